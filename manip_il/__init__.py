@@ -1,0 +1,3 @@
+"""Robot-arm imitation learning without a human at the controls."""
+
+__version__ = "0.1.0"

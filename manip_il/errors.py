@@ -1,0 +1,59 @@
+"""Errors that explain themselves: the thing, its value, what was expected, what to do next.
+
+The command line turns every `ManipError` into one line on standard error and its `exit_code`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ManipError(Exception):
+    """The work failed (exit code 1)."""
+
+    exit_code = 1
+
+
+class UsageError(ManipError):
+    """The words were off: an unknown name, option or value (exit code 2)."""
+
+    exit_code = 2
+
+
+class UnknownName(UsageError):
+    """A name that is not in a table of names; says which names are, and the nearest."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]):
+        known = sorted(known)
+        super().__init__(f"unknown {kind} {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+
+
+class MismatchError(ManipError):
+    """Two sides that must agree (dataset, policy, environment) do not; names both."""
+
+    def __init__(self, what: str, left: str, left_value: object, right: str, right_value: object):
+        super().__init__(f"{what} differs: {left} has {left_value}, {right} has {right_value}")
+
+
+class NotFiniteError(ManipError):
+    """NaN or infinity where a number was needed."""
+
+
+class FolderExistsError(UsageError):
+    """An output folder that holds something already."""
+
+    def __init__(self, folder: object):
+        super().__init__(
+            f"{folder} exists already; go on with it by --resume=true, or replace it by --overwrite=true"
+        )
+
+
+class RenderError(ManipError):
+    """No working OpenGL for off-screen pictures."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ` (did you mean 'x'?)`, or nothing where no known name is near."""
+    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" (did you mean {match[0]!r}?)" if match else ""

@@ -1,0 +1,55 @@
+"""Named random streams that cannot meet.
+
+An episode's seed is `base(stream) + index`. Each stream owns a block of `BLOCK` seeds, and each
+value of the user's `--seed` shifts all of them into a block of its own, so that demonstrations,
+every DAgger round, training, validation and the final test never share a seed, and none of them
+is LeRobot's 1000.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from manip_il.errors import UsageError
+
+BLOCK = 1_000_000  # seeds in one stream
+MAX_ROUNDS = 100
+_STREAMS = {"demonstrations": 1, "training": 2, "validation": 3, "test": 4, "certificate": 5}
+_FIRST_ROUND = 10  # rounds take blocks 10, 11, ...
+_BLOCKS_PER_SEED = _FIRST_ROUND + MAX_ROUNDS
+MAX_SEED = 1_000
+
+
+def stream_base(stream: str, seed: int = 0) -> int:
+    """First seed of a named stream (`demonstrations`, `training`, `validation`, `test`, `round/3`).
+
+    Raises `UsageError` for an unknown stream, or for a `seed` outside [0, 1000].
+    """
+    if not 0 <= seed <= MAX_SEED:
+        raise UsageError(f"seed is {seed}; expected a whole number from 0 to {MAX_SEED}")
+    return (seed * _BLOCKS_PER_SEED + _block(stream)) * BLOCK
+
+
+def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
+    """The first `count` seeds of a named stream."""
+    if not 0 <= count <= BLOCK:
+        raise UsageError(f"{count} seeds asked of stream {stream!r}; expected 0 to {BLOCK}")
+    base = stream_base(stream, seed)
+    return range(base, base + count)
+
+
+def rng_for(seed: int, purpose: str) -> np.random.Generator:
+    """A generator for one purpose within one episode (`reset`, `mixture`, `noise`, ...)."""
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
+
+
+def _block(stream: str) -> int:
+    kind, _, number = stream.partition("/")
+    if kind == "round" and number.isdigit() and int(number) < MAX_ROUNDS:
+        return _FIRST_ROUND + int(number)
+    if stream not in _STREAMS:
+        known = ", ".join([*_STREAMS, f"round/0 to round/{MAX_ROUNDS - 1}"])
+        raise UsageError(f"unknown random stream {stream!r}; known: {known}")
+    return _STREAMS[stream]
