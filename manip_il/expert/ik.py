@@ -1,0 +1,85 @@
+"""Differential inverse kinematics of one arm on mink; the only file that imports mink."""
+
+from __future__ import annotations
+
+import math
+
+import mink
+import mujoco
+import numpy as np
+import qpsolvers
+from numpy.typing import NDArray
+
+from manip_il.sim.robot import Robot
+from manip_il.sim.scene import arm_model
+
+F64 = NDArray[np.float64]
+
+_POSITION_COST = 1.0  # [1/m]
+_ORIENTATION_COST = 0.2  # [1/rad]
+_POSTURE_COST = 0.01  # [1/rad]; without it the label depends on the path that led to the posture
+_LM_DAMPING = 1e-3
+_DAMPING = 1e-5
+_SOLVER = "daqp"
+
+
+class ArmIK:
+    """Stateless use of mink: every call starts from the measured `q` and a fixed posture target."""
+
+    def __init__(self, robot: Robot):
+        model = arm_model(robot)
+        self._configuration = mink.Configuration(model)
+        self._address = np.array([model.joint(name).qposadr[0] for name in robot.arm_joints])
+        home = np.zeros(model.nq)
+        home[self._address] = robot.home
+        self._site = model.site("ee").id
+        self._frame = mink.FrameTask("ee", "site", _POSITION_COST, _ORIENTATION_COST, lm_damping=_LM_DAMPING)
+        posture = mink.PostureTask(model, cost=_POSTURE_COST)
+        posture.set_target(home)
+        self._tasks = [self._frame, posture]
+        self._limits = [mink.ConfigurationLimit(model)]
+        self._qpos = np.zeros(model.nq)
+
+    def ee_pose(self, q: F64) -> tuple[F64, F64]:
+        """Position [m] (3,) and rotation matrix (3, 3) of `ee` in the world at joint positions `q` [rad] (arm,)."""
+        self._qpos[self._address] = q
+        self._configuration.update(self._qpos)
+        data = self._configuration.data
+        return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
+
+    def step(self, position: F64, rotation: F64) -> tuple[F64, float] | None:
+        """One step from the posture last given to `ee_pose` towards a pose of `ee`.
+
+        Returns the joint displacement [rad] (arm,) and how much of the weighted pose error it leaves, as a
+        share; None where the quadratic program has no solution.
+        """
+        self._frame.set_target(_se3(position, rotation))
+        before = self._pose_error(position, rotation)
+        problem = mink.build_ik(self._configuration, self._tasks, 1.0, _DAMPING, self._limits)
+        result = qpsolvers.solve_problem(problem, solver=_SOLVER)
+        if not result.found or result.x is None:
+            return None
+        dq = result.x[self._address]
+        if before < _CONVERGED:
+            return dq, 0.0
+        data = self._configuration.data
+        data.qpos[self._address] += dq
+        mujoco.mj_kinematics(self._configuration.model, data)
+        return dq, self._pose_error(position, rotation) / before
+
+    def _pose_error(self, position: F64, rotation: F64) -> float:
+        """Distance to a pose, position and angle weighted as the frame task weights them."""
+        data = self._configuration.data
+        dx, dy, dz = (data.site_xpos[self._site] - position).tolist()
+        cosine = (float(data.site_xmat[self._site] @ rotation.ravel()) - 1) / 2
+        angle = math.acos(min(1.0, max(-1.0, cosine)))
+        return math.hypot(dx, dy, dz, _ORIENTATION_COST * angle)
+
+
+_CONVERGED = 1e-4
+
+
+def _se3(position: F64, rotation: F64) -> mink.SE3:
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, rotation.ravel())
+    return mink.SE3(wxyz_xyz=np.concatenate([quat, position]))

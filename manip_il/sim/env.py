@@ -1,0 +1,219 @@
+"""One gymnasium environment for every robot and task, with exact save and restore."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.mdp import Observation, State
+from manip_il.seeding import rng_for
+from manip_il.sim.observe import environment_state, environment_state_names
+from manip_il.sim.render import Renderer
+from manip_il.sim.scene import CAMERAS, DT_SIM, STATE_KIND, build_scene
+from manip_il.sim.task import CUBE_HALF_SIZE, draw_start
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """What makes one environment; every field is part of the fingerprint."""
+
+    robot: str = "panda"
+    task: str = "pick_place"
+    control_hz: int = 20
+    tolerance: float = 0.02  # of object (or hand) to goal [m]
+    success_steps: int = 5  # control steps in a row within the tolerance
+    horizon: int = 100  # control steps
+
+    def __post_init__(self) -> None:
+        if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
+            raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
+        if not 0 < self.tolerance < 1:
+            raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
+        if self.success_steps < 1 or self.horizon < self.success_steps:
+            raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
+
+    @property
+    def physics_steps(self) -> int:
+        """MuJoCo steps in one control step."""
+        return round(1 / (DT_SIM * self.control_hz))
+
+
+class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
+    """Joint-position control of one arm on one task.
+
+    Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
+    `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
+    Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
+    "solved once" and "solved at the end" can both be told.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        robot: str = "panda",
+        task: str = "pick_place",
+        *,
+        config: EnvConfig | None = None,
+        cameras: tuple[str, ...] = (),
+        image_size: tuple[int, int] = (128, 128),
+        render_mode: str | None = None,
+        **settings: Any,
+    ):
+        self.config = config or EnvConfig(robot, task, **settings)
+        self.scene = build_scene(self.config.robot, self.config.task)
+        self.data = mujoco.MjData(self.scene.model)
+        self.render_mode = render_mode
+        self.cameras, self.image_size = tuple(cameras), image_size
+        self.metadata = {**type(self).metadata, "render_fps": self.config.control_hz}
+        self._max_episode_steps = self.config.horizon
+        self.task_description = self.scene.task.instruction
+        self.task = self.config.task
+        self._goal = np.zeros(3)
+        self._step = self._streak = 0
+        self._ever = False
+        self._renderer: Renderer | None = None
+        self.action_space = self._action_space()
+        self.observation_space = self._observation_space()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Draw a start. The same seed gives the same start, bit for bit."""
+        super().reset(seed=seed)
+        self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
+        return self._observation(), self._info()
+
+    def start(self, seed: int) -> None:
+        """`reset` without making an observation."""
+        scene, data = self.scene, self.data
+        start = draw_start(scene.task, scene.robot, rng_for(seed, "reset"))
+        mujoco.mj_resetData(scene.model, data)
+        posture = np.asarray(scene.robot.home) + start.joint_offset
+        data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
+        data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = scene.robot.max_opening / 2
+        if scene.object_q is not None:
+            pose = [*start.object_xy, CUBE_HALF_SIZE, np.cos(start.object_yaw / 2), 0, 0, np.sin(start.object_yaw / 2)]
+            data.qpos[scene.object_q : scene.object_q + 7] = pose
+        self._goal = start.goal
+        data.mocap_pos[scene.goal_mocap] = start.goal
+        self._step = self._streak = 0
+        self._ever = False
+        mujoco.mj_forward(scene.model, data)
+
+    def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Apply one action for one control step."""
+        self.advance(action)
+        return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
+
+    def advance(self, action: NDArray[Any]) -> None:
+        """`step` without making an observation. Raises `NotFiniteError`, `MismatchError`."""
+        scene, data = self.scene, self.data
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action_space.shape:
+            raise MismatchError("action shape", "the policy", action.shape, "the robot", self.action_space.shape)
+        if not np.isfinite(action).all():
+            raise NotFiniteError(f"action at step {self._step} is not finite: {action}")
+        low, high = self._action_limits
+        action = np.minimum(np.maximum(action, low), high)
+        data.ctrl[scene.arm_ctrl] = action[:-1]
+        data.ctrl[scene.finger_ctrl] = action[-1] / 2
+        mujoco.mj_step(scene.model, data, self.config.physics_steps)
+        mujoco.mj_kinematics(scene.model, data)  # positions as of now, not of the last physics step's start
+        self._step += 1
+        self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
+        self._ever = self._ever or self.solved
+
+    @property
+    def solved(self) -> bool:
+        """Within the tolerance for the required steps in a row, now."""
+        return self._streak >= self.config.success_steps
+
+    def distance(self) -> float:
+        """Of the object (where there is one), else of the hand, to the goal [m]."""
+        scene, data = self.scene, self.data
+        at = data.site_xpos[scene.ee_site]
+        if scene.object_q is not None:
+            at = data.qpos[scene.object_q : scene.object_q + 3]
+        return float(np.linalg.norm(at - self._goal))
+
+    def get_state(self) -> State:
+        """Everything that the future depends on; `set_state` restores it bit for bit."""
+        physics = np.empty(self.scene.state_size)
+        mujoco.mj_getState(self.scene.model, self.data, physics, STATE_KIND)
+        return State(physics, self._goal.copy(), self._step, self._streak, self._ever)
+
+    def set_state(self, state: State) -> None:
+        """Restore a state of the same scene. Raises `MismatchError` for another scene's."""
+        size = self.scene.state_size
+        if len(state.physics) != size:
+            name = f"{self.config.robot} {self.config.task}"
+            raise MismatchError("size of the physics state", "the state", len(state.physics), name, size)
+        mujoco.mj_setState(self.scene.model, self.data, state.physics, STATE_KIND)
+        self._goal = state.goal.copy()
+        self._step, self._streak, self._ever = state.step, state.streak, state.ever
+        mujoco.mj_kinematics(self.scene.model, self.data)
+
+    def observe(self) -> Observation:
+        """What a learner sees now (pictures only where the environment has cameras)."""
+        scene, data = self.scene, self.data
+        opening = data.qpos[scene.finger_q].sum()
+        state = np.append(data.qpos[scene.arm_q], opening).astype(np.float32)
+        images = {camera: self._picture(camera, self.image_size) for camera in self.cameras}
+        return Observation(state, environment_state(scene, data, self._goal), images)
+
+    def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A picture from the front camera, uint8 (480, 640, 3)."""
+        return self._picture("front", (480, 640)) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _picture(self, camera: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+        mujoco.mj_camlight(self.scene.model, self.data)  # cameras that ride on the hand
+        if self._renderer is None or self._renderer.size != size:
+            self.close()
+            self._renderer = Renderer(self.scene, *size)
+        return self._renderer.picture(self.data, camera)
+
+    def _info(self) -> dict[str, Any]:
+        return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}
+
+    def _observation(self) -> dict[str, Any]:
+        seen = self.observe()
+        observation: dict[str, Any] = {"agent_pos": seen.state, "environment_state": seen.environment_state}
+        if self.cameras:
+            observation["pixels"] = seen.images
+        return observation
+
+    def _action_space(self) -> gymnasium.spaces.Box:
+        scene = self.scene
+        limits = np.vstack([scene.arm_range, [0, scene.robot.max_opening]])
+        self._action_limits = limits[:, 0], limits[:, 1]
+        finite = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi).astype(np.float32)
+        return gymnasium.spaces.Box(finite[:, 0], finite[:, 1], dtype=np.float32)
+
+    def _observation_space(self) -> gymnasium.spaces.Dict:
+        n, k = len(self.scene.robot.joint_names), len(environment_state_names(self.scene.task))
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
+            "environment_state": gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32),
+        }
+        if self.cameras:
+            picture = gymnasium.spaces.Box(0, 255, (*self.image_size, 3), np.uint8)
+            spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
+        return gymnasium.spaces.Dict(spaces)
+
+
+__all__ = ["CAMERAS", "EnvConfig", "ManipEnv"]
