@@ -1,6 +1,6 @@
-# make setup   the environment in .venv         make demo   the whole story, small
-# make test    lint is separate: make lint      make bench  every speed ratio
-.PHONY: setup demo test test-fast lint format bench lock clean
+# `make help` lists the targets.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-fast lint format bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= python3.12
@@ -11,7 +11,10 @@ export UV_LINK_MODE ?= copy
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .tools/bin/uv)
 BIN := .venv/bin
 
-setup: .venv/.installed
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
+
+setup: .venv/.installed  ## the environment, in .venv
 
 .tools/bin/uv:
 	$(PYTHON) -m venv .tools
@@ -23,6 +26,34 @@ setup: .venv/.installed
 	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
 	touch $@
 
-lock: | $(filter .tools%,$(UV))
+demo: setup  ## the whole story, small: runs/quickstart/report.html
+	$(BIN)/manip-il quickstart --output_dir=runs/quickstart
+
+# Two workers with one thread each: more threads than cores makes small networks slower, not faster.
+test: setup  ## every test
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
+
+test-fast: setup  ## the tests that take seconds and need no OpenGL
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow and not gl"
+
+lint: setup  ## style, types and who may import whom
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/lint-imports --no-cache
+
+format: setup  ## put the code into shape
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+# One by one: two at a time would measure each other.
+bench: setup  ## every speed ratio
+	@set -e; for file in $(wildcard benchmarks/[!_]*.py); do echo "== $$file"; $(BIN)/python "$$file"; done
+
+lock: | $(filter .tools%,$(UV))  ## choose the versions anew
 	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
 	    --python $(PYTHON) --extra dev pyproject.toml -o requirements.lock
+
+clean:  ## remove what tools left behind; keeps .venv, runs and datasets
+	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find manip_il tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

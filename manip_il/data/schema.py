@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.mdp import Episode, require_finite
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
@@ -36,6 +42,21 @@ class RobotTaskSpec:
 
     action_meaning: str = "joint position targets [rad], gripper opening command [m]"
 
+    def to_json(self) -> dict[str, Any]:
+        """As JSON knows it."""
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
+        """The inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
+        known = {field.name for field in fields(cls)}
+        if set(data) != known:
+            odd = sorted(known.symmetric_difference(data))
+            raise ManipError(f"a robot-task spec with wrong keys: {', '.join(odd)} missing or unknown")
+        names = ("joint_names", "environment_state_names")
+        values: dict[str, Any] = {key: tuple(value) if key in names else value for key, value in data.items()}
+        return cls(**values)
+
 
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     """LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
@@ -60,3 +81,57 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 
 def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
+
+
+def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
+    """Raise `MismatchError` unless actions and observations mean the same on both sides.
+
+    The task may differ: a policy may be tried on another one.
+    """
+    for what in ("robot", "fps", "joint_names", "environment_state_names", "action_meaning"):
+        left_value, right_value = getattr(left, what), getattr(right, what)
+        if left_value != right_value:
+            raise MismatchError(what, left_name, left_value, right_name, right_value)
+
+
+def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
+    """The episode's columns in the order of `features(spec)`: (T,) for scalars, (T, d) for vectors.
+
+    Raises `UnknownName` for a column too many, `MismatchError` for one missing or of another dtype or shape,
+    `NotFiniteError` naming the frame, `ManipError` where seed or success and their columns disagree.
+    """
+    who = f"episode with seed {episode.seed}"
+    table = features(spec)
+    for key in episode.columns:
+        if key not in table:
+            raise UnknownName(f"column of {who}", key, table)
+    columns = {key: _fitted(who, key, episode.columns.get(key), feature) for key, feature in table.items()}
+    _check_flags(who, episode, columns)
+    return columns
+
+
+def _fitted(who: str, key: str, values: NDArray[Any] | None, feature: dict[str, Any]) -> NDArray[Any]:
+    shape: tuple[int, ...] = feature["shape"]
+    what, need = f"column {key!r}", f"{feature['dtype']} of shape (T, {shape[0]})"
+    if values is None:
+        raise MismatchError(what, who, "no such column", "the schema", need)
+    is_scalar = shape == (1,)
+    fits = values.shape[1:] == shape or (is_scalar and values.ndim == 1)
+    if values.dtype != np.dtype(feature["dtype"]) or not fits:
+        raise MismatchError(what, who, f"{values.dtype} of shape {values.shape}", "the schema", need)
+    require_finite(f"{who}, {key}", values)
+    return values.reshape(-1) if is_scalar else values
+
+
+def _check_flags(who: str, episode: Episode, columns: dict[str, NDArray[Any]]) -> None:
+    """What is stored once an episode and what is stored in every frame must say the same."""
+    if (columns[SEED] != episode.seed).any():
+        frame = int(np.argmax(columns[SEED] != episode.seed))
+        raise MismatchError("seed", who, episode.seed, f"its column at frame {frame}", int(columns[SEED][frame]))
+    success = columns[SUCCESS]
+    for name, flag, column in (
+        ("success", episode.success, bool(success.any())),
+        ("success_at_end", episode.success_at_end, bool(success[-1])),
+    ):
+        if flag != column:
+            raise MismatchError(name, who, flag, f"its column {SUCCESS!r}", column)

@@ -89,8 +89,9 @@ def grasped(g: Geometry, offset: F64) -> bool:
 
 
 def at_grasp(g: Geometry, offset: F64, angle: float) -> bool:
-    """Closing the fingers now would hold the object."""
-    return _inside(offset, AT_GRASP) and angle < AT_GRASP_ANGLE and g.object_tilt < MAX_TILT
+    """Closing the fingers now would hold the object; once they have begun to close, they go on more readily."""
+    box = AT_GRASP if open_enough(g) else IN_HAND
+    return _inside(offset, box) and angle < AT_GRASP_ANGLE and g.object_tilt < MAX_TILT
 
 
 def open_enough(g: Geometry) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.seeding import rng_for
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.task import CUBE_HALF_SIZE, in_reach
 
@@ -155,3 +156,22 @@ def _place(env: ManipEnv, pose: F64) -> bool:
     mujoco.mj_forward(scene.model, data)
     cube = scene.model.geom("object").id
     return all(contact.dist > _OVERLAP for contact in data.contact if cube in (contact.geom1, contact.geom2))
+
+
+class Disturber:
+    """One episode's disturbances, drawn from its seed."""
+
+    def __init__(self, env: ManipEnv, disturbance: Disturbance, seed: int):
+        self._env, self._disturbance = env, disturbance
+        self._noise, self._knock = rng_for(seed, "action noise"), rng_for(seed, "knock")
+        self._knock_at = int(self._knock.integers(*disturbance.knock_steps)) if disturbance.knock else -1
+
+    def before(self, step: int) -> None:
+        """Knock the object, where this is the step for it."""
+        if step == self._knock_at and self._disturbance.knock is not None:
+            knock_object(self._env, self._knock, self._disturbance.knock)
+
+    def action(self, action: F64) -> F64:
+        """The action as it reaches the robot."""
+        share = self._disturbance.action_noise
+        return noisy(action, self._env, share, self._noise) if share else action

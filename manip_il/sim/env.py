@@ -99,7 +99,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         mujoco.mj_resetData(scene.model, data)
         posture = np.asarray(scene.robot.home) + start.joint_offset
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
-        data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = scene.robot.max_opening / 2
+        data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = start.opening / 2
         if scene.object_q is not None:
             pose = [*start.object_xy, CUBE_HALF_SIZE, np.cos(start.object_yaw / 2), 0, 0, np.sin(start.object_yaw / 2)]
             data.qpos[scene.object_q : scene.object_q + 7] = pose

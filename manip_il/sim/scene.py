@@ -151,7 +151,11 @@ def _add_look(spec: mujoco.MjSpec) -> None:
     spec.add_material(name="cube", rgba=[0.86, 0.24, 0.16, 1], specular=0.3, shininess=0.5)
     spec.add_material(name="goal", rgba=[0.12, 0.72, 0.35, 0.55], specular=0.0, emission=0.4)
     spec.worldbody.add_light(
-        pos=[0.9, -0.9, 1.8], dir=[-0.35, 0.75, -1.5], diffuse=[0.62, 0.60, 0.56], specular=[0.2, 0.2, 0.2], castshadow=True
+        pos=[0.9, -0.9, 1.8],
+        dir=[-0.35, 0.75, -1.5],
+        diffuse=[0.62, 0.60, 0.56],
+        specular=[0.2, 0.2, 0.2],
+        castshadow=True,
     )
     spec.worldbody.add_light(pos=[-0.5, 1.2, 1.5], dir=[0.6, -0.7, -1.0], diffuse=[0.2, 0.22, 0.26], castshadow=False)
 
@@ -165,7 +169,9 @@ def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     )
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         leg = [x + 0.08 + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -0.22]
-        spec.worldbody.add_geom(name=f"leg{i}", type=box, size=[0.025, 0.025, 0.18], pos=leg, rgba=[0.35, 0.36, 0.38, 1])
+        spec.worldbody.add_geom(
+            name=f"leg{i}", type=box, size=[0.025, 0.025, 0.18], pos=leg, rgba=[0.35, 0.36, 0.38, 1]
+        )
     spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, -0.4], material="floor")
     if robot.name == "panda":  # a pedestal from the floor to the base
         spec.worldbody.add_geom(

@@ -33,9 +33,13 @@ class Task:
 
 
 TASKS = {
-    "reach": Task("reach", has_object=False, goal="anywhere", instruction="Move the hand to the green goal.", goal_in_air=1.0),
+    "reach": Task(
+        "reach", has_object=False, goal="anywhere", instruction="Move the hand to the green goal.", goal_in_air=1.0
+    ),
     "lift": Task("lift", has_object=True, goal="above_object", instruction="Lift the cube to the green goal above it."),
-    "pick_place": Task("pick_place", has_object=True, goal="anywhere", instruction="Pick up the cube and bring it to the green goal."),
+    "pick_place": Task(
+        "pick_place", has_object=True, goal="anywhere", instruction="Pick up the cube and bring it to the green goal."
+    ),
 }
 _LIFT_HEIGHT = (0.1, 0.25)  # of lift's goal over the resting object [m]
 _MAX_DRAWS = 1_000
@@ -50,12 +54,13 @@ def get_task(name: str) -> Task:
 
 @dataclass(frozen=True)
 class Start:
-    """What a reset draws: object on the table (x, y, yaw), goal (3,) [m], arm posture offset (arm,) [rad]."""
+    """What a reset draws: object on the table (x, y, yaw), goal (3,) [m], arm posture offset (arm,) [rad], opening [m]."""
 
     object_xy: F64
     object_yaw: float
     goal: F64
     joint_offset: F64
+    opening: float
 
 
 def draw_start(task: Task, robot: Robot, rng: np.random.Generator) -> Start:
@@ -64,13 +69,14 @@ def draw_start(task: Task, robot: Robot, rng: np.random.Generator) -> Start:
     object_xy = _draw_until(lambda: centre + rng.uniform(-1, 1, 2) * task.object_range, robot, task)
     yaw = float(rng.uniform(-1, 1) * task.object_yaw)
     goal = _draw_goal(task, robot, object_xy, rng)
-    return Start(object_xy, yaw, goal, rng.uniform(-1, 1, len(robot.arm_joints)) * _JOINT_JITTER)
+    joint_offset = rng.uniform(-1, 1, len(robot.arm_joints)) * _JOINT_JITTER
+    return Start(object_xy, yaw, goal, joint_offset, rng.uniform(0, robot.max_opening))
 
 
 _JOINT_JITTER = 0.03  # [rad]
 
 
-def _draw_until(draw, robot: Robot, task: Task) -> F64:  # noqa: ANN001
+def _draw_until(draw, robot: Robot, task: Task) -> F64:
     for _ in range(_MAX_DRAWS):
         xy = draw()
         if np.linalg.norm(xy - robot.workspace) >= task.min_start_distance and in_reach(robot, _on_table(xy)):

@@ -1,0 +1,163 @@
+"""Output folders and files that a kill cannot leave half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from manip_il.cli.options import CONFIG_HEADER
+from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+
+
+def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
+    """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
+
+    It is not created, as LeRobot's writers insist on doing so themselves. Raises `FolderExistsError` where it holds
+    something, and `UsageError` where `overwrite` would delete what this program did not make.
+    """
+    if resume and overwrite:
+        raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
+    if folder.is_symlink() and not folder.exists():
+        raise UsageError(f"{folder} is a link to nothing; expected a folder")
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is a file; expected a folder")
+    if resume or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise FolderExistsError(folder)
+    _require_ours(folder)
+    _delete(folder)
+
+
+def atomic_write(path: Path, content: str | bytes) -> None:
+    """Write a whole file or nothing, through a temporary file beside it; creates the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
+    """Add one line of JSON and flush it. A torn last line, left by a kill, is removed first.
+
+    Raises `NotFiniteError` where the record holds NaN or infinity, which JSON has not.
+    """
+    try:
+        line = json.dumps(dict(record), allow_nan=False, default=_plain)
+    except ValueError as error:
+        raise NotFiniteError(f"{path}: a record that is not finite: {dict(record)}") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _mend_tail(path)
+    with path.open("ab") as file:
+        file.write(line.encode() + b"\n")
+        file.flush()
+
+
+def read_jsonl(path: Path) -> list[dict[str, Any]]:
+    """Every record, without a torn last line; none where there is no file.
+
+    Raises `ManipError` for any other line that is not a JSON object.
+    """
+    if not path.exists():
+        return []
+    lines = path.read_bytes().split(b"\n")
+    tail = lines.pop()
+    records = [_require_record(path, number, line) for number, line in enumerate(lines, start=1)]
+    last = _record(tail)
+    return [*records, last] if last is not None else records
+
+
+def _require_ours(folder: Path) -> None:
+    real = folder.resolve()
+    if folder.is_symlink():
+        raise UsageError(f"{folder} is a link to {real}; --overwrite=true deletes no links, name the folder itself")
+    for name, kept in (("your home folder", Path.home().resolve()), ("the current folder", Path.cwd().resolve())):
+        if kept.is_relative_to(real):
+            raise UsageError(f"{folder} is or contains {name}; --overwrite=true will not delete it")
+    if next(real.rglob(".git"), None) is not None:
+        raise UsageError(f"{folder} holds a git checkout; --overwrite=true will not delete it")
+    if not _is_ours(real):
+        raise UsageError(
+            f"{folder} holds something that manip-il did not make (no config.yaml, meta/info.json or eval.json of its "
+            "own); choose another folder, or delete it by hand"
+        )
+
+
+def _is_ours(folder: Path) -> bool:
+    config = folder / "config.yaml"
+    if config.is_file() and config.read_bytes().startswith(CONFIG_HEADER.encode()):
+        return True
+    # Any LeRobot dataset has meta/info.json; one with both actions is from here.
+    features = _json_object(folder / "meta" / "info.json").get("features")
+    if isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys():
+        return True
+    return {"success_rate", "fingerprint"} <= _json_object(folder / "eval.json").keys()
+
+
+def _json_object(path: Path) -> dict[str, Any]:
+    """The object in a JSON file, or an empty one."""
+    return (_record(path.read_bytes()) or {}) if path.is_file() else {}
+
+
+def _delete(folder: Path) -> None:
+    # Renamed first: a kill on the way leaves no folder that has lost its mark but not its files.
+    doomed = folder.with_name(f".{folder.name}.deleting.{os.getpid()}")
+    folder.rename(doomed)
+    shutil.rmtree(doomed)
+
+
+def _mend_tail(path: Path) -> None:
+    if not path.exists():
+        return
+    with path.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        if size == 0 or _read_at(file, size - 1) == b"\n":
+            return
+        file.seek(0)
+        content = file.read()
+        whole = content.rfind(b"\n") + 1
+        if _record(content[whole:]) is not None:  # only its newline is missing
+            file.write(b"\n")
+        else:
+            file.truncate(whole)
+
+
+def _read_at(file: Any, position: int) -> bytes:
+    file.seek(position)
+    return file.read(1)
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _require_record(path: Path, number: int, line: bytes) -> dict[str, Any]:
+    record = _record(line)
+    if record is None:
+        raise ManipError(f"{path}, line {number}: expected a JSON object, got {line[:80].decode(errors='replace')!r}")
+    return record
+
+
+def _plain(value: Any) -> Any:
+    """Numpy scalars and arrays, and paths, as JSON has them."""
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")

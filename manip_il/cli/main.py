@@ -1,0 +1,180 @@
+"""`manip-il COMMAND --option=value ...`: finds the command, answers for help and for errors.
+
+Nothing heavy is imported before a command is known, so that help and a wrong word answer at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import select
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import MISSING
+from typing import Any, NamedTuple
+
+from manip_il import __version__
+from manip_il.cli import progress
+from manip_il.cli.interrupt import Interrupted, resume_command
+from manip_il.cli.options import Option, options_of, parse, to_plain
+from manip_il.cli.values import metavar
+from manip_il.errors import ManipError, UnknownName, UsageError
+
+PROGRAM = "manip-il"
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+
+
+class Command(NamedTuple):
+    """target: `module:OptionsClass`, loaded when the command is called."""
+
+    target: str
+    summary: str
+
+
+COMMANDS = {
+    "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
+    "train": Command("manip_il.cli.train:TrainOptions", "fit a policy to a dataset (behaviour cloning)"),
+    "dagger": Command("manip_il.cli.dagger:DaggerOptions", "roll out, label, aggregate, refit, and repeat"),
+    "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
+    "quickstart": Command("manip_il.cli.quickstart:QuickstartOptions", "the whole story, small: watch it learn"),
+}
+
+_GLOBAL_HELP = """\
+  --debug      show the traceback of an error
+  --quiet      no progress on standard error"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command. Returns 0 done, 1 the work failed, 2 the words were off, 130 interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug, quiet = "--debug" in words, "--quiet" in words
+    words = [word for word in words if word not in ("--debug", "--quiet")]
+    progress.set_quiet(quiet)
+    try:
+        _dispatch(words)
+        sys.stdout.flush()  # here, where a reader that has gone away can still be answered
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, BrokenPipeError) and _stdout_is_gone():
+            _silence_stdout()
+            return EXIT_BROKEN_PIPE
+        if debug:
+            traceback.print_exc()
+        return _report(error, words)
+    return 0
+
+
+def load(name: str) -> type:
+    """The dataclass of options of a command; `UnknownName` (exit code 2) names the known ones."""
+    if name not in COMMANDS:
+        raise UnknownName("command", name, COMMANDS)
+    module, _, options_class = COMMANDS[name].target.partition(":")
+    return getattr(importlib.import_module(module), options_class)
+
+
+def _dispatch(words: list[str]) -> None:
+    if not words or words[0] in ("--help", "-h", "help"):
+        print(_help())
+    elif words[0] == "--version":
+        print(f"{PROGRAM} {__version__}")
+    elif words[0].startswith("-"):
+        raise UsageError(f"{words[0]!r} stands before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
+    elif "--help" in words or "-h" in words:
+        print(_command_help(words[0], load(words[0])))
+    else:
+        parse(load(words[0]), words[1:]).run()
+
+
+def _report(error: BaseException, words: list[str]) -> int:
+    """Say on standard error what happened, in one line; return the exit code."""
+    if isinstance(error, KeyboardInterrupt):
+        _complain(f"interrupted{_how_to_go_on(error, words)}")
+        return EXIT_INTERRUPTED
+    if isinstance(error, ManipError):
+        _complain(f"error: {error}")
+        return error.exit_code
+    _complain(f"error: {type(error).__name__}: {error}; run again with --debug for the traceback")
+    return 1
+
+
+def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
+    if isinstance(error, Interrupted):
+        return f"; kept: {error.kept}; go on with: {error.resume_command or resume_command(words)}"
+    try:
+        can_resume = any(option.name == "resume" for option in options_of(load(words[0])))
+    except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
+        return ""
+    return f"; what was finished is kept; go on with: {resume_command(words)}" if can_resume else ""
+
+
+def _complain(text: str) -> None:
+    print(f"{PROGRAM}: {' '.join(text.split())}", file=sys.stderr, flush=True)
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS)) + 2
+    commands = "\n".join(f"  {name:{width}}{command.summary}" for name, command in COMMANDS.items())
+    return (
+        f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
+        "Robot-arm imitation learning without a human at the controls.\n\n"
+        f"commands:\n{commands}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
+        f"{PROGRAM} COMMAND --help lists a command's options.\n"
+        f"example: {PROGRAM} quickstart"
+    )
+
+
+def _command_help(name: str, cls: Any) -> str:
+    options = options_of(cls)
+    places = "".join(f" {option.label}" for option in options if option.positional)
+    rows = [_row(option) for option in options]
+    rows.append(("--config_path=FILE.yaml", "read options from YAML; those on the command line win"))
+    width = max(len(left) for left, _ in rows) + 2
+    lines = "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows)
+    example = getattr(cls, "example", "")
+    return (
+        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{_description(name, cls)}\n\n"
+        f"options:\n{lines}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
+    )
+
+
+def _description(name: str, cls: type) -> str:
+    text = inspect.cleandoc(cls.__doc__ or "")
+    generated = text.startswith(f"{cls.__name__}(")  # what `dataclass` makes up where there is no docstring
+    return COMMANDS[name].summary if generated or not text else text
+
+
+def _row(option: Option) -> tuple[str, str]:
+    left = option.label if option.positional else f"{option.label}={metavar(option.type)}"
+    return left, f"{option.help} [{_default_text(option)}]".lstrip()
+
+
+def _default_text(option: Option) -> str:
+    if option.default is MISSING:
+        return "required"
+    value = to_plain(option.default)
+    if isinstance(value, list):
+        return ",".join(map(str, value)) or "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "none" if value is None else str(value) or "empty"
+
+
+def _stdout_is_gone() -> bool:
+    """Whether nobody reads our output any more: a broken pipe to a worker is a real error."""
+    try:
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), select.POLLOUT)
+        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
+    except (OSError, ValueError):
+        return False
+
+
+def _silence_stdout() -> None:
+    """Python flushes once more at exit, and would complain there."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

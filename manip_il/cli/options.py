@@ -1,0 +1,220 @@
+"""Dataclasses of options, read from `--a.b=c` words and YAML in LeRobot's style.
+
+Words beat YAML beats defaults. The parser is our own, as draccus cannot be taught to answer with one line: it
+exits through argparse, turns a range error of a nested dataclass into a decoding error, takes `true` for a
+number, and loads YAML with tags that read other files.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from manip_il import __version__
+from manip_il.cli.values import choices, decode, expected
+from manip_il.errors import UsageError, nearest
+
+CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
+CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
+
+
+@dataclass(frozen=True)
+class Option:
+    """One leaf of a dataclass of options. `default` is `MISSING` where the user must give a value."""
+
+    name: str  # dotted: `dataset.root`
+    type: Any
+    default: Any
+    help: str
+    positional: bool
+
+    @property
+    def label(self) -> str:
+        """How the user writes it."""
+        return self.name.upper() if self.positional else f"--{self.name}"
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A value as the user gave it, and where, for the error message."""
+
+    value: Any
+    where: str
+    is_word: bool  # from the command line, where everything is text
+
+
+def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
+    """Every option of a dataclass, depth first, in the order of definition.
+
+    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il doctor DATASET`).
+    """
+    found: list[Option] = []
+    for field, field_type in _fields(cls):
+        name, default = prefix + field.name, _default(field, base)
+        if dataclasses.is_dataclass(field_type):
+            found += options_of(typing.cast(type, field_type), None if default is MISSING else default, f"{name}.")
+        else:
+            help_text, positional = field.metadata.get("help", ""), field.metadata.get("positional", False)
+            found.append(Option(name, field_type, default, help_text, positional))
+    return found
+
+
+def parse[T](cls: type[T], words: Sequence[str]) -> T:
+    """Options from the command line; `UsageError` for an unknown name, a bad or a missing value."""
+    known = {option.name: option for option in options_of(cls)}
+    from_words, config_paths = _read_words(words, known)
+    from_files: dict[str, _Given] = {}
+    for path in config_paths:
+        from_files |= _read_yaml(Path(path), cls, known)
+    return _build(cls, from_files | from_words)
+
+
+def from_yaml[T](path: Path, cls: type[T]) -> T:
+    """Options from a YAML file of differences, or from one that `dump_yaml` wrote."""
+    known = {option.name: option for option in options_of(cls)}
+    return _build(cls, _read_yaml(path, cls, known))
+
+
+def dump_yaml(options: Any) -> str:
+    """The resolved options as YAML: `from_yaml` gives them back equal."""
+    import yaml
+
+    header = f"{CONFIG_HEADER} {__version__}: resolved options ({type(options).__name__})\n"
+    return header + yaml.safe_dump(to_plain(options), sort_keys=False)
+
+
+def to_plain(value: Any) -> Any:
+    """Options as dicts, lists, text, numbers, booleans and None."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [to_plain(item) for item in value]
+    return value
+
+
+def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict[str, _Given], list[str]]:
+    given: dict[str, _Given] = {}
+    config_paths: list[str] = []
+    places = [option for option in known.values() if option.positional]
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("--"):
+            if not places:
+                raise UsageError(f"unexpected {word!r}; options are written --name=value{_did_you_mean(word, known)}")
+            option = places.pop(0)
+            given[option.name] = _Given(word, option.label, True)
+            continue
+        name, equals, value = word[2:].partition("=")
+        if name != CONFIG_PATH and (name not in known or known[name].positional):
+            raise _unknown("option", name, known, "--")
+        if not equals:
+            value = _next_value(name, known, rest)
+        if name == CONFIG_PATH:
+            config_paths.append(value)
+        else:
+            given[name] = _Given(value, f"--{name}", True)
+    return given, config_paths
+
+
+def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
+    """Take the value of `--name value` from `rest`; a flag without one is true."""
+    if name in known and known[name].type is bool and not (rest and rest[0] in ("true", "false")):
+        return "true"
+    if not rest or rest[0].startswith("--"):
+        wanted = expected(known[name].type) if name in known else "a path"
+        raise UsageError(f"--{name} has no value; expected {wanted}")
+    return rest.pop(0)
+
+
+def _read_yaml(path: Path, cls: type, known: Mapping[str, Option]) -> dict[str, _Given]:
+    import yaml
+
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}; expected a YAML file of options") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of option names to values")
+    return {name: _Given(value, f"{path}: {name}", False) for name, value in _leaves(tree or {}, known, path)}
+
+
+def _leaves(tree: dict[Any, Any], known: Mapping[str, Option], path: Path, prefix: str = "") -> Iterator[tuple]:
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if name in known:
+            yield name, value
+        elif not any(option.startswith(f"{name}.") for option in known):
+            raise _unknown(f"key in {path}:", name, known)
+        elif isinstance(value, dict):
+            yield from _leaves(value, known, path, f"{name}.")
+        elif value is not None:
+            raise UsageError(f"{path}: {name}: expected a mapping of options, got {value!r}")
+
+
+def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
+    """An instance of `cls`: what was given, else `base`'s values, else the class's defaults."""
+    arguments: dict[str, Any] = {}
+    for field, field_type in _fields(cls):
+        name, default = prefix + field.name, _default(field, base)
+        if dataclasses.is_dataclass(field_type):
+            nested = None if default is MISSING else default
+            arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")
+        elif name in given:
+            arguments[field.name] = _decode_given(field_type, given[name])
+        elif default is MISSING:
+            label = name.upper() if field.metadata.get("positional") else f"--{name}"
+            raise UsageError(f"{label} is missing; expected {expected(field_type)}")
+        else:
+            arguments[field.name] = default
+    return cls(**arguments)
+
+
+def _decode_given(field_type: Any, given: _Given) -> Any:
+    try:
+        return decode(field_type, given.value, is_word=given.is_word)
+    except (ValueError, OverflowError):
+        hint = nearest(given.value, choices(field_type)) if isinstance(given.value, str) else ""
+        quotes = "; YAML needs quotes around text like this" if field_type is str and not given.is_word else ""
+        raise UsageError(f"{given.where}: expected {expected(field_type)}, got {given.value!r}{hint}{quotes}") from None
+
+
+def _fields(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
+    hints = typing.get_type_hints(cls)
+    return ((field, hints[field.name]) for field in dataclasses.fields(cls) if field.init)
+
+
+def _default(field: dataclasses.Field[Any], base: Any) -> Any:
+    if base is not None:
+        return getattr(base, field.name)
+    return field.default_factory() if field.default_factory is not MISSING else field.default
+
+
+def _unknown(kind: str, name: str, known: Mapping[str, Option], dashes: str = "") -> UsageError:
+    groups = {".".join(option.split(".")[:-1]) for option in known}
+    if name in groups:
+        inside = ", ".join(dashes + option for option in known if option.startswith(f"{name}."))
+        return UsageError(f"{dashes}{name} is a group of options; known: {inside}")
+    named = ", ".join(dashes + option.name for option in known.values() if not (dashes and option.positional))
+    return UsageError(f"unknown {kind} {dashes + name!r}{_did_you_mean(name, known, dashes)}; known: {named}")
+
+
+def _did_you_mean(name: str, known: Mapping[str, Option], dashes: str = "--") -> str:
+    """The nearest option; `num_episodes` without its group finds `dataset.num_episodes`."""
+    names = [option.name for option in known.values() if not (dashes and option.positional)]
+    leaf = name.rpartition(".")[2].replace("-", "_")
+    same_leaf = [option for option in names if option.rpartition(".")[2] == leaf]
+    if len(same_leaf) == 1:
+        return f" (did you mean {dashes + same_leaf[0]!r}?)"
+    return nearest(dashes + name, [dashes + option for option in names])

@@ -1,0 +1,117 @@
+"""How far long work has come: a bar on a terminal, a line every few seconds elsewhere, both on standard error."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+INTERVAL = 5.0  # [s] between plain lines
+
+_quiet = False
+
+
+class Progress(Protocol):
+    """What `progress` hands out."""
+
+    def advance(self, n: int = 1, **fields: object) -> None:
+        """`n` more are done; `fields` (loss=0.12, success=0.9) replace those shown so far."""
+        ...
+
+
+def set_quiet(quiet: bool) -> None:
+    """Switch progress off (or on again) for this process; `say` is not affected."""
+    global _quiet
+    _quiet = quiet
+
+
+def say(line: str) -> None:
+    """A line of normal output, on standard output."""
+    print(line, flush=True)
+
+
+@contextmanager
+def progress(total: int | None, description: str) -> Generator[Progress]:
+    """Show the progress of `total` steps (None where nobody knows) while the `with` lasts."""
+    if _quiet:
+        yield _Silent()
+    elif sys.stderr.isatty():
+        with _bar(total, description) as bar:
+            yield bar
+    else:
+        lines = _Lines(total, description)
+        try:
+            yield lines
+        finally:
+            lines.finish()
+
+
+class _Silent:
+    def advance(self, n: int = 1, **fields: object) -> None:
+        pass
+
+
+class _Lines:
+    """Lines at most every `INTERVAL`, and one at the end: `record: 12/50 (3.4/s, success 0.92)`."""
+
+    def __init__(self, total: int | None, description: str):
+        self._total, self._description = total, description
+        self._done = 0
+        self._fields: dict[str, object] = {}
+        self._start = self._printed = time.monotonic()
+        self._fresh = True  # something to say since the last line
+
+    def advance(self, n: int = 1, **fields: object) -> None:
+        self._done += n
+        self._fields |= fields
+        self._fresh = True
+        now = time.monotonic()
+        if now - self._printed >= INTERVAL:
+            self._print(now)
+
+    def finish(self) -> None:
+        if self._fresh:
+            self._print(time.monotonic())
+
+    def _print(self, now: float) -> None:
+        self._printed, self._fresh = now, False
+        count = f"{self._done}/{self._total}" if self._total is not None else f"{self._done}"
+        rate = self._done / max(now - self._start, 1e-9)
+        details = ", ".join(filter(None, [f"{rate:.3g}/s", _fields_text(self._fields)]))
+        print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
+
+
+class _Bar:
+    def __init__(self, bar: Any, task: Any):
+        self._bar, self._task = bar, task
+        self._fields: dict[str, object] = {}
+
+    def advance(self, n: int = 1, **fields: object) -> None:
+        self._fields |= fields
+        self._bar.update(self._task, advance=n, details=_fields_text(self._fields))
+
+
+@contextmanager
+def _bar(total: int | None, description: str) -> Generator[_Bar]:
+    # Imported here: `manip-il --help` needs none of it.
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(),
+        rich_progress.MofNCompleteColumn(),
+        rich_progress.TimeRemainingColumn(),
+        rich_progress.TextColumn("{task.fields[details]}", markup=False),
+    )
+    # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
+    with rich_progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
+        yield _Bar(bar, bar.add_task(description, total=total, details=""))
+
+
+def _fields_text(fields: dict[str, object]) -> str:
+    return ", ".join(
+        f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in fields.items()
+    )

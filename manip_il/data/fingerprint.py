@@ -1,0 +1,86 @@
+"""What an environment was made of: versions and hashes, compared whenever two sides meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from enum import Enum
+from importlib import metadata
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+
+from manip_il.errors import ManipError
+
+_PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
+_MEANING = {
+    "model_sha256": "compiled MuJoCo model",
+    "config_sha256": "config",
+}
+
+
+def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
+    """Versions of what computes, and SHA-256 of the compiled model and of the config's canonical JSON.
+
+    Nothing is imported for it: a missing package is `absent`. Raises `ManipError` for a config that JSON cannot hold.
+    """
+    versions = {name: _version(name) for name in _PACKAGES}
+    return {
+        "python": platform.python_version(),
+        **versions,
+        "model_sha256": hashlib.sha256(model_bytes).hexdigest(),
+        "config_sha256": hashlib.sha256(canonical_json(config).encode()).hexdigest(),
+    }
+
+
+def compare_fingerprints(
+    left_name: str, left: Mapping[str, Any], right_name: str, right: Mapping[str, Any]
+) -> list[str]:
+    """One warning, naming both sides, for every entry that differs; an empty list where nothing does."""
+    warnings: list[str] = []
+    for key in [*left, *(key for key in right if key not in left)]:
+        left_value, right_value = left.get(key, "nothing"), right.get(key, "nothing")
+        if left_value != right_value:
+            what = _MEANING.get(key, key)
+            sides = (f"{left_name} has {_short(left_value)}", f"{right_name} has {_short(right_value)}")
+            warnings.append(f"{what} differs: {', '.join(sides)}")
+    return warnings
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
+
+    Takes dataclasses, enums, paths and numpy numbers and arrays as well. Raises `ManipError` for anything else.
+    """
+    try:
+        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=_plain)
+    except (TypeError, ValueError) as error:
+        raise ManipError(f"config cannot be written as JSON: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, PurePath):
+        return value.as_posix()
+    raise TypeError(f"{value!r} of type {type(value).__name__}")
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "absent"
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return f"{text[:12]}..." if len(text) == hashlib.sha256().digest_size * 2 else text

@@ -1,0 +1,135 @@
+"""Where a LeRobot v3.0 dataset keeps what, and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
+
+Restated here, and held against the library by the tests, because importing `lerobot.datasets` imports torch (seconds).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from manip_il.data.schema import RobotTaskSpec, features
+
+VERSION = "v3.0"
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+OURS = "meta/manip_il.json"  # spec, fingerprint, provenance: LeRobot leaves files alone that it does not know
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA_FILES = "data/*/*.parquet"
+CHUNKS_SIZE = 1000  # files in one chunk folder
+DATA_FILES_SIZE_IN_MB = 100
+VIDEO_FILES_SIZE_IN_MB = 200
+
+TIMESTAMP = "timestamp"
+FRAME_INDEX = "frame_index"
+EPISODE_INDEX = "episode_index"
+INDEX = "index"
+TASK_INDEX = "task_index"
+
+_INDEX_DTYPES = {
+    TIMESTAMP: "float32",
+    FRAME_INDEX: "int64",
+    EPISODE_INDEX: "int64",
+    INDEX: "int64",
+    TASK_INDEX: "int64",
+}
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
+
+
+def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
+    """Our features and LeRobot's own five, in the order of the columns."""
+    own = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}
+    return {**features(spec), **own}
+
+
+def info_json(spec: RobotTaskSpec, episodes: int, frames: int, file_size: float) -> dict[str, Any]:
+    """Content of `meta/info.json`, keys in LeRobot's order."""
+    table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in all_features(spec).items()}
+    return {
+        "codebase_version": VERSION,
+        "fps": spec.fps,
+        "features": table,
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": CHUNKS_SIZE,
+        "data_files_size_in_mb": file_size,
+        "video_files_size_in_mb": VIDEO_FILES_SIZE_IN_MB,
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "robot_type": spec.robot,
+        "splits": {"train": f"0:{episodes}"},
+    }
+
+
+def data_schema(spec: RobotTaskSpec) -> pa.Schema:
+    """Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
+
+    Its metadata holds the Hugging Face features that `datasets` reads.
+    """
+    fields: list[pa.Field] = []
+    hugging_face: dict[str, Any] = {}
+    for key, feature in all_features(spec).items():
+        value = {"dtype": feature["dtype"], "_type": "Value"}
+        dtype = _arrow_type(feature["dtype"])
+        size: int = feature["shape"][0]
+        if feature["shape"] != (1,):
+            dtype = pa.list_(dtype, size)
+            value = {"feature": value, "length": size, "_type": "List"}
+        fields.append(pa.field(key, dtype))
+        hugging_face[key] = value
+    metadata = {"huggingface": json.dumps({"info": {"features": hugging_face}})}
+    return pa.schema(fields, metadata=metadata)
+
+
+def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
+    """Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
+    stats = [
+        pa.field(f"stats/{key}/{name}", pa.list_(pa.int64() if name == "count" else pa.float64()))
+        for key in all_features(spec)
+        for name in STAT_NAMES
+    ]
+    whole = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
+    return pa.schema(
+        [
+            pa.field(EPISODE_INDEX, pa.int64()),
+            pa.field("tasks", pa.list_(pa.string())),
+            *(pa.field(name, pa.int64()) for name in whole),
+            *stats,
+            pa.field("meta/episodes/chunk_index", pa.int64()),
+            pa.field("meta/episodes/file_index", pa.int64()),
+        ]
+    )
+
+
+def tasks_table(instruction: str) -> pa.Table:
+    """The one task, as pandas would write it with `task` for its index: LeRobot looks tasks up by that index."""
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
+        for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.3.3"}
+    table = pa.table({TASK_INDEX: pa.array([0], pa.int64()), "task": pa.array([instruction])})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def numbered(template: str, number: int) -> tuple[str, int, int]:
+    """Path, chunk and file index of the `number`-th file."""
+    chunk, file = divmod(number, CHUNKS_SIZE)
+    return template.format(chunk_index=chunk, file_index=file), chunk, file
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write `data` laid out as LeRobot does."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def _arrow_type(dtype: str) -> pa.DataType:
+    return {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}[dtype]

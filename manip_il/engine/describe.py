@@ -1,0 +1,40 @@
+"""What an environment is, in the words of datasets and checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+from manip_il.data.fingerprint import environment_fingerprint
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.observe import environment_state_names
+from manip_il.sim.scene import build_scene
+
+_STATE_EXTRAS = 6  # goal, step, streak, ever: what State.to_vector adds to the physics state
+
+
+@cache
+def env_spec(config: EnvConfig) -> RobotTaskSpec:
+    """Names, sizes and rate that a dataset or policy for this environment must share."""
+    scene = build_scene(config.robot, config.task)
+    return RobotTaskSpec(
+        robot=config.robot,
+        task=config.task,
+        fps=config.control_hz,
+        joint_names=scene.robot.joint_names,
+        environment_state_names=environment_state_names(scene.task),
+        sim_state_size=scene.state_size + _STATE_EXTRAS,
+        instruction=scene.task.instruction,
+    )
+
+
+def env_fingerprint(config: EnvConfig) -> dict[str, Any]:
+    """Versions, and hashes of the compiled model and of the environment's settings."""
+    return dict(_fingerprint(config))
+
+
+@cache
+def _fingerprint(config: EnvConfig) -> dict[str, str]:
+    return environment_fingerprint(build_scene(config.robot, config.task).model_bytes(), asdict(config))

@@ -1,0 +1,80 @@
+"""Who drives a rollout: the expert, a learner, a mixture of both, or chance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError
+from manip_il.mdp import Actor
+from manip_il.rollout import Turn
+from manip_il.seeding import rng_for
+
+F64 = NDArray[np.float64]
+
+
+class Policy(Protocol):
+    """A learner: (B, n) joint states and (B, k) environment states to (B, n) absolute actions."""
+
+    def act(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> F64: ...
+
+
+class ExpertDriver:
+    """Executes the expert's label."""
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        return [(_expert_action(turn), Actor.EXPERT) for turn in turns]
+
+
+class LearnerDriver:
+    """Executes the learner's action, one batched call a step."""
+
+    def __init__(self, policy: Policy):
+        self._policy = policy
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        states = np.stack([turn.observation.state for turn in turns])
+        environment_states = np.stack([turn.observation.environment_state for turn in turns])
+        actions = self._policy.act(states, environment_states)
+        return [(action, Actor.LEARNER) for action in actions]
+
+
+class MixtureDriver:
+    """pi_i = beta_i pi* + (1 - beta_i) pi_hat: each step is the expert's with probability beta (Ross et al. 2011)."""
+
+    def __init__(self, policy: Policy, beta: float):
+        self._learner, self._beta = LearnerDriver(policy), beta
+        self._rngs: dict[int, np.random.Generator] = {}
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        chosen = self._learner.act(turns)
+        for i, turn in enumerate(turns):
+            rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "mixture"))
+            if rng.uniform() < self._beta:
+                chosen[i] = (_expert_action(turn), Actor.EXPERT)
+        return chosen
+
+
+class RandomDriver:
+    """Joint targets drawn evenly within `reach` [rad] of the measured joints, any gripper opening."""
+
+    def __init__(self, reach: float, max_opening: float):
+        self._reach, self._max_opening = reach, max_opening
+        self._rngs: dict[int, np.random.Generator] = {}
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        return [(self._draw(turn), Actor.LEARNER) for turn in turns]
+
+    def _draw(self, turn: Turn) -> F64:
+        rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "random policy"))
+        q = turn.observation.state[:-1].astype(np.float64)
+        return np.append(q + rng.uniform(-self._reach, self._reach, len(q)), rng.uniform(0, self._max_opening))
+
+
+def _expert_action(turn: Turn) -> F64:
+    if turn.label is None:
+        raise ManipError(f"episode {turn.seed}: the expert was to drive at step {turn.step} but was not asked")
+    return turn.label.action

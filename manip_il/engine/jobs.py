@@ -1,0 +1,86 @@
+"""One rollout job: all that a worker must know to turn seeds into episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Literal, cast
+
+from manip_il.data.episodes import group_episodes
+from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
+from manip_il.errors import UsageError
+from manip_il.expert.expert import Expert
+from manip_il.mdp import Episode
+from manip_il.rollout import Driver, Environment, Intruder, Rules, rollout
+from manip_il.sim.disturb import Disturbance, Disturber
+from manip_il.sim.env import EnvConfig, ManipEnv
+
+LOCKSTEP = 25  # environments that share one call of the policy
+
+
+@dataclass(frozen=True)
+class RolloutJob:
+    """Who drives in which environment, for how long, and what is kept.
+
+    policy: a checkpoint's `pretrained_model` folder, needed where a learner drives. beta: the share of steps
+    that the expert drives (`mixture`). hold: end an episode this many steps after success; None: at the horizon.
+    """
+
+    env: EnvConfig
+    driver: Literal["expert", "policy", "mixture", "random"]
+    policy: Path | None = None
+    beta: float = 0.0
+    hold: int | None = None
+    labels: Literal["all", "last"] = "all"
+    disturbance: Disturbance = field(default_factory=Disturbance)
+    round: int = 0
+
+    def __post_init__(self) -> None:
+        if self.driver in ("policy", "mixture") and self.policy is None:
+            raise UsageError(f"a rollout driven by {self.driver!r} needs a policy's folder")
+
+
+def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
+    """Yield one episode a seed, in the order in which they end."""
+    envs = [ManipEnv(config=job.env) for _ in range(min(LOCKSTEP, len(seeds)))]
+    if not envs:
+        return
+    rules = Rules(job.env.horizon, job.hold, "all" if job.driver in ("expert", "mixture") else job.labels)
+    transitions = rollout(
+        envs, seeds, _driver(job, envs[0]), rules, _expert(job.env.robot, job.env.task), _intrude(job.disturbance)
+    )
+    yield from group_episodes(transitions, job.round, job.beta)
+
+
+def undisturbed(job: RolloutJob) -> RolloutJob:
+    """The same job with nothing in the learner's way."""
+    return replace(job, disturbance=Disturbance())
+
+
+@cache
+def _expert(robot: str, task: str) -> Expert:
+    return Expert(ManipEnv(robot, task).scene)
+
+
+def _driver(job: RolloutJob, env: ManipEnv) -> Driver:
+    if job.driver == "expert":
+        return ExpertDriver()
+    if job.driver == "random":
+        return RandomDriver(env.scene.robot.max_joint_step, env.scene.robot.max_opening)
+    from manip_il.learn.policy import LearnedPolicy  # torch only where a learner drives
+
+    assert job.policy is not None
+    policy = LearnedPolicy.load(job.policy)
+    return LearnerDriver(policy) if job.driver == "policy" else MixtureDriver(policy, job.beta)
+
+
+def _intrude(disturbance: Disturbance):
+    if disturbance == Disturbance():
+        return None
+
+    def make(env: Environment, seed: int) -> Intruder:
+        return Disturber(cast(ManipEnv, env), disturbance, seed)
+
+    return make

@@ -1,0 +1,60 @@
+"""`report.html`: a run's whole story in one file that opens with no network and no scripts."""
+
+from __future__ import annotations
+
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+from manip_il.data.atomic import write_file
+from manip_il.evaluation import sections
+from manip_il.evaluation.report_data import (
+    CurvePoint,
+    Film,
+    LearningCurve,
+    Paths,
+    PolicyRow,
+    Report,
+    Strip,
+)
+
+__all__ = [
+    "CurvePoint",
+    "Film",
+    "LearningCurve",
+    "Paths",
+    "PolicyRow",
+    "Report",
+    "Strip",
+    "render_report",
+    "write_report",
+]
+
+# The browser itself refuses whatever would reach outside the file.
+POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'"
+
+
+def render_report(report: Report) -> str:
+    """The page as one string of HTML."""
+    body = [
+        sections.header(report),
+        sections.results(report),
+        sections.curve(report.curve) if report.curve and report.curve.points else "",
+        sections.pictures(report),
+        sections.making(report),
+    ]
+    css = files("manip_il.evaluation").joinpath("report.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
+        f"<title>{escape(report.title)}</title><style>{css}</style></head>\n"
+        f"<body><main>{''.join(body)}</main></body></html>\n"
+    )
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write the page to `path`, whole or not at all, creating its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, render_report(report).encode())

@@ -1,0 +1,209 @@
+"""What a report shows: frozen types that know nothing of HTML or of a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from manip_il.errors import ManipError
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.statistics import Proportion
+from manip_il.mdp import F64, require_finite
+
+Kind = Literal["expert", "dagger", "cloning", "baseline"]
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class PolicyRow:
+    """One policy's line in the table. `labels`: expert labels it learnt from, None where it learnt from none.
+
+    success: at some time; success_at_end: at the last frame; mean_steps: [control steps];
+    disturbed: success under the disturbance, where measured. kind: decides the colour.
+    """
+
+    name: str
+    success: Proportion
+    labels: int | None = None
+    success_at_end: Proportion | None = None
+    mean_steps: float | None = None
+    disturbed: Proportion | None = None
+    kind: Kind = "dagger"
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        result: EvalResult,
+        labels: int | None = None,
+        disturbed: EvalResult | None = None,
+        kind: Kind = "dagger",
+    ) -> PolicyRow:
+        """A row from one evaluation, and a second one under a disturbance where there is one."""
+        return cls(
+            name=name,
+            success=result.success,
+            labels=labels,
+            success_at_end=result.success_at_end,
+            mean_steps=result.mean_steps,
+            disturbed=disturbed.success if disturbed else None,
+            kind=kind,
+        )
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Validation success of one policy that learnt from `labels` expert labels; `name` such as `round 3`."""
+
+    labels: int
+    success: Proportion
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.labels < 0:
+            raise ManipError(f"a learning curve's point has {self.labels} labels; expected 0 or more")
+
+
+@dataclass(frozen=True)
+class LearningCurve:
+    """Validation success over expert labels: DAgger's rounds in order, cloning at labels of its own.
+
+    log_x: None chooses a logarithmic axis where labels span a factor of 20 or more.
+    """
+
+    dagger: tuple[CurvePoint, ...]
+    cloning: tuple[CurvePoint, ...] = ()
+    expert: Proportion | None = None
+    log_x: bool | None = None
+
+    @property
+    def points(self) -> tuple[CurvePoint, ...]:
+        """All points of both."""
+        return (*self.dagger, *self.cloning)
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One episode of one policy as pictures: (time [s], PNG bytes) in order."""
+
+    policy: str
+    frames: tuple[tuple[float, bytes], ...]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        for seconds, picture in self.frames:
+            if not picture.startswith(PNG_MAGIC):
+                raise ManipError(
+                    f"picture strip of {self.policy}: the frame at {seconds:.2f} s is no PNG (starts {picture[:8]!r})"
+                )
+
+
+@dataclass(frozen=True)
+class Film:
+    """One episode, or several in a row, of one policy as an MP4 (H.264)."""
+
+    policy: str
+    mp4: bytes
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        if self.mp4[4:8] != b"ftyp":
+            raise ManipError(f"film of {self.policy}: no MP4 (starts {self.mp4[:8]!r})")
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Where hand and object went in one episode: the picture that needs no renderer.
+
+    hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m]; dt: between rows [s].
+    """
+
+    policy: str
+    hand: F64
+    obj: F64
+    goal: F64
+    dt: float = 0.0
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        shapes = {"hand": np.shape(self.hand), "obj": np.shape(self.obj), "goal": np.shape(self.goal)}
+        steps = shapes["hand"][0] if shapes["hand"] else 0
+        if shapes != {"hand": (steps, 3), "obj": (steps, 3), "goal": (3,)} or steps == 0:
+            raise ManipError(f"paths of {self.policy}: shapes {shapes}; expected hand and obj (T, 3), goal (3,)")
+        for name in shapes:
+            require_finite(f"paths of {self.policy}, {name}", np.asarray(getattr(self, name)))
+
+
+@dataclass(frozen=True)
+class Report:
+    """One run's whole story. Empty parts are left out of the page.
+
+    verdict: the first sentence, in plain words with its numbers. command: what made this run.
+    facts: further sentences under the verdict, such as paired comparisons. rows: the table.
+    disturbance: what the disturbed column means, in words. pictures_note: one line that says why
+    there are paths and no pictures. timings: what -> [s]. config, fingerprint: nested mappings.
+    """
+
+    title: str
+    verdict: str
+    command: str
+    rows: tuple[PolicyRow, ...]
+    facts: tuple[str, ...] = ()
+    curve: LearningCurve | None = None
+    films: tuple[Film, ...] = ()
+    strips: tuple[Strip, ...] = ()
+    paths: tuple[Paths, ...] = ()
+    pictures_note: str = ""
+    disturbance: str = ""
+    config: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    timings: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    def __post_init__(self) -> None:
+        if not self.rows:
+            raise ManipError(f"report {self.title!r} has no policy to show")
+        for what in ("title", "verdict", "command"):
+            if not getattr(self, what).strip():
+                raise ManipError(f"report {self.title!r}: {what} is empty")
+
+
+def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """A nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
+    flat: dict[str, str] = {}
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{name}.")
+        else:
+            flat[name] = _plain(value)
+    return flat
+
+
+def format_seconds(seconds: float) -> str:
+    """`4.2 s`, `3 min 20 s`, `1 h 05 min`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_percent(rate: float) -> str:
+    """`98.7 %`."""
+    return f"{100 * rate:.1f} %"
+
+
+def _plain(value: object) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value) or "(empty)"
+    if isinstance(value, Mapping):
+        return "(empty)"
+    return str(value)

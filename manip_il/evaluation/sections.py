@@ -1,0 +1,228 @@
+"""The parts of `report.html`, one function each: data in, HTML out. Everything from outside is escaped."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Iterable, Mapping
+from html import escape
+
+from manip_il.evaluation.charts import curve_axes, learning_curve, success_bar
+from manip_il.evaluation.path_charts import side_view, top_view
+from manip_il.evaluation.report_data import (
+    CurvePoint,
+    Film,
+    LearningCurve,
+    Paths,
+    PolicyRow,
+    Report,
+    Strip,
+    flatten,
+    format_percent,
+    format_seconds,
+)
+from manip_il.evaluation.statistics import Proportion
+
+NOT_MEASURED = '<span class="none" aria-label="not measured">&ndash;</span>'
+
+
+def header(report: Report) -> str:
+    """The verdict comes first; then what else can be said in a sentence."""
+    facts = "".join(f"<li>{_prose(fact)}</li>" for fact in report.facts)
+    return (
+        f'<header><p class="kicker">{escape(report.title)}</p><h1>{_prose(report.verdict)}</h1>'
+        f"{f'<ul class="facts">{facts}</ul>' if facts else ''}</header>"
+    )
+
+
+def results(report: Report) -> str:
+    """The table, and under it the same success as bars."""
+    return _section("Results", _table(report), _bars(report.rows), _how_measured(report))
+
+
+def curve(data: LearningCurve) -> str:
+    """The learning curve with its legend, and its numbers for those who cannot see it."""
+    legend = [
+        ("dagger", "DAgger, one point a round", bool(data.dagger)),
+        ("cloning", "behaviour cloning", bool(data.cloning)),
+        ("expert", f"expert, {data.expert and format_percent(data.expert.rate)}", data.expert is not None),
+    ]
+    keys = "".join(f'<li><i class="key {kind}"></i>{escape(words)}</li>' for kind, words, shown in legend if shown)
+    x, y = curve_axes(data)
+    across = "expert labels, logarithmic" if x.log else "expert labels"
+    cut = f" The axis starts at {y.low:.0f}\u00a0%." if y.low > 0 else ""
+    return _section(
+        "What the labels bought",
+        f'<p class="note">Validation success over expert labels used; bars are {_confidence(data)} intervals.{cut}</p>',
+        f'<ul class="legend">{keys}</ul>',
+        f'<div class="plot">{learning_curve(data)}<p class="x-title">{across}</p></div>',
+        _details("The curve in numbers", _curve_table(data)),
+    )
+
+
+def pictures(report: Report) -> str:
+    """Films, picture strips, or where there are none, paths; by policy in the order of the table."""
+    parts = [
+        *map(_film, report.films),
+        *map(_strip, report.strips),
+        *map(_paths, report.paths),
+    ]
+    if not parts and not report.pictures_note:
+        return ""
+    note = f'<p class="note">{_prose(report.pictures_note)}</p>' if report.pictures_note else ""
+    kind = "films" if report.films and not (report.strips or report.paths) else "stacked"
+    return _section("How it looks", note, f'<div class="{kind}">{"".join(parts)}</div>')
+
+
+def making(report: Report) -> str:
+    """The command, and folded away: timings, configuration and fingerprint."""
+    # Word by word, so that a narrow page breaks lines between options and not inside them.
+    words = " ".join(f"<span>{escape(word)}</span>" for word in report.command.split(" "))
+    timings = {what: format_seconds(seconds) for what, seconds in report.timings.items()}
+    return _section(
+        "How it was made",
+        f'<pre class="command"><code>{words}</code></pre>',
+        _folded("Time taken", timings),
+        _folded("Configuration", flatten(report.config)),
+        _folded("Fingerprint", flatten(report.fingerprint)),
+    )
+
+
+def _table(report: Report) -> str:
+    confidence = f"{100 * report.rows[0].success.confidence:g} %"
+    columns: list[tuple[str, list[str]]] = [
+        ("Expert labels", [NOT_MEASURED if r.labels is None else f"{r.labels:,}" for r in report.rows]),
+        (f"Success [{confidence} interval]", [_proportion(r.success) for r in report.rows]),
+        ("Success at end", [_proportion(r.success_at_end) for r in report.rows]),
+        ("Mean steps", [NOT_MEASURED if r.mean_steps is None else f"{r.mean_steps:.1f}" for r in report.rows]),
+        ("Success, disturbed", [_proportion(r.disturbed) for r in report.rows]),
+    ]
+    columns = [column for column in columns if any(cell != NOT_MEASURED for cell in column[1])]
+    head = "".join(f'<th scope="col" role="columnheader">{escape(name)}</th>' for name in ["Policy", *dict(columns)])
+    body = "".join(
+        f'<tr role="row"><th scope="row" role="rowheader"><i class="key {row.kind}"></i>{escape(row.name)}</th>'
+        + "".join(f'<td role="cell" data-label="{escape(name)}">{cells[i]}</td>' for name, cells in columns)
+        + "</tr>"
+        for i, row in enumerate(report.rows)
+    )
+    # Roles are spelt out because a narrow page shows rows as cards, which would undo the table's own.
+    return (
+        f'<table class="results" role="table"><thead role="rowgroup"><tr role="row">{head}</tr></thead>'
+        f'<tbody role="rowgroup">{body}</tbody></table>'
+    )
+
+
+def _bars(rows: Iterable[PolicyRow]) -> str:
+    lines = "".join(
+        f'<div class="bar-line"><span class="bar-name">{escape(row.name)}</span>{success_bar(row)}'
+        f'<span class="bar-rate">{format_percent(row.success.rate)}</span></div>'
+        for row in rows
+    )
+    scale = "".join(f"<span>{tick} %</span>" for tick in (0, 25, 50, 75, 100))
+    below = f'<div class="bar-line scale-line"><span></span><div>{scale}</div><span></span></div>'
+    return f'<div class="bars">{lines}{below}</div>'
+
+
+def _how_measured(report: Report) -> str:
+    sizes = sorted({row.success.n for row in report.rows})
+    episodes = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
+    parts = [f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."]
+    if report.disturbance:
+        parts.append(f"Disturbed: {report.disturbance}.")
+    return f'<p class="note">{_prose(" ".join(parts))}</p>'
+
+
+def _curve_table(data: LearningCurve) -> str:
+    rows = [(kind, point) for kind, points in (("DAgger", data.dagger), ("cloning", data.cloning)) for point in points]
+    return _pairs({_point_name(kind, point): str(point.success) for kind, point in rows})
+
+
+def _point_name(kind: str, point: CurvePoint) -> str:
+    return f"{kind}, {point.name + ', ' if point.name else ''}{point.labels:,} labels"
+
+
+def _confidence(data: LearningCurve) -> str:
+    return f"{100 * data.points[0].success.confidence:g} %"
+
+
+def _film(film: Film) -> str:
+    return _figure(
+        film.policy,
+        f'<video controls muted loop playsinline aria-label="{escape(film.policy)}" '
+        f'src="data:video/mp4;base64,{_base64(film.mp4)}"></video>',
+        film.caption,
+    )
+
+
+def _strip(strip: Strip) -> str:
+    frames = "".join(
+        f'<div class="frame"><img alt="{escape(strip.policy)} at {seconds:.1f} s" '
+        f'src="data:image/png;base64,{_base64(png)}"><span>{seconds:.1f} s</span></div>'
+        for seconds, png in strip.frames
+    )
+    return _figure(
+        strip.policy, f'<div class="strip" style="--n:{_columns(len(strip.frames))}">{frames}</div>', strip.caption
+    )
+
+
+def _paths(paths: Paths) -> str:
+    keys = (
+        '<ul class="legend"><li><i class="key hand"></i>hand</li><li><i class="key object"></i>object</li>'
+        '<li><i class="key goal"></i>goal</li><li>open circle: start, full: end</li></ul>'
+    )
+    lasted = f"{paths.dt * (len(paths.hand) - 1):.1f} s" if paths.dt else ""
+    views = "".join(
+        f'<div class="view"><span>seen {seen}</span>{drawing}</div>'
+        for seen, drawing in (("from above", top_view(paths)), ("from the side", side_view(paths)))
+    )
+    caption = ", ".join(part for part in (paths.caption, lasted) if part)
+    return _figure(paths.policy, f'<div class="views">{views}</div>{keys}', caption)
+
+
+def _figure(name: str, content: str, caption: str) -> str:
+    words = f"<b>{escape(name)}</b>{f' · {escape(caption)}' if caption else ''}"
+    return f"<figure><figcaption>{words}</figcaption>{content}</figure>"
+
+
+def _columns(frames: int) -> int:
+    """Columns that leave no orphan in the last row, at most 8."""
+    rows = math.ceil(frames / 8) or 1
+    return math.ceil(frames / rows) or 1
+
+
+def _proportion(proportion: Proportion | None) -> str:
+    if proportion is None:
+        return NOT_MEASURED
+    low, high = proportion.interval
+    return (
+        f'<span class="rate">{format_percent(proportion.rate)}</span> '
+        f'<span class="interval">[{100 * low:.1f}, {100 * high:.1f}]</span>'
+    )
+
+
+def _folded(name: str, pairs: Mapping[str, str]) -> str:
+    return _details(name, _pairs(pairs)) if pairs else ""
+
+
+def _details(name: str, content: str) -> str:
+    return f"<details><summary>{escape(name)}</summary>{content}</details>"
+
+
+def _pairs(pairs: Mapping[str, str]) -> str:
+    rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in pairs.items())
+    return f'<dl class="pairs">{rows}</dl>'
+
+
+def _section(name: str, *parts: str) -> str:
+    return f"<section><h2>{escape(name)}</h2>{''.join(parts)}</section>"
+
+
+def _prose(sentence: str) -> str:
+    # A number keeps its unit, and a comparison its sign, on one line.
+    joined = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", sentence)
+    return escape(joined, quote=False)
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")

@@ -1,0 +1,172 @@
+"""Checkpoints in LeRobot's layout, with what a policy was trained for beside the weights.
+
+    OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors
+                                                  policy_preprocessor.json policy_postprocessor.json manip_il.json
+                             /training_state/     optimizer_*.safetensors|json, training_step.json
+    OUTPUT/checkpoints/last -> 004000
+
+A checkpoint is written under a temporary name and `last` is switched over in one rename, so a kill
+leaves the one before.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError
+
+# LeRobot is imported where something is written: its import takes seconds, which a worker that
+# only acts need not spend.
+if TYPE_CHECKING:
+    import torch
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+META_FILE = "manip_il.json"
+PRETRAINED_MODEL = "pretrained_model"
+TRAINING_STATE = "training_state"
+_LAST = "last"
+_STEP_FILE = "training_step.json"
+_MUST_AGREE = {
+    "robot": "robot",
+    "fps": "control rate [1/s]",
+    "joint_names": "joint names",
+    "environment_state_names": "environment state",
+    "action_meaning": "meaning of the action",
+}
+
+
+@dataclass(frozen=True)
+class CheckpointMeta:
+    """What a policy was trained for and how; `manip_il.json`."""
+
+    robot: str
+    task: str
+    fps: int
+    joint_names: tuple[str, ...]
+    environment_state_names: tuple[str, ...]
+    action_meaning: str
+    fingerprint: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, spec: RobotTaskSpec, fingerprint: Mapping[str, Any] | None = None, options: Mapping[str, Any] | None = None
+    ) -> CheckpointMeta:
+        """The meta of a policy trained on data of `spec`."""
+        return cls(
+            robot=spec.robot,
+            task=spec.task,
+            fps=spec.fps,
+            joint_names=tuple(spec.joint_names),
+            environment_state_names=tuple(spec.environment_state_names),
+            action_meaning=spec.action_meaning,
+            fingerprint=dict(fingerprint or {}),
+            options=dict(options or {}),
+        )
+
+
+def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
+    """The checkpoint's meta, or None where another tool (lerobot-train) wrote the checkpoint.
+
+    Raises `ManipError` for a file that is not ours or not whole.
+    """
+    path = Path(pretrained_model) / META_FILE
+    if not path.is_file():
+        return None
+    try:
+        values = json.loads(path.read_text())
+        for name in ("joint_names", "environment_state_names"):
+            values[name] = tuple(values[name])
+        return CheckpointMeta(**values)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
+
+
+def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
+    """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
+    for name, what in _MUST_AGREE.items():
+        ours, theirs = getattr(meta, name), getattr(spec, name)
+        if ours != theirs:
+            raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
+
+
+def save_checkpoint(
+    output_dir: Path,
+    step: int,
+    policy: PreTrainedPolicy,
+    meta: CheckpointMeta,
+    optimizer: torch.optim.Optimizer,
+    resume_key: Mapping[str, Any],
+) -> Path:
+    """Write the checkpoint of `step`, make it `last`, remove those before; return its `pretrained_model`.
+
+    resume_key: what a resumed run must share with this one (JSON values).
+    """
+    from lerobot.optim.optimizers import save_optimizer_state
+
+    checkpoints = Path(output_dir) / "checkpoints"
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    final = checkpoints / f"{step:06d}"
+    temporary = checkpoints / f".{final.name}.tmp"
+    for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
+        shutil.rmtree(stale, ignore_errors=True)
+    _write_pretrained(temporary / PRETRAINED_MODEL, policy, meta)
+    state = temporary / TRAINING_STATE
+    state.mkdir()
+    save_optimizer_state(optimizer, state)
+    _write_json(state / _STEP_FILE, {"step": step, **resume_key})
+    temporary.rename(final)
+    _point_last_at(final)
+    for other in checkpoints.iterdir():
+        if not other.is_symlink() and other.name != final.name:
+            shutil.rmtree(other, ignore_errors=True)
+    return checkpoints / _LAST / PRETRAINED_MODEL
+
+
+def last_checkpoint(output_dir: Path) -> Path | None:
+    """The folder `checkpoints/last` under `output_dir`, or None where there is none."""
+    last = Path(output_dir) / "checkpoints" / _LAST
+    return last if (last / PRETRAINED_MODEL).is_dir() else None
+
+
+def read_step(checkpoint: Path) -> dict[str, Any]:
+    """The step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
+    path = checkpoint / TRAINING_STATE / _STEP_FILE
+    if not path.is_file():
+        raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
+    return json.loads(path.read_text())
+
+
+def load_optimizer(checkpoint: Path, optimizer: torch.optim.Optimizer) -> None:
+    """Put the optimiser in the checkpoint's state."""
+    from lerobot.optim.optimizers import load_optimizer_state
+
+    load_optimizer_state(optimizer, checkpoint / TRAINING_STATE)
+
+
+def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMeta) -> None:
+    from lerobot.policies.factory import make_pre_post_processors
+
+    folder.mkdir(parents=True)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config):
+        processor.save_pretrained(folder)
+    _write_json(folder / META_FILE, asdict(meta))
+
+
+def _point_last_at(final: Path) -> None:
+    temporary = final.parent / ".last.tmp"
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(final.name)
+    os.replace(temporary, final.parent / _LAST)
+
+
+def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(values, indent=2) + "\n")

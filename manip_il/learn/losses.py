@@ -1,0 +1,199 @@
+"""Behaviour cloning as maximum likelihood: the losses, and how each acts.
+
+fit(D) = argmin over policies of the mean over D of -log pi(a* | s): empirical risk minimisation
+(imitation-learning chapter, Eqs. 8.2 to 8.4; the same reduction to supervised learning in
+Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head says what family pi(. | s) is taken
+from. The network gives `params` (B, size) for a row; targets (B, n) are in normalised units.
+
+Acting is deterministic: one action for a state.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import override
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from manip_il.errors import UnknownName
+
+LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
+
+# A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
+# floor, 2 % of a target's own standard deviation, keeps the gradients finite.
+MIN_LOG_STD = -4.0
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class Head(ABC):
+    """A family of action distributions."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Parameters a row."""
+
+    @abstractmethod
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        """Loss of each row, (B,), from params (B, size) and target (B, n)."""
+
+    @abstractmethod
+    def action(self, params: Tensor) -> Tensor:
+        """The action of each row, (B, n)."""
+
+
+@dataclass(frozen=True)
+class MSEHead(Head):
+    """Mean squared error: a Gaussian with unit variance, up to constants. Acts with its mean."""
+
+    n: int
+
+    @property
+    @override
+    def size(self) -> int:
+        return self.n
+
+    @override
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        return (params - target).square().mean(-1)
+
+    @override
+    def action(self, params: Tensor) -> Tensor:
+        return params
+
+
+@dataclass(frozen=True)
+class L1Head(MSEHead):
+    """Mean absolute error: a Laplace distribution with unit scale, up to constants. Acts with its median."""
+
+    @override
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        return (params - target).abs().mean(-1)
+
+
+@dataclass(frozen=True)
+class GaussianHead(Head):
+    """Diagonal Gaussian whose mean and log-deviation depend on the state. Acts with the mean."""
+
+    n: int
+
+    @property
+    @override
+    def size(self) -> int:
+        return 2 * self.n
+
+    @override
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        mean, raw = params.split(self.n, -1)
+        return -_normal_log_prob(target, mean, floored_log_std(raw)).sum(-1)
+
+    @override
+    def action(self, params: Tensor) -> Tensor:
+        return params[..., : self.n]
+
+
+@dataclass(frozen=True)
+class MixtureHead(Head):
+    """Mixture of `components` diagonal Gaussians (Bishop, Mixture density networks, 1994).
+
+    Acts with the mean of the heaviest component: the mixture's own mean may lie between two ways
+    round an obstacle, where no demonstration goes.
+    """
+
+    n: int
+    components: int
+
+    @property
+    @override
+    def size(self) -> int:
+        return self.components * (1 + 2 * self.n)
+
+    def split(self, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
+        k, n = self.components, self.n
+        logits, means, raw = params.split([k, k * n, k * n], -1)
+        shape = (*params.shape[:-1], k, n)
+        return logits.log_softmax(-1), means.reshape(shape), floored_log_std(raw.reshape(shape))
+
+    @override
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        log_weights, means, log_std = self.split(params)
+        log_prob = _normal_log_prob(target.unsqueeze(-2), means, log_std).sum(-1)
+        return -(log_weights + log_prob).logsumexp(-1)
+
+    @override
+    def action(self, params: Tensor) -> Tensor:
+        log_weights, means, _ = self.split(params)
+        heaviest = log_weights.argmax(-1)[..., None, None].expand(*means.shape[:-2], 1, self.n)
+        return means.gather(-2, heaviest).squeeze(-2)
+
+
+@dataclass(frozen=True)
+class CategoricalHead(Head):
+    """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
+
+    A target between two bin centres is shared out between them in proportion (two-hot, as in
+    Schrittwieser et al., MuZero, 2020, appendix F), so that the centres' expectation is the target
+    itself and not its bin's centre. Acts with the expectation over the likeliest bin and its two
+    neighbours: exact within a bin, unlike the argmax, and never between two modes, unlike the
+    expectation over all bins.
+    """
+
+    n: int
+    bins: int
+
+    @property
+    @override
+    def size(self) -> int:
+        return self.n * self.bins
+
+    @override
+    def nll(self, params: Tensor, target: Tensor) -> Tensor:
+        log_prob = self._logits(params).log_softmax(-1)
+        place = (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1))
+        lower = place.floor().clamp(max=self.bins - 2)
+        upper_share = place - lower
+        index = lower.long().unsqueeze(-1)
+        at_lower = log_prob.gather(-1, index).squeeze(-1)
+        at_upper = log_prob.gather(-1, index + 1).squeeze(-1)
+        return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
+
+    @override
+    def action(self, params: Tensor) -> Tensor:
+        logits = self._logits(params)
+        near = logits.argmax(-1, keepdim=True) + torch.arange(-1, 2, device=params.device)
+        inside = (near >= 0) & (near < self.bins)
+        near = near.clamp(0, self.bins - 1)
+        weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
+        centres = near.to(params.dtype) * (2.0 / (self.bins - 1)) - 1.0
+        return (weights * centres).sum(-1)
+
+    def _logits(self, params: Tensor) -> Tensor:
+        return params.reshape(*params.shape[:-1], self.n, self.bins)
+
+
+def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
+    """The head for a name in `LOSSES`; raises `UnknownName` for another."""
+    heads: dict[str, Head] = {
+        "mse": MSEHead(n),
+        "l1": L1Head(n),
+        "gaussian": GaussianHead(n),
+        "mixture": MixtureHead(n, components),
+        "categorical": CategoricalHead(n, bins),
+    }
+    if loss not in heads:
+        raise UnknownName("loss", loss, heads)
+    return heads[loss]
+
+
+def floored_log_std(raw: Tensor) -> Tensor:
+    """Log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
+    return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
+
+
+def _normal_log_prob(value: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+    return -0.5 * ((value - mean) * torch.exp(-log_std)).square() - log_std - _HALF_LOG_2PI

@@ -1,0 +1,100 @@
+"""The options of the `mlp` policy, in LeRobot's form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import override
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+
+from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.learn.losses import LOSSES
+from manip_il.learn.network import ACTIVATIONS, Shape
+
+
+def _identity_mapping() -> dict[str, NormalizationMode]:
+    return {kind: NormalizationMode.IDENTITY for kind in ("STATE", "ENV", "VISUAL", "ACTION")}
+
+
+@PreTrainedConfig.register_subclass("mlp")
+@dataclass
+class MLPConfig(PreTrainedConfig):
+    """A multi-layer perceptron from joint and environment state to one action.
+
+    loss: one of `manip_il.learn.losses.LOSSES`. components: of `mixture`. bins: a dimension, of
+    `categorical`. clamp: bound of the normalised inputs, in standard deviations, so that a state
+    far off the data cannot blow the outputs up.
+
+    The network needs raw inputs (its targets are relative to the measured joints), so LeRobot's
+    normaliser steps are the identity and the statistics are buffers of the model.
+
+    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size below 1.
+    """
+
+    width: int = 256
+    depth: int = 3
+    activation: str = "silu"
+    loss: str = "mse"
+    components: int = 5
+    bins: int = 101
+    clamp: float = 10.0
+
+    device: str | None = "cpu"
+    push_to_hub: bool = False  # type: ignore[assignment]
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_identity_mapping)
+
+    # Read by lerobot-train alone; `manip_il.learn.train` has its own in `TrainConfig`.
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 1e-4
+    scheduler_warmup_steps: int = 100
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.loss not in LOSSES:
+            raise UnknownName("loss", self.loss, LOSSES)
+        if self.activation not in ACTIVATIONS:
+            raise UnknownName("activation", self.activation, ACTIVATIONS)
+        for name, least in (("width", 1), ("depth", 1), ("components", 1), ("bins", 2)):
+            if getattr(self, name) < least:
+                raise UsageError(f"policy.{name} is {getattr(self, name)}; expected at least {least}")
+        if not self.clamp > 0:
+            raise UsageError(f"policy.clamp is {self.clamp}; expected more than 0")
+
+    def network_shape(self) -> Shape:
+        """The part that the network is built from."""
+        return Shape(**{field.name: getattr(self, field.name) for field in fields(Shape)})
+
+    @override
+    def validate_features(self) -> None:
+        """Raise unless `observation.state` and `action` are there with one and the same size."""
+        state, action = self.robot_state_feature, self.action_feature
+        if state is None or action is None:
+            have = ", ".join([*(self.input_features or {}), *(self.output_features or {})])
+            raise UsageError(f"the mlp policy needs observation.state and action; the features are {have}")
+        if len(state.shape) != 1 or state.shape != action.shape:
+            raise MismatchError("shape", "observation.state", state.shape, "action", action.shape)
+
+    @override
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
+
+    @override
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    @property
+    @override
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    @override
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    @override
+    def reward_delta_indices(self) -> None:
+        return None

@@ -1,0 +1,93 @@
+"""The `mlp` policy: one action from joint and environment state."""
+
+from __future__ import annotations
+
+from typing import Any, override
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
+from manip_il.learn.columns import INDEX, learning_rows, read_columns, valid_frames
+from manip_il.learn.mlp.configuration_mlp import MLPConfig
+from manip_il.learn.network import MLPNetwork
+from manip_il.learn.normalise import fit_statistics
+
+
+class MLPPolicy(PreTrainedPolicy):
+    """LeRobot's policy interface to `MLPNetwork`.
+
+    Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, to learn,
+    `action` (B, n), all raw ([rad], [m]).
+
+    dataset_meta: LeRobot's, given by `make_policy` for training; the statistics are then those of
+    its columns, and frames without a valid label are left out of the loss.
+    """
+
+    config_class = MLPConfig  # type: ignore[assignment]
+    name = "mlp"  # type: ignore[assignment]
+
+    def __init__(self, config: MLPConfig, dataset_meta: Any = None, **_: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        features = config.input_features or {}
+        self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in features]
+        config.input_features = {key: features[key] for key in self.inputs}
+        width = sum(features[key].shape[0] for key in self.inputs)
+        self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
+        self._valid_by_index: Tensor | None = None
+        if dataset_meta is not None:
+            self._learn_dataset(dataset_meta, config.loss)
+
+    @override
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
+        """Mean loss over the rows with a valid label; with `reduction="none"` each row's, 0 without one."""
+        state, action = batch[STATE], batch[ACTION]
+        relative = torch.cat([action[:, :-1] - state[:, :-1], action[:, -1:]], dim=-1)
+        losses = self.model.row_losses(self.model.encode(self._inputs(batch)), self.model.encode_targets(relative))
+        valid = self._valid(batch)
+        # `where`, as 0 * inf is NaN
+        losses = losses if valid is None else torch.where(valid, losses, torch.zeros_like(losses))
+        if reduction == "none":
+            return losses, {}
+        count = len(losses) if valid is None else valid.sum().clamp(min=1)
+        return losses.sum() / count, {}
+
+    @override
+    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """One absolute action a row, (B, n)."""
+        return self.model.act(self._inputs(batch))
+
+    @override
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """A chunk of one action a row, (B, 1, n)."""
+        return self.select_action(batch).unsqueeze(1)
+
+    @override
+    def reset(self) -> None:
+        """Do nothing: the policy has no memory."""
+
+    @override
+    def get_optim_params(self) -> Any:
+        return self.parameters()
+
+    def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
+        return torch.cat([batch[key] for key in self.inputs], dim=-1)
+
+    def _valid(self, batch: dict[str, Tensor]) -> Tensor | None:
+        if LABEL_VALID in batch:
+            return batch[LABEL_VALID].reshape(-1) != 0
+        # LeRobot's preprocessor drops columns that it does not know; `index` is one that it keeps.
+        if self._valid_by_index is not None and batch.get(INDEX) is not None:
+            index = batch[INDEX].reshape(-1)
+            return self._valid_by_index.to(index.device)[index]
+        return None
+
+    def _learn_dataset(self, dataset_meta: Any, loss: str) -> None:
+        columns = read_columns(dataset_meta.root)
+        rows = learning_rows(columns)
+        self.model.set_statistics(fit_statistics(rows.inputs, rows.targets, loss))
+        valid = torch.zeros(int(columns[INDEX].max()) + 1, dtype=torch.bool)
+        valid[torch.from_numpy(columns[INDEX])] = torch.from_numpy(valid_frames(columns))
+        self._valid_by_index = valid

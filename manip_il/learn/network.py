@@ -1,0 +1,96 @@
+"""The `mlp` policy's network, in torch alone.
+
+Apart from LeRobot's interface to it (`manip_il.learn.mlp`), so that a worker that only acts need
+not spend seconds on importing LeRobot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from manip_il.learn.losses import make_head
+from manip_il.learn.normalise import Statistics, identity_statistics, scale_targets
+
+# The order of the sums in a matrix product changes with the number of rows. Acting always
+# multiplies this many, filled up with zeros.
+ROWS = 64
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
+ACTIVATIONS = tuple(_ACTIVATIONS)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a network is built from; the names are those of `MLPConfig`, which says what they mean."""
+
+    width: int
+    depth: int
+    activation: str
+    loss: str
+    components: int
+    bins: int
+    clamp: float
+
+
+class MLPNetwork(nn.Module):
+    """Perceptron, head and units. Inputs (B, n + k) are raw, the first n the measured joints.
+
+    Its targets are relative to the measured joints, but for the gripper's, the last, which is
+    absolute. A row's action does not depend on the rows beside it, bit for bit.
+    """
+
+    input_mean: Tensor
+    input_scale: Tensor
+    target_mean: Tensor
+    target_scale: Tensor
+    target_low: Tensor
+    target_high: Tensor
+
+    def __init__(self, inputs: int, n: int, shape: Shape) -> None:
+        super().__init__()
+        self.n, self.clamp = n, shape.clamp
+        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins)
+        self.layers = _perceptron(inputs, self.head.size, shape)
+        for name, tensor in identity_statistics(inputs, n).items():
+            self.register_buffer(name, tensor)
+
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Take the units of the data; they are saved with the weights."""
+        for name, tensor in statistics.items():
+            getattr(self, name).copy_(tensor)
+
+    def encode(self, inputs: Tensor) -> Tensor:
+        """The perceptron's inputs from raw ones, (B, n + k)."""
+        return ((inputs - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
+
+    def encode_targets(self, targets: Tensor) -> Tensor:
+        """The head's targets from raw relative ones, (B, n)."""
+        return scale_targets(targets, self.target_mean, self.target_scale)
+
+    def row_losses(self, x: Tensor, y: Tensor) -> Tensor:
+        """Loss of each row, (B,), from encoded inputs and targets."""
+        return self.head.nll(self.layers(x), y)
+
+    @torch.no_grad()
+    def act(self, inputs: Tensor) -> Tensor:
+        """Absolute actions, (B, n), each the same bits whatever the other rows are."""
+        rows = len(inputs)
+        padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
+        padded[:rows] = inputs
+        return torch.cat([self._act_rows(chunk) for chunk in padded.split(ROWS)])[:rows]
+
+    def _act_rows(self, inputs: Tensor) -> Tensor:
+        y = self.head.action(self.layers(self.encode(inputs)))
+        # The expert's targets never left this range, so neither shall the learner's, wherever it is.
+        action = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
+        action[:, :-1] += inputs[:, : self.n - 1]
+        return action
+
+
+def _perceptron(inputs: int, outputs: int, shape: Shape) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i in range(shape.depth):
+        layers += [nn.Linear(inputs if i == 0 else shape.width, shape.width), _ACTIVATIONS[shape.activation]()]
+    return nn.Sequential(*layers, nn.Linear(shape.width, outputs))

@@ -1,0 +1,156 @@
+"""The one loop that steps environments, as a generator of transitions.
+
+Environments run in lockstep, so that a learner answers for all of them in one batch. Recording, labelling and
+evaluation are consumers of what it yields, not branches inside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.mdp import Actor, Label, Observation, State, Transition
+
+F64 = NDArray[np.float64]
+
+
+class Environment(Protocol):
+    """What the loop needs of an environment."""
+
+    @property
+    def solved(self) -> bool: ...
+    def start(self, seed: int) -> None: ...
+    def advance(self, action: F64) -> None: ...
+    def observe(self) -> Observation: ...
+    def get_state(self) -> State: ...
+
+
+class Labeller(Protocol):
+    """Answers what the expert would do."""
+
+    def label(self, state: State) -> Label: ...
+
+
+class Driver(Protocol):
+    """Chooses the executed action of every running episode."""
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]: ...
+
+
+class Intruder(Protocol):
+    """Disturbs one episode: before a step in the environment, or in the action on its way to the robot."""
+
+    def before(self, step: int) -> None: ...
+    def action(self, action: F64) -> F64: ...
+
+
+@dataclass(slots=True)
+class Turn:
+    """One running episode at one step, as a driver sees it. `label` is None where nobody asked for it."""
+
+    seed: int
+    step: int
+    observation: Observation
+    label: Label | None
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How long an episode runs and when the expert is asked.
+
+    horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
+    labels: in every state, in the last one only, or never.
+    """
+
+    horizon: int
+    hold: int | None = None
+    labels: Literal["all", "last", "none"] = "all"
+
+
+@dataclass(slots=True)
+class _Slot:
+    env: Environment
+    seed: int
+    intruder: Intruder | None
+    step: int = 0
+    held: int = 0
+    state: State = field(init=False)
+    turn: Turn = field(init=False)
+
+
+def rollout(
+    envs: Sequence[Environment],
+    seeds: Iterable[int],
+    driver: Driver,
+    rules: Rules,
+    labeller: Labeller | None = None,
+    intrude: Callable[[Environment, int], Intruder | None] | None = None,
+) -> Iterator[Transition]:
+    """Run one episode per seed, `len(envs)` at a time; yields every step's transition as it happens.
+
+    An environment whose episode ends takes the next seed. What an episode holds depends on its seed alone,
+    not on its neighbours. intrude: makes an episode's disturbances, or None for none.
+    """
+    waiting = iter(seeds)
+    running = [slot for env in envs if (slot := _next_episode(env, waiting, intrude)) is not None]
+    while running:
+        for slot in running:
+            _look(slot, rules, labeller)
+        actions = driver.act([slot.turn for slot in running])
+        still: list[_Slot] = []
+        for slot, (action, actor) in zip(running, actions, strict=True):
+            transition = _advance(slot, action, actor, rules)
+            yield transition
+            following = _next_episode(slot.env, waiting, intrude) if transition.done else slot
+            if following is not None:
+                still.append(following)
+        running = still
+
+
+def _next_episode(
+    env: Environment,
+    seeds: Iterator[int],
+    intrude: Callable[[Environment, int], Intruder | None] | None,
+) -> _Slot | None:
+    seed = next(seeds, None)
+    if seed is None:
+        return None
+    env.start(seed)
+    return _Slot(env, seed, intrude(env, seed) if intrude is not None else None)
+
+
+def _look(slot: _Slot, rules: Rules, labeller: Labeller | None) -> None:
+    if slot.intruder is not None:
+        slot.intruder.before(slot.step)
+    slot.state = slot.env.get_state()
+    last = slot.step == rules.horizon - 1
+    wanted = rules.labels == "all" or (rules.labels == "last" and last)
+    label = labeller.label(slot.state) if labeller is not None and wanted else None
+    slot.turn = Turn(slot.seed, slot.step, slot.env.observe(), label)
+
+
+def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition:
+    executed = slot.intruder.action(action) if slot.intruder is not None else action
+    if actor == Actor.EXPERT and executed is not action:
+        actor = Actor.NOISY_EXPERT
+    slot.env.advance(executed)
+    slot.step += 1
+    solved = slot.env.solved
+    slot.held += slot.held > 0 or solved
+    done = slot.step >= rules.horizon or (rules.hold is not None and slot.held > rules.hold)
+    return Transition(
+        seed=slot.seed,
+        step=slot.step - 1,
+        state=slot.state,
+        observation=slot.turn.observation,
+        label=slot.turn.label,
+        executed_action=executed,
+        actor=actor,
+        reward=float(solved),
+        success=solved,
+        done=done,
+    )

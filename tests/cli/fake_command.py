@@ -1,0 +1,55 @@
+"""A small command that does what it is told, for the tests of the command line."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from manip_il.cli.interrupt import Interrupted, StopRequest
+from manip_il.cli.progress import say
+from manip_il.errors import ManipError, UsageError
+
+
+@dataclass
+class Group:
+    root: Path | None = None
+    num_episodes: int = field(default=50, metadata={"help": "how many episodes"})
+
+
+@dataclass
+class FakeOptions:
+    """Do what the tests ask.
+
+    And say so.
+    """
+
+    example: ClassVar[str] = "manip-il fake --act=say"
+    act: Literal["say", "fail", "usage", "bug", "chatter", "stop", "interrupt", "foreign_pipe"] = "say"
+    dataset: Group = field(default_factory=Group)
+    resume: bool = False
+
+    def run(self) -> None:
+        match self.act:
+            case "say":
+                say(f"episodes {self.dataset.num_episodes}")
+            case "fail":
+                raise ManipError("the work\nfailed")
+            case "usage":
+                raise UsageError("0 episodes; expected 1 or more")
+            case "bug":
+                raise ZeroDivisionError("by\nzero")
+            case "chatter":
+                for _ in range(100_000):
+                    say("line")
+            case "stop":
+                with StopRequest() as stop:
+                    os.kill(os.getpid(), signal.SIGTERM)
+                    if stop.requested:
+                        raise Interrupted(kept="1 of 50 episodes in x")
+            case "interrupt":
+                raise KeyboardInterrupt
+            case "foreign_pipe":
+                raise BrokenPipeError(32, "a worker went away")

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
+from manip_il.cli.options import CONFIG_HEADER
+from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+
+
+@pytest.fixture
+def ours(tmp_path):
+    folder = tmp_path / "run"
+    atomic_write(folder / "config.yaml", f"{CONFIG_HEADER} 0: resolved\n")
+    return folder
+
+
+def overwrite(folder: Path) -> None:
+    prepare_output(folder, resume=False, overwrite=True)
+
+
+def test_a_new_or_empty_folder_is_fine(tmp_path):
+    prepare_output(tmp_path / "new", resume=False, overwrite=False)
+    prepare_output(tmp_path, resume=False, overwrite=False)
+    prepare_output(tmp_path / "new", resume=True, overwrite=False)
+
+
+def test_a_folder_that_holds_something_is_refused_with_the_ways_on(ours):
+    with pytest.raises(FolderExistsError, match=r"--resume=true.*--overwrite=true"):
+        prepare_output(ours, resume=False, overwrite=False)
+
+
+def test_resume_leaves_everything(ours):
+    prepare_output(ours, resume=True, overwrite=False)
+    assert (ours / "config.yaml").exists()
+
+
+def test_resume_and_overwrite_contradict(ours):
+    with pytest.raises(UsageError, match="contradict"):
+        prepare_output(ours, resume=True, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options\nseed: 0\n"),
+        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}})),
+        ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}})),
+    ],
+)
+def test_overwrite_deletes_what_this_program_made(tmp_path, name, content):
+    folder = tmp_path / "run"
+    atomic_write(folder / name, content)
+    overwrite(folder)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.yaml", "seed: 0\n"),
+        ("meta/info.json", json.dumps({"features": {"action": {}}})),
+        ("meta/info.json", "{"),
+        ("eval.json", "[]"),
+        ("thesis.tex", "years of work"),
+    ],
+)
+def test_overwrite_refuses_what_others_made(tmp_path, name, content):
+    atomic_write(tmp_path / "run" / name, content)
+    with pytest.raises(UsageError, match="did not make"):
+        overwrite(tmp_path / "run")
+    assert (tmp_path / "run" / name).read_text() == content
+
+
+def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monkeypatch, tmp_path):
+    inside = ours / "inside"
+    inside.mkdir()
+    with monkeypatch.context() as patch:
+        patch.chdir(inside)
+        with pytest.raises(UsageError, match="current folder"):
+            overwrite(ours)
+    with monkeypatch.context() as patch:
+        patch.setenv("HOME", str(inside))
+        with pytest.raises(UsageError, match="home folder"):
+            overwrite(ours)
+    with pytest.raises(UsageError, match="will not delete"):
+        overwrite(Path("/"))
+    link = tmp_path / "link"
+    link.symlink_to(ours)
+    with pytest.raises(UsageError, match="is a link"):
+        overwrite(link)
+    (inside / ".git").mkdir()
+    with pytest.raises(UsageError, match="git checkout"):
+        overwrite(ours)
+    assert (ours / "config.yaml").exists()
+
+
+def test_a_file_in_place_of_a_folder_is_refused(tmp_path):
+    atomic_write(tmp_path / "x", "")
+    with pytest.raises(UsageError, match="is a file"):
+        prepare_output(tmp_path / "x", resume=True, overwrite=False)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a" / "x.json"
+    atomic_write(path, b"old")
+
+    def full_disk(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space"):
+        atomic_write(path, "new")
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_records_come_back_in_order(tmp_path):
+    path = tmp_path / "m" / "metrics.jsonl"
+    assert read_jsonl(path) == []
+    append_jsonl(path, {"round": 0, "loss": np.float32(0.5), "path": Path("x"), "rates": np.array([1, 2])})
+    append_jsonl(path, {"round": 1})
+    assert read_jsonl(path) == [{"round": 0, "loss": 0.5, "path": "x", "rates": [1, 2]}, {"round": 1}]
+
+
+@settings(deadline=None)
+@given(cut=st.integers(min_value=0))
+def test_a_kill_at_any_byte_costs_at_most_the_last_record(tmp_path_factory, cut):
+    path = tmp_path_factory.mktemp("torn") / "metrics.jsonl"
+    records = [{"round": i, "note": "é\n"} for i in range(3)]
+    for record in records:
+        append_jsonl(path, record)
+    content = path.read_bytes()
+    kept = content[: cut % (len(content) + 1)]
+    path.write_bytes(kept)
+    before = read_jsonl(path)
+    assert before == records[: len(before)]
+    assert len(before) >= kept.count(b"\n")
+    append_jsonl(path, {"round": 9})
+    assert read_jsonl(path) == [*before, {"round": 9}]
+
+
+def test_a_damaged_line_in_the_middle_is_an_error_that_names_it(tmp_path):
+    path = tmp_path / "m.jsonl"
+    path.write_text('{"a": 1}\nrubbish\n{"a": 2}\n')
+    with pytest.raises(ManipError, match="line 2"):
+        read_jsonl(path)
+
+
+def test_nan_is_not_written(tmp_path):
+    with pytest.raises(NotFiniteError, match="not finite"):
+        append_jsonl(tmp_path / "m.jsonl", {"loss": float("nan")})
+    assert not (tmp_path / "m.jsonl").exists()

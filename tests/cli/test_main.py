@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from manip_il import __version__
+from manip_il.cli.main import COMMANDS, Command, main
+
+HERE = Path(__file__).parent
+PREPARE = f"""
+import sys
+sys.path.insert(0, {str(HERE)!r})
+from manip_il.cli.main import COMMANDS, Command, main
+COMMANDS["fake"] = Command("fake_command:FakeOptions", "do what the tests ask")
+"""
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch):
+    monkeypatch.syspath_prepend(str(HERE))
+    monkeypatch.setitem(COMMANDS, "fake", Command("fake_command:FakeOptions", "do what the tests ask"))
+
+
+def in_process(*words: str) -> subprocess.CompletedProcess[str]:
+    code = PREPARE + f"sys.exit(main({list(words)!r}))"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+def test_help_names_every_command_and_imports_nothing_heavy():
+    code = PREPARE + (
+        "codes = [main(words) for words in ([], ['--help'], ['--version'], ['recrod'], ['fake', '--help'])]\n"
+        "assert codes == [0, 0, 0, 2, 0], codes\n"
+        "heavy = {'torch', 'lerobot', 'mujoco', 'mink', 'numpy', 'draccus', 'rich', 'yaml', 'gymnasium'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(f"  {name} " in done.stdout for name in COMMANDS)
+    assert f"manip-il {__version__}\n" in done.stdout
+
+
+def test_the_module_runs_as_a_program():
+    run = [sys.executable, "-m", "manip_il.cli.main"]
+    assert subprocess.run([*run, "--help"], capture_output=True, check=False).returncode == 0
+    done = subprocess.run([*run, "recrod"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("manip-il: error: unknown command 'recrod' (did you mean 'record'?); known: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_commands_help_holds_options_defaults_and_an_example(capsys):
+    assert main(["fake", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "usage: manip-il fake [--option=value ...]" in out
+    assert "Do what the tests ask.\n\nAnd say so.\n" in out
+    assert "--dataset.num_episodes=INT" in out
+    assert "how many episodes [50]" in out
+    assert "--dataset.root=PATH" in out
+    assert "example: manip-il fake --act=say" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["fake", "--act=fail"], 1, "manip-il: error: the work failed"),
+        (["fake", "--act=usage"], 2, "manip-il: error: 0 episodes; expected 1 or more"),
+        (
+            ["fake", "--act=bug"],
+            1,
+            "manip-il: error: ZeroDivisionError: by zero; run again with --debug for the traceback",
+        ),
+        (
+            ["fake", "--act=foreign_pipe"],
+            1,
+            "manip-il: error: BrokenPipeError: [Errno 32] a worker went away; run again with --debug for the traceback",
+        ),
+        (
+            ["fake", "--act=interrupt", "--dataset.num_episodes=3"],
+            130,
+            "manip-il: interrupted; what was finished is kept; go on with: "
+            "manip-il fake --act=interrupt --dataset.num_episodes=3 --resume=true",
+        ),
+        (
+            ["--seed=1", "record"],
+            2,
+            "manip-il: error: '--seed=1' stands before a command; write manip-il COMMAND --seed=1 (see --help)",
+        ),
+    ],
+)
+def test_every_error_is_one_line_and_an_exit_code(words, code, line, capsys):
+    assert main(words) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == line + "\n"
+
+
+def test_an_unknown_option_names_the_nearest(capsys):
+    assert main(["fake", "--dataset.num_episode=1"]) == 2
+    err = capsys.readouterr().err
+    assert "unknown option '--dataset.num_episode' (did you mean '--dataset.num_episodes'?); known: --act" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["--debug", "fake", "--act=bug"], ["fake", "--act=bug", "--debug"]])
+def test_debug_shows_the_traceback(words, capsys):
+    assert main(words) == 1
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert "in run" in err
+
+
+def test_options_reach_the_command(capsys):
+    assert main(["fake", "--dataset.num_episodes=3"]) == 0
+    assert capsys.readouterr().out == "episodes 3\n"
+
+
+def test_a_stop_in_good_order_says_what_is_kept_and_how_to_go_on():
+    done = in_process("fake", "--act=stop")
+    assert done.returncode == 130
+    lines = done.stderr.strip().splitlines()
+    assert lines[0] == "stopping after the step in hand (Ctrl-C again to stop at once)"
+    assert lines[1] == (
+        "manip-il: interrupted; kept: 1 of 50 episodes in x; go on with: manip-il fake --act=stop --resume=true"
+    )
+
+
+def test_a_reader_that_goes_away_is_no_error():
+    code = PREPARE + "sys.exit(main(['fake', '--act=chatter']))"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline() == b"line\n"
+    process.stdout.close()
+    assert process.wait(timeout=30) == 141
+    assert process.stderr.read() == b""
+    process.stderr.close()
+
+
+@pytest.mark.parametrize("name", ["record", "train", "dagger", "eval", "quickstart"])
+def test_every_command_leads_to_a_dataclass_that_runs(name):
+    module, _, options_class = COMMANDS[name].target.partition(":")
+    if importlib.util.find_spec(module) is None:
+        pytest.skip(f"{module} is not there yet")
+    assert callable(getattr(importlib.import_module(module), options_class).run)

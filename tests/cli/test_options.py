@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import reduce
+from operator import getitem
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manip_il.cli.options import CONFIG_HEADER, dump_yaml, from_yaml, options_of, parse, to_plain
+from manip_il.cli.values import expected, metavar
+from manip_il.errors import UsageError
+
+
+class Device(Enum):
+    CPU = "cpu"
+    CUDA = "cuda:0"
+
+
+@dataclass
+class Dataset:
+    repo_id: str = "local/pick"
+    root: Path | None = None
+    num_episodes: int = field(default=50, metadata={"help": "how many"})
+
+    def __post_init__(self) -> None:
+        if self.num_episodes < 1:
+            raise UsageError(f"num_episodes is {self.num_episodes}; expected 1 or more")
+
+
+@dataclass
+class Options:
+    dataset: Dataset = field(default_factory=Dataset)
+    small: Dataset = field(default_factory=lambda: Dataset(num_episodes=3))
+    loss: Literal["mse", "l1"] = "mse"
+    device: Device = Device.CPU
+    cameras: list[str] = field(default_factory=list)
+    gains: list[float] = field(default_factory=lambda: [1.0])
+    lr: float = 1e-3
+    beta: float | Literal["linear"] = "linear"
+    note: str | None = None
+    resume: bool = False
+
+
+@dataclass
+class Doctor:
+    dataset: Path = field(metadata={"positional": True})
+    repair: bool = False
+
+
+def fails(words: list[str], cls: type = Options) -> str:
+    with pytest.raises(UsageError) as caught:
+        parse(cls, words)
+    return str(caught.value)
+
+
+def test_no_words_give_the_defaults():
+    assert parse(Options, []) == Options()
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    [
+        (["--dataset.num_episodes=7"], {"dataset": Dataset(num_episodes=7)}),
+        (["--dataset.num_episodes", "7"], {"dataset": Dataset(num_episodes=7)}),
+        (["--small.repo_id=a=b"], {"small": Dataset(repo_id="a=b", num_episodes=3)}),
+        (["--dataset.root=x/y"], {"dataset": Dataset(root=Path("x/y"))}),
+        (["--dataset.root=null"], {}),
+        (["--dataset.root=~/x"], {"dataset": Dataset(root=Path.home() / "x")}),
+        (["--loss", "l1"], {"loss": "l1"}),
+        (["--device=CUDA"], {"device": Device.CUDA}),
+        (["--cameras=front,wrist"], {"cameras": ["front", "wrist"]}),
+        (["--cameras=['front', 'wrist']"], {"cameras": ["front", "wrist"]}),
+        (["--cameras="], {}),
+        (["--gains=1,2.5"], {"gains": [1.0, 2.5]}),
+        (["--lr", "-1e-4"], {"lr": -1e-4}),
+        (["--beta=0.5"], {"beta": 0.5}),
+        (["--note="], {"note": ""}),
+        (["--resume"], {"resume": True}),
+        (["--resume", "--loss=l1"], {"resume": True, "loss": "l1"}),
+        (["--resume", "false"], {}),
+        (["--loss=l1", "--loss=mse"], {}),
+    ],
+)
+def test_words_change_what_they_name(words, change):
+    assert parse(Options, words) == Options(**change)
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "--dataset.root"]),
+        (["--num_epsiodes=1"], ["did you mean", "num_episodes"]),
+        (["--repo-id=x"], ["unknown option", "known: --dataset.repo_id"]),
+        (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
+        (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
+        (["--lr=nan"], ["expected a number"]),
+        (["--dataset.num_episodes=1.5"], ["--dataset.num_episodes", "a whole number", "'1.5'"]),
+        (["--dataset.num_episodes=0"], ["num_episodes is 0"]),
+        (["--loss=l2"], ["one of mse, l1", "'l2'", "did you mean 'l1'"]),
+        (["--device=GPU"], ["one of CPU, CUDA"]),
+        (["--resume=yes"], ["true or false", "'yes'"]),
+        (["--dataset.root="], ["a path or null"]),
+        (["--gains=1,x"], ["comma-separated list", "a number"]),
+        (["--cameras=front,"], ["comma-separated list"]),
+        (["--lr"], ["--lr has no value", "a number"]),
+        (["--lr", "--resume"], ["--lr has no value"]),
+        (["lr=1"], ["unexpected 'lr=1'", "--name=value"]),
+        (["--config_path=absent.yaml"], ["cannot read absent.yaml"]),
+    ],
+)
+def test_a_users_mistake_is_named_with_what_was_expected(words, parts):
+    message = fails(words)
+    assert all(part in message for part in parts), message
+
+
+def test_positional_values_are_taken_in_order():
+    assert parse(Doctor, ["data/x", "--repair"]) == Doctor(Path("data/x"), repair=True)
+    assert "DATASET is missing; expected a path" in fails([], Doctor)
+    assert "unexpected 'y'" in fails(["x", "y"], Doctor)
+    assert "unknown option" in fails(["--dataset=x"], Doctor)
+
+
+def test_words_beat_yaml_beats_defaults(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("dataset: {num_episodes: 9, root: a}\nlr: 1e-4\ncameras: [front]\nsmall:\n")
+    options = parse(Options, ["--dataset.num_episodes=8", f"--config_path={path}"])
+    assert options == Options(
+        dataset=Dataset(num_episodes=8, root=Path("a")), lr=1e-4, cameras=["front"], small=Dataset(num_episodes=3)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("dataset: {num_episode: 9}", ["dataset.num_episode", "did you mean 'dataset.num_episodes'"]),
+        ("losss: l1", ["'losss'", "did you mean 'loss'"]),
+        ("dataset: 5", ["dataset: expected a mapping"]),
+        ("resume: 1", ["resume: expected true or false, got 1"]),
+        ("dataset: {num_episodes: true}", ["expected a whole number, got True"]),
+        ("dataset: {num_episodes: 2.0}", ["expected a whole number"]),
+        ("dataset: {num_episodes: null}", ["expected a whole number, got None"]),
+        ("dataset: {repo_id: no}", ["expected text, got False", "quotes"]),
+        ("cameras: front", ["comma-separated list"]),
+        ("- 1", ["holds list", "expected a mapping"]),
+        ("a: [", ["is not YAML"]),
+        ("lr: !!python/object/apply:os.getcwd []", ["is not YAML"]),
+    ],
+)
+def test_a_mistake_in_yaml_names_file_and_key(tmp_path, text, parts):
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    message = fails([f"--config_path={path}"])
+    assert all(part in message for part in [str(path), *parts]), message
+    assert "\n" not in message
+
+
+def test_an_empty_yaml_file_changes_nothing(tmp_path):
+    path = tmp_path / "c.yaml"
+    path.write_text("# nothing\n")
+    assert from_yaml(path, Options) == Options()
+
+
+text = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+datasets = st.builds(
+    Dataset,
+    repo_id=text,
+    root=st.none() | st.lists(st.from_regex(r"[\w. -]{1,8}", fullmatch=True), min_size=1).map(lambda p: Path(*p)),
+    num_episodes=st.integers(min_value=1),
+)
+numbers = st.floats(allow_nan=False)
+any_options = st.builds(
+    Options,
+    dataset=datasets,
+    small=datasets,
+    loss=st.sampled_from(["mse", "l1"]),
+    device=st.sampled_from(Device),
+    cameras=st.lists(text),
+    gains=st.lists(numbers),
+    lr=numbers,
+    beta=numbers | st.just("linear"),
+    note=st.none() | text,
+    resume=st.booleans(),
+)
+
+
+@settings(deadline=None)
+@given(any_options)
+def test_options_survive_yaml(tmp_path_factory, options):
+    path = tmp_path_factory.mktemp("yaml") / "config.yaml"
+    path.write_text(dump_yaml(options), encoding="utf-8")
+    assert from_yaml(path, Options) == options
+
+
+def as_word(value: object) -> str:
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case list():
+            return ",".join(map(str, value))
+        case _:
+            return str(value)
+
+
+@settings(deadline=None)
+@given(any_options)
+def test_options_survive_the_command_line(options):
+    options = replace(options, cameras=[], note=None)  # a comma in an item, and the text "null", need YAML
+    plain = to_plain(options)
+    words = []
+    for option in options_of(Options):
+        value = reduce(getitem, option.name.split("."), plain)
+        words.append(f"--{option.name}={as_word(value)}")
+    assert parse(Options, words) == options
+
+
+def test_the_dump_begins_with_our_header():
+    assert dump_yaml(Options()).startswith(CONFIG_HEADER)
+
+
+def test_a_groups_own_default_shows_in_the_list_of_options():
+    defaults = {option.name: option.default for option in options_of(Options)}
+    assert defaults["dataset.num_episodes"] == 50
+    assert defaults["small.num_episodes"] == 3
+
+
+def test_types_are_named_for_people():
+    assert metavar(Path | None) == "PATH"
+    assert metavar(list[float]) == "FLOAT,..."
+    assert metavar(float | Literal["linear"]) == "FLOAT|linear"
+    assert expected(int | None) == "a whole number or null"

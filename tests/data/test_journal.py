@@ -1,0 +1,213 @@
+"""One file an episode: whole and bit for bit, or refused by name."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from manip_il.data import journal
+from manip_il.data import schema as s
+from manip_il.data.foxglove import JOINT_STATES
+from manip_il.errors import ManipError
+from manip_il.mdp import Episode
+
+MakeEpisode = Callable[..., Episode]
+FINGERPRINT = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
+HERE = Path(__file__).parent
+
+DTYPES = st.sampled_from(["<f4", "<f8", ">f8", "<f2", "i1", "u1", "<i8", "<u8", "?"])
+
+
+@st.composite
+def any_episode(draw: st.DrawFn) -> Episode:
+    length = draw(st.integers(1, 5))
+    shapes = st.sampled_from([(length,), (length, 1), (length, 3), (length, 2, 2), (length, 0)])
+    arrays = DTYPES.flatmap(
+        lambda dtype: hnp.arrays(
+            dtype, shapes, elements={"allow_nan": False, "allow_infinity": False} if "f" in dtype else None
+        )
+    )
+    names = st.sampled_from([s.ACTION, s.STATE, s.SUCCESS, "a/b", "é %s", "x.npy", s.ENVIRONMENT_STATE])
+    columns: dict[str, Any] = draw(st.dictionaries(names, arrays, min_size=1, max_size=5))
+    seed = draw(st.integers(0, 2**63 - 1))
+    return Episode(seed, columns, draw(st.booleans()), draw(st.booleans()))
+
+
+def assert_same(left: Episode, right: Episode) -> None:
+    assert (left.seed, left.success, left.success_at_end) == (right.seed, right.success, right.success_at_end)
+    assert list(left.columns) == list(right.columns)
+    for key, values in right.columns.items():
+        mine = left.columns[key]
+        assert (mine.dtype, mine.shape) == (values.dtype, values.shape)
+        assert mine.tobytes() == values.tobytes()  # bits: a minus zero is one
+
+
+@settings(deadline=None, max_examples=60)
+@given(any_episode())
+def test_any_columns_come_back_bit_for_bit(episode: Episode) -> None:
+    spec = s.RobotTaskSpec("r", "t", 30, ("a", "b", "%s"), ("ee.x", "ee.y", "ee.z"), 1, "")
+    with tempfile.TemporaryDirectory() as folder:
+        path = journal.write_episode(Path(folder), episode, spec, {})
+        assert_same(journal.read_episode(path), episode)
+
+
+def test_an_episode_comes_back_with_its_header(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+    for episode in episodes:
+        path = journal.write_episode(tmp_path / "new" / "folder", episode, spec, FINGERPRINT)
+        assert_same(journal.read_episode(path), episode)
+        header = journal.read_header(path)
+        assert header == journal.Header(
+            episode.seed, episode.success, episode.success_at_end, len(episode), spec, FINGERPRINT
+        )
+
+
+def test_files_are_listed_in_the_order_of_their_seeds(
+    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
+) -> None:
+    seeds = [110_000_000_000, 7, 3, 1_000_000]
+    paths = {seed: journal.write_episode(tmp_path, make_episode(seed, 2), spec, {}) for seed in seeds}
+    assert paths[7].name == "episode-000000000007.mcap"
+    assert journal.list_episodes(tmp_path) == [paths[seed] for seed in sorted(seeds)]
+    assert journal.list_episodes(tmp_path / "nothing") == []
+
+
+def test_the_same_episode_gives_the_same_bytes(
+    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
+) -> None:
+    first = journal.write_episode(tmp_path / "a", make_episode(3), spec, FINGERPRINT).read_bytes()
+    assert journal.write_episode(tmp_path / "b", make_episode(3), spec, FINGERPRINT).read_bytes() == first
+    assert len(list((tmp_path / "b").iterdir())) == 1
+
+
+@pytest.fixture
+def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+    return journal.write_episode(tmp_path, make_episode(17, 4), spec, FINGERPRINT)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused_by_name(path: Path, keep: float) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep)])
+    with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a whole episode"):
+        journal.read_episode(path)
+
+
+def test_a_changed_byte_anywhere_is_refused_by_name(path: Path, tmp_path: Path) -> None:
+    data = path.read_bytes()
+    changed = tmp_path / "episode-000000000018.mcap"
+    for place in [*range(0, len(data), 97), *range(len(data) - 60, len(data))]:
+        changed.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
+        with pytest.raises(ManipError, match=r"episode-000000000018\.mcap"):
+            journal.read_episode(changed)
+
+
+def test_another_mcap_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    other = tmp_path / "episode-000000000001.mcap"
+    other.write_bytes(b"something else")
+    with pytest.raises(ManipError, match="not a whole episode"):
+        journal.read_episode(other)
+    with pytest.raises(ManipError, match="no such episode file"):
+        journal.read_header(tmp_path / "episode-000000000002.mcap")
+
+
+def test_a_column_of_objects_is_refused(tmp_path: Path, spec: s.RobotTaskSpec) -> None:
+    episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
+    with pytest.raises(ManipError, match="column 'x' of dtype object"):
+        journal.write_episode(tmp_path, episode, spec, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    found: dict[str, list[tuple[int, Any]]] = {}
+    for _, channel, message in make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages():
+        found.setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
+    return found
+
+
+def test_foxglove_sees_joints_frames_and_scalars(
+    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
+) -> None:
+    episode = make_episode(8, 3)
+    turned = [0, 1, 0, -1, 0, 0]  # the hand's y axis along world y, its z axis along world -x
+    episode.columns[s.ENVIRONMENT_STATE][:, 3:9] = turned
+    episode.columns[s.ENVIRONMENT_STATE][:, 12:14] = [np.cos(0.4), np.sin(0.4)]  # a yaw of 0.1 rad
+    topics = messages(journal.write_episode(tmp_path, episode, spec, {}))
+    assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars", "/tf"]
+    assert [time for time, _ in topics["/tf"]] == [0, 50_000_000, 100_000_000]
+    _, last = topics["/joint_states"][2]
+    assert last["timestamp"] == {"sec": 0, "nsec": 100_000_000}
+    assert [joint["name"] for joint in last["joints"]] == list(spec.joint_names)
+    positions = [joint["position"] for joint in last["joints"]]
+    np.testing.assert_allclose(positions, episode.columns[s.STATE][2], atol=1e-6)
+    hand, cube = topics["/tf"][0][1]["transforms"]
+    assert (hand["parent_frame_id"], hand["child_frame_id"], cube["child_frame_id"]) == ("world", "ee", "object")
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose([hand["rotation"][axis] for axis in "wxyz"], [half, 0, -half, 0], atol=1e-6)
+    np.testing.assert_allclose(cube["rotation"]["z"], np.sin(0.05), atol=1e-6)
+    scalars = {scalar["label"]: scalar["value"] for scalar in topics["/scalars"][2][1]["scalars"]}
+    assert scalars[s.SUCCESS] == 1.0
+    assert scalars[s.EXPERT_PHASE] == episode.columns[s.EXPERT_PHASE][2]
+
+
+def test_channels_carry_foxgloves_schemas(path: Path) -> None:
+    summary = make_reader(io.BytesIO(path.read_bytes())).get_summary()
+    assert summary is not None
+    schemas = {schema.name: schema for schema in summary.schemas.values()}
+    assert sorted(schemas) == ["foxglove.FrameTransforms", "foxglove.JointStates", "lerobot.Scalars"]
+    assert json.loads(schemas["foxglove.JointStates"].data) == JOINT_STATES
+    assert {schema.encoding for schema in schemas.values()} == {"jsonschema"}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"json"}
+
+
+_RECORDER = """
+import sys
+from pathlib import Path
+import numpy as np
+from manip_il.data import journal, schema
+from manip_il.mdp import Episode
+spec = schema.RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 1, "")
+for seed in range(100_000):
+    columns = {schema.ACTION: np.full((50, 2), seed, np.float32), schema.SIM_STATE: np.full((50, 60), seed, np.float64)}
+    journal.write_episode(Path(sys.argv[1]), Episode(seed, columns, True, True), spec, {})
+    print(seed, flush=True)
+"""
+
+
+@pytest.mark.parametrize("delay", [0.001, 0.0017])
+def test_a_killed_recorder_loses_no_finished_episode(tmp_path: Path, delay: float) -> None:
+    command = [sys.executable, "-c", _RECORDER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "0\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(delay)
+        os.kill(process.pid, signal.SIGKILL)
+        told = [0, *(int(line) for line in process.stdout.read().split())]
+    found = journal.list_episodes(tmp_path)
+    assert [journal.read_episode(path).seed for path in found] == list(range(len(found)))
+    assert len(found) >= len(told)
+    journal.clean_temporary(tmp_path)
+    assert sorted(tmp_path.iterdir()) == found
+
+
+def test_leftovers_are_cleared_and_finished_files_kept(path: Path) -> None:
+    leftover = path.with_name(f".{path.name}.x1y2.partial")
+    leftover.write_bytes(b"half")
+    assert journal.list_episodes(path.parent) == [path]
+    assert journal.clean_temporary(path.parent) == [leftover]
+    assert list(path.parent.iterdir()) == [path]

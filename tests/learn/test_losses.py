@@ -1,0 +1,132 @@
+"""Each loss is the likelihood it says it is, and only the right ones can hold two ways at once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import distributions as td
+
+from manip_il.errors import UnknownName
+from manip_il.learn.losses import (
+    LOSSES,
+    MIN_LOG_STD,
+    CategoricalHead,
+    GaussianHead,
+    Head,
+    MixtureHead,
+    floored_log_std,
+    make_head,
+)
+
+N = 3
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def head_for(loss: str, n: int = N) -> Head:
+    return make_head(loss, n, components=4, bins=11)
+
+
+def fitted(head: Head, targets: torch.Tensor, steps: int = 600) -> tuple[torch.Tensor, float, float]:
+    """The best constant params for `targets` (B, n), and the loss before and after."""
+    start = torch.randn(head.size, generator=torch.Generator().manual_seed(1))
+    params = start.clone().requires_grad_()
+    optimizer = torch.optim.Adam([params], lr=0.05)
+    losses = []
+    for _ in range(steps):
+        loss = head.nll(params.expand(len(targets), -1), targets).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    return params.detach(), losses[0], losses[-1]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_fitting_reduces_the_loss_and_acts_near_a_single_target(loss, generator):
+    target = torch.tensor([0.3, -0.52, 0.71])
+    targets = target + 0.01 * torch.randn((64, N), generator=generator)
+    params, before, after = fitted(head_for(loss), targets)
+    assert after < before
+    torch.testing.assert_close(head_for(loss).action(params[None])[0], target, atol=0.02, rtol=0)
+
+
+def test_gaussian_nll_is_torchs(generator):
+    params = torch.randn((5, 2 * N), generator=generator)
+    target = torch.randn((5, N), generator=generator)
+    normal = td.Independent(td.Normal(params[:, :N], floored_log_std(params[:, N:]).exp()), 1)
+    torch.testing.assert_close(GaussianHead(N).nll(params, target), -normal.log_prob(target))
+
+
+def test_mixture_nll_is_torchs(generator):
+    head = MixtureHead(N, 4)
+    params = 3 * torch.randn((5, head.size), generator=generator)
+    target = torch.randn((5, N), generator=generator)
+    log_weights, means, log_std = head.split(params)
+    mixture = td.MixtureSameFamily(
+        td.Categorical(logits=log_weights), td.Independent(td.Normal(means, log_std.exp()), 1)
+    )
+    torch.testing.assert_close(head.nll(params, target), -mixture.log_prob(target))
+
+
+def test_mixture_of_one_is_the_gaussian(generator):
+    gaussian = torch.randn((5, 2 * N), generator=generator)
+    target = torch.randn((5, N), generator=generator)
+    mixture = torch.cat([torch.zeros(5, 1), gaussian], dim=1)
+    torch.testing.assert_close(MixtureHead(N, 1).nll(mixture, target), GaussianHead(N).nll(gaussian, target))
+
+
+def test_categorical_nll_at_a_bin_centre_is_torchs(generator):
+    head = CategoricalHead(N, 11)
+    params = torch.randn((5, head.size), generator=generator)
+    bins = torch.tensor([0, 5, 10]).expand(5, N)
+    categorical = td.Independent(td.Categorical(logits=params.reshape(5, N, 11)), 1)
+    torch.testing.assert_close(head.nll(params, bins / 5.0 - 1.0), -categorical.log_prob(bins))
+
+
+def test_categorical_between_centres_is_the_mean_of_both(generator):
+    head = CategoricalHead(1, 11)
+    params = torch.randn((1, 11), generator=generator)
+    at = [head.nll(params, torch.tensor([[x]])).item() for x in (0.2, 0.25, 0.4)]
+    assert at[1] == pytest.approx(0.75 * at[0] + 0.25 * at[2], abs=1e-5)
+
+
+def test_categorical_acts_finer_than_its_bins():
+    head = CategoricalHead(1, 11)  # 0.2 from centre to centre
+    for target in (-1.0, -0.97, 0.07, 0.13, 1.0):
+        params, *_ = fitted(head, torch.full((8, 1), target), steps=1500)
+        assert head.action(params[None]).item() == pytest.approx(target, abs=0.01)
+
+
+def test_categorical_takes_a_target_outside_its_range_as_the_edge(generator):
+    head = CategoricalHead(1, 11)
+    params = torch.randn((1, 11), generator=generator)
+    assert head.nll(params, torch.tensor([[7.0]])) == head.nll(params, torch.tensor([[1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("loss", "on_a_mode"), [("mse", False), ("gaussian", False), ("mixture", True), ("categorical", True)]
+)
+def test_two_ways_are_kept_apart_by_mixture_and_categorical_alone(loss, on_a_mode, generator):
+    signs = torch.where(torch.rand((256, 1), generator=generator) < 0.6, 1.0, -1.0)
+    targets = signs * 0.6 + 0.02 * torch.randn((256, 1), generator=generator)
+    params, *_ = fitted(head_for(loss, n=1), targets)
+    action = head_for(loss, n=1).action(params[None]).item()
+    if on_a_mode:
+        assert action == pytest.approx(0.6, abs=0.05)
+    else:
+        assert abs(action) < 0.3
+
+
+def test_log_deviation_has_a_floor():
+    raw = torch.tensor([-1e3, -10.0, 0.0, 2.0])
+    assert (floored_log_std(raw) >= MIN_LOG_STD).all()
+    torch.testing.assert_close(floored_log_std(raw)[2:], raw[2:], atol=0.02, rtol=0)
+
+
+def test_unknown_loss_names_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'mixture'"):
+        head_for("mixtur")

@@ -1,0 +1,119 @@
+"""LeRobot's own tools make, train, load and run the mlp policy."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
+
+from manip_il.data.schema import features
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.columns import read_columns
+from manip_il.learn.mlp.modeling_mlp import MLPPolicy
+from manip_il.learn.policy import LearnedPolicy
+
+LEARNING = ("observation.state", "observation.environment_state", "action", "label_valid")
+
+
+@pytest.fixture
+def dataset(table, spec, tmp_path):
+    """A LeRobot dataset of `table`'s learning columns, with a tenth of the labels invalid."""
+    from lerobot.datasets import LeRobotDataset
+
+    table["label_valid"][::10] = 0
+    columns = {key: value for key, value in features(spec).items() if key in LEARNING}
+    dataset = LeRobotDataset.create("manip/test", spec.fps, columns, root=tmp_path / "dataset", use_videos=False)
+    for row in range(60):
+        dataset.add_frame({key: table[key][row] for key in LEARNING} | {"task": spec.instruction})
+        if row % 20 == 19:
+            dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("manip/test", root=tmp_path / "dataset")
+
+
+def test_the_plugin_is_known_by_name_after_import():
+    assert type(make_policy_config("mlp")).__module__ == "manip_il.learn.mlp.configuration_mlp"
+
+
+def test_columns_come_back_from_a_lerobot_dataset_as_they_went_in(dataset, table):
+    columns = read_columns(dataset.root)
+    for key in LEARNING:
+        assert np.array_equal(columns[key].reshape(60, -1), table[key][:60])
+
+
+def test_a_dataset_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ManipError, match="no folder"):
+        read_columns(tmp_path)
+
+
+def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset, table):
+    policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
+    assert isinstance(policy, MLPPolicy)
+    valid = table["label_valid"][:60, 0] != 0
+    relative = (table["action"][:60, :-1] - table["observation.state"][:60, :-1])[valid]
+    np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
+    np.testing.assert_allclose(policy.model.target_scale[:-1], relative.std(0), rtol=1e-4)
+    assert sorted(policy.config.input_features) == ["observation.environment_state", "observation.state"]
+
+
+def test_lerobots_batches_leave_out_frames_without_a_valid_label(dataset):
+    policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
+    assert isinstance(policy, MLPPolicy)
+    before, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    batch = before(next(iter(torch.utils.data.DataLoader(dataset, batch_size=20))))
+    assert "label_valid" not in batch  # LeRobot drops it: frames are known by their index
+    each, _ = policy.forward(batch, reduction="none")
+    assert [i for i in range(20) if each[i] == 0] == [0, 10]
+    mean, _ = policy.forward(batch)
+    torch.testing.assert_close(mean, each.sum() / 18)
+
+
+def test_features_that_do_not_fit_are_refused(dataset):
+    columns = dict(dataset.meta.features)
+    columns["action"] = columns["action"] | {"shape": (3,)}
+    with pytest.raises(MismatchError, match=r"\(4,\).*\(3,\)"):
+        make_policy(make_policy_config("mlp"), ds_meta=SimpleNamespace(features=columns, root=dataset.root, stats={}))
+
+
+@pytest.mark.slow
+def test_lerobot_train_gives_a_policy_that_acts_and_resumes(dataset, table, tmp_path):
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+
+    def lerobot_train(*options: str) -> None:
+        command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *options]
+        plugin = "--policy.discover_packages_path=manip_il.learn.mlp"
+        run = subprocess.run([*command, plugin], capture_output=True, text=True, env=environment)
+        assert run.returncode == 0, run.stderr[-3000:]
+
+    lerobot_train(
+        "--policy.type=mlp", "--policy.width=64", "--policy.optimizer_lr=5e-3", "--policy.scheduler_warmup_steps=10",
+        "--dataset.repo_id=manip/test", f"--dataset.root={dataset.root}", f"--output_dir={tmp_path / 'run'}",
+        "--steps=200", "--save_freq=100", "--batch_size=32", "--num_workers=0", "--prefetch_factor=null",
+        "--persistent_workers=false", "--wandb.enable=false",
+    )  # fmt: skip
+    last = tmp_path / "run/checkpoints/last/pretrained_model"
+    policy = LearnedPolicy.load(last)
+    actions = policy.act(table["observation.state"][:60], table["observation.environment_state"][:60])
+    relative = table["action"][:60, :-1] - table["observation.state"][:60, :-1]
+    assert np.abs(actions - table["action"][:60])[:, :-1].mean() < 0.4 * np.abs(relative - relative.mean(0)).mean()
+
+    config = tmp_path / "run/checkpoints/000100/pretrained_model/train_config.json"
+    assert json.loads(config.read_text())["policy"]["type"] == "mlp"
+    lerobot_train(f"--config_path={config}", "--resume=true", "--steps=110")
+    assert (tmp_path / "run/checkpoints/000110/pretrained_model/model.safetensors").is_file()
+
+
+def test_features_of_a_checkpoint_are_lerobots(dataset):
+    policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
+    policy.save_pretrained(dataset.root / "policy")
+    config = PreTrainedConfig.from_pretrained(dataset.root / "policy")
+    assert config.input_features["observation.environment_state"].type is FeatureType.ENV
+    assert config.output_features["action"].shape == (4,)

@@ -1,0 +1,188 @@
+"""Acting: through LeRobot and past it the same; a row does not feel its company."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.factory import make_pre_post_processors
+from safetensors.torch import load_file, save_file
+
+from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.learn.losses import LOSSES
+from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.mlp.modeling_mlp import MLPPolicy
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.threads import threads
+from manip_il.learn.train import TrainConfig, fit
+
+
+@pytest.fixture
+def checkpoint(table, spec, tmp_path):
+    return make_checkpoint(table, spec, tmp_path)
+
+
+def make_checkpoint(table, spec, folder, loss="mse", width=256):
+    config = TrainConfig(steps=3, batch_size=32, policy=MLPConfig(loss=loss, width=width))
+    return fit(table, config, folder / loss, spec=spec)
+
+
+def observations(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_row_does_not_depend_on_the_others(loss, count, table, spec, tmp_path):
+    policy = MLPPolicy.from_pretrained(make_checkpoint(table, spec, tmp_path, loss))
+    inputs = torch.from_numpy(np.concatenate(observations(130), axis=1))
+    with threads(count):
+        together = policy.model.act(inputs)
+        for rows in ([0], [77], [129, 3], list(range(64)), list(range(129, 40, -1)), list(range(5, 130))):
+            assert torch.equal(policy.model.act(inputs[rows]), together[rows])
+
+
+def test_no_rows_give_no_actions(checkpoint):
+    assert LearnedPolicy.load(checkpoint).act(*observations(0)).shape == (0, 4)
+
+
+def test_acting_is_the_same_through_lerobots_processors(checkpoint):
+    states, environments = observations(7)
+    policy = MLPPolicy.from_pretrained(checkpoint)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+    for row in range(7):  # unbatched, as a robot gives them
+        batch = {
+            "observation.state": torch.from_numpy(states[row]),
+            "observation.environment_state": torch.from_numpy(environments[row]),
+        }
+        action = after(policy.select_action(before(batch)))
+        fast = LearnedPolicy.load(checkpoint).act(states[row : row + 1], environments[row : row + 1])
+        assert fast.dtype == np.float64
+        assert np.array_equal(action.numpy().astype(np.float64), fast)
+
+
+def test_a_fresh_process_acts_bit_equal(checkpoint, tmp_path):
+    states, environments = observations(9)
+    np.savez(tmp_path / "in.npz", states=states, environments=environments)
+    code = (
+        "import sys, numpy as np; from manip_il.learn.policy import LearnedPolicy;"
+        "z = np.load(sys.argv[2]); p = LearnedPolicy.load(sys.argv[1]);"
+        "np.save(sys.argv[3], p.act(z['states'], z['environments']))"
+    )
+    arguments = [str(checkpoint), str(tmp_path / "in.npz"), str(tmp_path / "out.npy")]
+    run = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
+    assert run.stdout == ""
+    assert np.array_equal(np.load(tmp_path / "out.npy"), LearnedPolicy.load(checkpoint).act(states, environments))
+
+
+def test_loading_needs_no_network(checkpoint, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("a network connection was tried")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    assert LearnedPolicy.load(checkpoint).act(*observations(2)).shape == (2, 4)
+
+
+def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(checkpoint, table):
+    states, environments = observations(50)
+    actions = LearnedPolicy.load(checkpoint).act(states * 1e3, environments * 1e6)
+    relative = table["action"][:, :-1] - table["observation.state"][:, :-1]
+    scale = np.abs(states).max() * 1e3
+    assert np.abs(actions[:, :-1] - states[:, :-1] * 1e3).max() <= np.abs(relative).max() + 1e-6 * scale
+
+
+def test_actions_that_are_not_finite_are_refused_by_row(checkpoint):
+    weights = load_file(checkpoint / "model.safetensors")
+    weights["model.layers.0.weight"][:, 0] = torch.finfo().max
+    save_file(weights, checkpoint / "model.safetensors")
+    states, environments = observations(3)
+    states[:2, 0] = weights["model.input_mean"][0].item()  # times 0
+    with pytest.raises(NotFiniteError, match="action in row 2"):
+        LearnedPolicy.load(checkpoint).act(states, environments)
+
+
+def test_observations_that_are_not_finite_are_refused_by_row(checkpoint):
+    states, environments = observations(3)
+    environments[2, 1] = np.inf
+    with pytest.raises(NotFiniteError, match=r"environment_state in row 2"):
+        LearnedPolicy.load(checkpoint).act(states, environments)
+
+
+def test_observations_of_another_width_are_refused(checkpoint):
+    states, environments = observations(3)
+    with pytest.raises(MismatchError, match=r"\(3, 6\).*\(3, 5\)"):
+        LearnedPolicy.load(checkpoint).act(states, environments[:, :5])
+
+
+def test_a_folder_that_is_no_checkpoint_is_named(tmp_path):
+    with pytest.raises(ManipError, match=r"no config\.json"):
+        LearnedPolicy.load(tmp_path)
+
+
+def test_a_downloaded_processor_cannot_name_code_to_run(checkpoint):
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps(config | {"type": "act"}))
+    path = checkpoint / "policy_preprocessor.json"
+    path.write_text(json.dumps({"name": "x", "steps": [{"class": "subprocess.Popen", "config": {"args": "true"}}]}))
+    with pytest.raises(ManipError, match=r"subprocess\.Popen"):
+        LearnedPolicy.load(checkpoint)
+
+
+def test_weights_that_do_not_fit_the_config_are_refused(checkpoint):
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps(config | {"width": 32}))
+    with pytest.raises(ManipError, match="do not belong together"):
+        LearnedPolicy.load(checkpoint)
+
+
+def test_another_of_lerobots_policies_acts_too(tmp_path):
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    state, environment = PolicyFeature(FeatureType.STATE, (4,)), PolicyFeature(FeatureType.ENV, (6,))
+    config = ACTConfig(
+        input_features={"observation.state": state, "observation.environment_state": environment},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        device="cpu", chunk_size=4, n_action_steps=4, dim_model=16, n_heads=2, dim_feedforward=16,
+        n_encoder_layers=1, n_vae_encoder_layers=1,
+    )  # fmt: skip
+    vector = {"mean": torch.zeros(4), "std": torch.ones(4)}
+    stats = {
+        "observation.state": vector,
+        "action": {"mean": torch.full((4,), 3.0), "std": torch.full((4,), 1e-3)},
+        "observation.environment_state": {"mean": torch.zeros(6), "std": torch.ones(6)},
+    }
+    ACTPolicy(config).save_pretrained(tmp_path)
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(tmp_path)
+    policy = LearnedPolicy.load(tmp_path)
+    assert policy.meta is None
+    np.testing.assert_allclose(policy.act(*observations(3)), 3.0, atol=0.02)  # unnormalised
+    assert policy.act(*observations(2)).shape == (2, 4)
+    policy.reset([0])
+    assert policy.act(*observations(2)).shape == (2, 4)
+
+
+def test_pictures_go_in_as_lerobot_feeds_them():
+    seen = {}
+
+    def select(batch):
+        seen.update(batch)
+        return torch.zeros(2, 4)
+
+    policy = LearnedPolicy(select, lambda: None, {"observation.state": 4}, None, cameras=["front"])
+    picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
+    policy.act(*observations(2), {"front": picture, "wrist": picture})
+    assert sorted(seen) == ["observation.images.front", "observation.state"]
+    assert seen["observation.images.front"].shape == (2, 3, 5, 6)
+    assert seen["observation.images.front"][1, 2, 4, 3].item() == pytest.approx(picture[1, 4, 3, 2] / 255)
+    with pytest.raises(MismatchError, match=r"\['front'\].*\['wrist'\]"):
+        policy.act(*observations(2), {"wrist": picture})

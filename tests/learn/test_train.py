@@ -1,0 +1,251 @@
+"""Training is a function of table, config and seed; it refuses what it cannot learn from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
+from manip_il.learn.checkpoint import CheckpointMeta, check_fits, read_meta
+from manip_il.learn.columns import learning_rows, split_by_episode
+from manip_il.learn.losses import LOSSES
+from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.normalise import fit_statistics, scale_targets
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.train import METRICS_FILE, ShuffledRows, TrainConfig, fit
+
+
+def tiny(**changes) -> TrainConfig:
+    values = {"steps": 4, "batch_size": 32, "log_freq": 2, "save_freq": 2, "val_fraction": 0.2}
+    policy = MLPConfig(width=16, depth=2, **changes.pop("policy", {}))
+    return TrainConfig(**(values | changes), policy=policy)
+
+
+def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def errors(table, path) -> np.ndarray:
+    actions = LearnedPolicy.load(path).act(table["observation.state"], table["observation.environment_state"])
+    return np.abs(actions - table["action"]).mean(0)
+
+
+def test_the_same_seed_gives_the_same_bits(table, spec, tmp_path, weights):
+    a, b, c = (
+        weights(fit(table, tiny(seed=seed), tmp_path / name, spec=spec))
+        for name, seed in (("a", 1), ("b", 1), ("c", 2))
+    )
+    assert equal(a, b)
+    assert not equal(a, c)
+
+
+def test_training_leaves_the_global_generator_alone(table, spec, tmp_path):
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    fit(table, tiny(), tmp_path, spec=spec)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_two_steps_and_two_more_are_four(loss, table, spec, tmp_path, weights):
+    config = tiny(policy={"loss": loss})
+    straight = weights(fit(table, config, tmp_path / "straight", spec=spec))
+
+    class KilledError(Exception):
+        pass
+
+    def kill(record):
+        if record["step"] == 4:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        fit(table, config, tmp_path / "killed", spec=spec, on_log=kill)
+    at_two = weights(tmp_path / "killed/checkpoints/last/pretrained_model")
+    resumed = weights(fit(table, config, tmp_path / "killed", spec=spec, resume=True))
+    assert not equal(at_two, straight)
+    assert equal(resumed, straight)
+    lines = [json.loads(line) for line in (tmp_path / "killed" / METRICS_FILE).read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4]
+
+
+def test_resuming_a_finished_run_changes_nothing(table, spec, tmp_path, weights):
+    before = weights(fit(table, tiny(), tmp_path, spec=spec))
+    assert equal(before, weights(fit(table, tiny(), tmp_path, spec=spec, resume=True)))
+
+
+def test_a_folder_with_a_checkpoint_is_not_overwritten(table, spec, tmp_path):
+    fit(table, tiny(), tmp_path, spec=spec)
+    with pytest.raises(FolderExistsError, match="--resume=true"):
+        fit(table, tiny(), tmp_path, spec=spec)
+
+
+def test_resume_on_other_data_or_options_is_refused(table, spec, tmp_path):
+    fit(table, tiny(), tmp_path, spec=spec)
+    with pytest.raises(MismatchError, match="option lr"):
+        fit(table, tiny(lr=0.1), tmp_path, spec=spec, resume=True)
+    other = table | {"action": table["action"] + 0.01}
+    with pytest.raises(MismatchError, match="data"):
+        fit(other, tiny(), tmp_path, spec=spec, resume=True)
+
+
+def test_only_the_last_checkpoint_stays_and_nothing_temporary(table, spec, tmp_path):
+    fit(table, tiny(), tmp_path, spec=spec)
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["000004", "last"]
+
+
+def test_a_half_written_checkpoint_is_passed_over(table, spec, tmp_path, weights):
+    straight = weights(fit(table, tiny(), tmp_path / "a", spec=spec))
+    for stale in (".000002.tmp/pretrained_model", "000002/pretrained_model"):
+        (tmp_path / "b/checkpoints" / stale).mkdir(parents=True)
+    assert equal(straight, weights(fit(table, tiny(), tmp_path / "b", spec=spec, resume=True)))
+
+
+def test_frames_without_a_valid_label_do_not_touch_the_weights(table, spec, tmp_path, weights):
+    invalid = np.random.default_rng(0).random(len(table["action"])) < 0.3
+    table["label_valid"][invalid] = 0
+    rubbish = {key: column.copy() for key, column in table.items()}
+    rubbish["action"][invalid] = 1e6
+    rubbish["observation.environment_state"][invalid] = -1e6
+    without = {key: column[~invalid] for key, column in table.items()}
+    paths = [fit(t, tiny(), tmp_path / name, spec=spec) for name, t in (("a", table), ("b", rubbish), ("c", without))]
+    assert equal(weights(paths[0]), weights(paths[1]))
+    assert equal(weights(paths[0]), weights(paths[2]))
+
+
+def test_no_valid_label_at_all_is_an_error(table, spec, tmp_path):
+    table["label_valid"][:] = 0
+    with pytest.raises(ManipError, match="none of 240 frames"):
+        fit(table, tiny(), tmp_path, spec=spec)
+
+
+@pytest.mark.parametrize("key", ["observation.state", "observation.environment_state", "action"])
+def test_nan_is_refused_with_column_episode_and_frame(key, table, spec, tmp_path):
+    table[key][47, 1] = np.nan
+    with pytest.raises(NotFiniteError, match=rf"{key}, row 47, episode 2, frame 7"):
+        fit(table, tiny(), tmp_path, spec=spec)
+
+
+def test_a_loss_that_explodes_says_at_which_step(table, spec, tmp_path):
+    with pytest.raises(NotFiniteError, match=r"loss is (inf|nan) at step \d"):
+        fit(table, tiny(lr=1e30, steps=20), tmp_path, spec=spec)
+
+
+def test_columns_of_the_wrong_size_or_missing_are_named(table, spec, tmp_path):
+    with pytest.raises(MismatchError, match=r"observation.environment_state has \(240, 6\).*\(N, 5\)"):
+        fit(table, tiny(), tmp_path, spec=replace(spec, environment_state_names=("x",) * 5))
+    del table["action"]
+    with pytest.raises(ManipError, match="no column 'action'"):
+        fit(table, tiny(), tmp_path, spec=spec)
+
+
+def test_metrics_hold_the_loss_of_whole_held_out_episodes(table, spec, tmp_path):
+    records = []
+    fit(table, tiny(), tmp_path, spec=spec, on_log=records.append)
+    assert [record["step"] for record in records] == [2, 4]
+    assert {"loss", "lr", "samples_per_s", "val_loss", "val_arm_error", "val_gripper_error"} <= records[0].keys()
+    episodes = np.repeat(np.arange(12), 20)
+    train, held_out = split_by_episode(episodes, 0.2, seed=0)
+    assert len(np.unique(episodes[held_out])) == 2
+    assert not set(episodes[train]) & set(episodes[held_out])
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_every_loss_learns_to_act(loss, table, spec, tmp_path):
+    config = tiny(
+        steps=400, save_freq=400, log_freq=400, batch_size=64, lr=5e-3, policy={"loss": loss, "components": 2}
+    )
+    config.policy.width = 64
+    before = errors(table, fit(table, tiny(policy={"loss": loss}), tmp_path / "before", spec=spec))
+    after = errors(table, fit(table, config, tmp_path / "after", spec=spec))
+    assert after[:-1].mean() < 0.6 * before[:-1].mean()
+    assert after[-1] < 0.01
+
+
+def test_a_warm_start_acts_as_the_policy_it_came_from(table, spec, tmp_path, weights):
+    first = fit(table, tiny(steps=50), tmp_path / "first", spec=spec)
+    wider = {key: column.copy() for key, column in table.items()}
+    wider["observation.environment_state"] *= 3.0  # other statistics
+    second = fit(wider, tiny(steps=1, lr=1e-12, init_from=first), tmp_path / "second", spec=spec)
+    a, b = LearnedPolicy.load(first), LearnedPolicy.load(second)
+    assert not torch.equal(weights(first)["model.input_scale"], weights(second)["model.input_scale"])
+    inputs = table["observation.state"], table["observation.environment_state"]
+    np.testing.assert_allclose(a.act(*inputs), b.act(*inputs), atol=2e-5)
+
+
+def test_a_feature_that_never_moves_is_not_seen(table, spec, tmp_path):
+    path = fit(table, tiny(), tmp_path, spec=spec)
+    policy = LearnedPolicy.load(path)
+    environment = table["observation.environment_state"].copy()
+    before = policy.act(table["observation.state"], environment)
+    environment[:, 2] += 100.0
+    assert np.array_equal(before, policy.act(table["observation.state"], environment))
+
+
+def test_statistics_undo_themselves_and_take_constant_targets(table):
+    rows = learning_rows(table)
+    targets = rows.targets.copy()
+    targets[:, 1] = 0.5
+    for loss in ("mse", "categorical"):
+        s = fit_statistics(rows.inputs, targets, loss)
+        y = scale_targets(torch.from_numpy(targets), s.target_mean, s.target_scale)
+        assert torch.isfinite(y).all()
+        np.testing.assert_allclose(y * s.target_scale + s.target_mean, targets, atol=1e-6)
+    assert y.abs().max() <= 1 + 1e-5
+
+
+def test_every_row_comes_once_an_epoch():
+    order = ShuffledRows(10, 4, seed=0)
+    drawn = torch.cat([order.batch(step) for step in range(5)])
+    assert sorted(drawn[:10].tolist()) == sorted(drawn[10:].tolist()) == list(range(10))
+    assert drawn[:10].tolist() != drawn[10:].tolist()
+    assert torch.equal(ShuffledRows(10, 4, seed=0).batch(3), order.batch(3))
+    assert len(ShuffledRows(3, 8, seed=0).batch(0)) == 8
+
+
+def test_the_learning_rate_warms_up_and_goes_to_zero():
+    config = TrainConfig(steps=1000, warmup_steps=100, lr=1.0)
+    rates = [config.lr_at(step) for step in range(1000)]
+    assert rates[:100] == sorted(rates[:100])
+    assert rates[100] == 1.0
+    assert rates[100:] == sorted(rates[100:], reverse=True)
+    assert rates[-1] < 1e-5
+
+
+def test_the_meta_says_what_the_policy_is_for(table, spec, tmp_path):
+    meta = read_meta(fit(table, tiny(), tmp_path, spec=spec, fingerprint={"mujoco": "3.11"}))
+    assert meta is not None
+    assert meta == replace(CheckpointMeta.of(spec, {"mujoco": "3.11"}), options=meta.options)
+    assert meta.options["policy"]["width"] == 16
+    check_fits(meta, spec)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"robot": "leg"},
+        {"fps": 50},
+        {"joint_names": ("a", "c", "b", "gripper")},
+        {"environment_state_names": ("x",)},
+        {"action_meaning": "torques"},
+    ],
+)
+def test_a_policy_for_something_else_is_refused_naming_both(change, spec):
+    meta = CheckpointMeta.of(spec)
+    with pytest.raises(MismatchError) as error:
+        check_fits(meta, replace(spec, **change))
+    ((name, value),) = change.items()
+    assert str(value) in str(error.value)
+    assert str(getattr(spec, name)) in str(error.value)
+
+
+def test_a_wrong_option_is_refused():
+    with pytest.raises(UnknownName, match="did you mean 'gaussian'"):
+        MLPConfig(loss="gausian")
+    with pytest.raises(UsageError, match="steps is 0"):
+        TrainConfig(steps=0)
+    with pytest.raises(UsageError, match=r"policy\.width is 0"):
+        MLPConfig(width=0)
