@@ -84,13 +84,10 @@ class Expert:
     def _towards(self, q: F64, g: Geometry, target: Target) -> Label:
         position = g.ee + _clip_norm(target.position - g.ee, MAX_POSITION_STEP)
         rotation = _turn_towards(g.ee_rotation, target.rotation, MAX_ANGLE_STEP)
-        step = self._ik.step(position, rotation)
+        step = self._ik.step(position, rotation, self._robot.max_joint_step)
         if step is None:
             return self._hold(q, g.opening, "inverse kinematics has no solution")
         dq, residual = step
-        largest = float(np.abs(dq).max())
-        if largest > self._robot.max_joint_step:
-            dq = dq * (self._robot.max_joint_step / largest)
         if residual > NO_PROGRESS and math.dist(position, g.ee) > NEAR:
             return self._hold(q, g.opening, "no joint step brings the hand nearer")
         arm = np.minimum(np.maximum(q + dq, self._low), self._high)

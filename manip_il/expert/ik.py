@@ -47,11 +47,11 @@ class ArmIK:
         data = self._configuration.data
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
-    def step(self, position: F64, rotation: F64) -> tuple[F64, float] | None:
-        """One step from the posture last given to `ee_pose` towards a pose of `ee`.
+    def step(self, position: F64, rotation: F64, largest: float) -> tuple[F64, float] | None:
+        """One step from the posture last given to `ee_pose` towards a pose of `ee`, no joint by more than `largest` [rad].
 
-        Returns the joint displacement [rad] (arm,) and how much of the weighted pose error it leaves, as a
-        share; None where the quadratic program has no solution.
+        Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
+        of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.
         """
         self._frame.set_target(_se3(position, rotation))
         before = self._pose_error(position, rotation)
@@ -60,6 +60,9 @@ class ArmIK:
         if not result.found or result.x is None:
             return None
         dq = result.x[self._address]
+        longest = float(np.abs(dq).max())
+        if longest > largest:
+            dq = dq * (largest / longest)
         if before < _CONVERGED:
             return dq, 0.0
         data = self._configuration.data

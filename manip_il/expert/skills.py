@@ -19,6 +19,7 @@ from manip_il.sim.task import CUBE_HALF_SIZE
 F64 = NDArray[np.float64]
 
 HOVER = 0.08  # of the hand over the object while it is not above it [m]
+CLEAR = 0.055  # of the hand over the object: the fingertips are above its top [m]
 FUNNEL_RADIUS = 0.010  # misalignment at which the hand may be all the way down [m]
 FUNNEL_SLOPE = 2.0  # height the hand gains per misalignment beyond it
 ANGLE_AS_LENGTH = 0.05  # how much misalignment a radian of wrong orientation counts for [m/rad]
@@ -129,7 +130,9 @@ def _approach(g: Geometry, at: F64, rotation: F64, angle: float) -> Target:
     to_object = at - g.ee
     misaligned = math.hypot(to_object[0], to_object[1]) + ANGLE_AS_LENGTH * max(0.0, angle - ANGLE_FREE)
     ready = open_enough(g) and g.object_tilt < MAX_TILT
-    height = min(HOVER, FUNNEL_SLOPE * max(0.0, misaligned - FUNNEL_RADIUS)) if ready else HOVER
+    height = min(HOVER, FUNNEL_SLOPE * max(0.0, misaligned - FUNNEL_RADIUS))
+    if not ready:
+        height = max(height, CLEAR)
     too_low = at[2] + height - g.ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
     position = np.array([*(g.ee[:2] + sideways * to_object[:2]), at[2] + height])

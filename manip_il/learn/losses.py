@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import override
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from manip_il.errors import UnknownName
@@ -75,25 +75,32 @@ class L1Head(MSEHead):
         return (params - target).abs().mean(-1)
 
 
-@dataclass(frozen=True)
-class GaussianHead(Head):
-    """Diagonal Gaussian whose mean and log-deviation depend on the state. Acts with the mean."""
+class GaussianHead(Head, nn.Module):
+    """Diagonal Gaussian: the network gives the mean; one learned log-deviation a dimension. Acts with the mean.
 
-    n: int
+    The deviation does not depend on the state: where it does, easy states outweigh hard ones by
+    orders of magnitude in the mean's gradient and the mean underfits (Seitzer et al., On the
+    pitfalls of heteroscedastic uncertainty estimation, ICLR 2022). In closed loop that lost
+    nearly every episode.
+    """
+
+    def __init__(self, n: int) -> None:
+        super().__init__()
+        self.n = n
+        self.raw_log_std = nn.Parameter(torch.zeros(n))
 
     @property
     @override
     def size(self) -> int:
-        return 2 * self.n
+        return self.n
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        mean, raw = params.split(self.n, -1)
-        return -_normal_log_prob(target, mean, floored_log_std(raw)).sum(-1)
+        return -_normal_log_prob(target, params, floored_log_std(self.raw_log_std)).sum(-1)
 
     @override
     def action(self, params: Tensor) -> Tensor:
-        return params[..., : self.n]
+        return params
 
 
 @dataclass(frozen=True)

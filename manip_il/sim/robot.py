@@ -31,7 +31,7 @@ class Robot:
     workspace: tuple[float, float]  # centre of the task area on the table, x and y [m]
     shoulder: tuple[float, float, float]  # where reach is measured from [m]
     wrist_above_ee: float  # height of the wrist over the ee when the hand points down [m]
-    reach: float  # shoulder to wrist, hand down, at which the IK still has room [m]
+    reach: tuple[float, float]  # shoulder to wrist, hand down: nearest and farthest with room for the IK [m]
     build: Callable[[], mujoco.MjSpec]
 
     @property
@@ -176,7 +176,7 @@ ROBOTS = {
         workspace=(0.45, 0.0),
         shoulder=(0.0, 0.0, 0.333),
         wrist_above_ee=0.243,
-        reach=0.7,
+        reach=(0.0, 0.7),
         build=_build_panda,
     ),
     "fetch": Robot(
@@ -190,7 +190,7 @@ ROBOTS = {
         workspace=(0.64, 0.0),
         shoulder=(0.15, 0.0, 0.586),
         wrist_above_ee=0.305,
-        reach=0.675,
+        reach=(0.42, 0.675),
         build=_build_fetch,
     ),
 }

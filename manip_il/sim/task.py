@@ -97,9 +97,11 @@ def _draw_goal(task: Task, robot: Robot, object_xy: F64, rng: np.random.Generato
 
 
 def in_reach(robot: Robot, position: F64, slack: float = 0.0) -> bool:
-    """Whether the hand, pointing down, gets its `ee` to `position` [m], (3,); `slack` [m] is added to the reach."""
+    """Whether the hand, pointing down, gets its `ee` to `position` [m], (3,); `slack` [m] widens the reach."""
     x, y, z = position
-    return math.dist((x, y, z + robot.wrist_above_ee), robot.shoulder) <= robot.reach + slack
+    nearest, farthest = robot.reach
+    distance = math.dist((x, y, z + robot.wrist_above_ee), robot.shoulder)
+    return nearest - slack <= distance <= farthest + slack
 
 
 def _on_table(xy: F64) -> F64:

@@ -34,7 +34,8 @@ def fitted(head: Head, targets: torch.Tensor, steps: int = 600) -> tuple[torch.T
     """The best constant params for `targets` (B, n), and the loss before and after."""
     start = torch.randn(head.size, generator=torch.Generator().manual_seed(1))
     params = start.clone().requires_grad_()
-    optimizer = torch.optim.Adam([params], lr=0.05)
+    learned = list(head.parameters()) if isinstance(head, torch.nn.Module) else []
+    optimizer = torch.optim.Adam([params, *learned], lr=0.05)
     losses = []
     for _ in range(steps):
         loss = head.nll(params.expand(len(targets), -1), targets).mean()
@@ -55,10 +56,17 @@ def test_fitting_reduces_the_loss_and_acts_near_a_single_target(loss, generator)
 
 
 def test_gaussian_nll_is_torchs(generator):
-    params = torch.randn((5, 2 * N), generator=generator)
-    target = torch.randn((5, N), generator=generator)
-    normal = td.Independent(td.Normal(params[:, :N], floored_log_std(params[:, N:]).exp()), 1)
-    torch.testing.assert_close(GaussianHead(N).nll(params, target), -normal.log_prob(target))
+    head = GaussianHead(N)
+    torch.nn.init.normal_(head.raw_log_std, generator=generator)
+    params, target = torch.randn((2, 5, N), generator=generator)
+    normal = td.Independent(td.Normal(params, floored_log_std(head.raw_log_std).exp()), 1)
+    torch.testing.assert_close(head.nll(params, target), -normal.log_prob(target))
+
+
+def test_gaussian_learns_the_deviation(generator):
+    head = GaussianHead(1)
+    fitted(head, 0.1 * torch.randn((4000, 1), generator=generator))
+    assert floored_log_std(head.raw_log_std).exp().item() == pytest.approx(0.1, rel=0.05)
 
 
 def test_mixture_nll_is_torchs(generator):
@@ -73,10 +81,10 @@ def test_mixture_nll_is_torchs(generator):
 
 
 def test_mixture_of_one_is_the_gaussian(generator):
-    gaussian = torch.randn((5, 2 * N), generator=generator)
-    target = torch.randn((5, N), generator=generator)
-    mixture = torch.cat([torch.zeros(5, 1), gaussian], dim=1)
-    torch.testing.assert_close(MixtureHead(N, 1).nll(mixture, target), GaussianHead(N).nll(gaussian, target))
+    gaussian = GaussianHead(N)
+    mean, target = torch.randn((2, 5, N), generator=generator)
+    mixture = torch.cat([torch.zeros(5, 1), mean, gaussian.raw_log_std.expand(5, N)], dim=1)
+    torch.testing.assert_close(MixtureHead(N, 1).nll(mixture, target), gaussian.nll(mean, target))
 
 
 def test_categorical_nll_at_a_bin_centre_is_torchs(generator):

@@ -38,7 +38,7 @@ class MLPConfig(PreTrainedConfig):
     activation: str = "silu"
     loss: str = "mse"
     components: int = 5
-    bins: int = 101
+    bins: int = 21
     clamp: float = 10.0
 
     device: str | None = "cpu"

@@ -1,0 +1,176 @@
+"""Groups of options that several commands share, and what commands do with them before and after the work."""
+
+from __future__ import annotations
+
+import functools
+import shlex
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from manip_il.cli.folders import atomic_write
+from manip_il.cli.options import dump_yaml, from_yaml, options_of, to_plain
+from manip_il.errors import MismatchError, UnknownName, UsageError
+
+if TYPE_CHECKING:  # the environment and the learner take a second to import
+    from manip_il.data.schema import RobotTaskSpec
+    from manip_il.learn.mlp.configuration_mlp import MLPConfig
+    from manip_il.sim.env import EnvConfig
+
+CONFIG_FILE = "config.yaml"
+POLICY_TYPES = ("mlp",)
+DEFAULT_ROBOT, DEFAULT_TASK, DEFAULT_HZ = "panda", "pick_place", 20
+WHERE_POLICIES_LIE = (".", "pretrained_model", "checkpoints/last/pretrained_model", "best/pretrained_model")
+
+
+def option(default: Any, text: str) -> Any:
+    """A field with one line of help."""
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata={"help": text})
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass
+class RobotGroup:
+    """`--robot.*`."""
+
+    type: str = option(DEFAULT_ROBOT, "panda or fetch")
+
+
+@dataclass
+class TaskGroup:
+    """`--task.*`."""
+
+    type: str = option(DEFAULT_TASK, "reach, lift or pick_place")
+
+
+@dataclass
+class EnvGroup:
+    """`--env.*`: what makes an environment beside robot and task. Defaults are `EnvConfig`'s."""
+
+    tolerance: float = option(0.02, "distance to the goal that counts as there [m]")
+    horizon: int = option(100, "control steps in an episode")
+    control_hz: int | None = option(None, f"control steps a second; the policy's where there is one, else {DEFAULT_HZ}")
+    success_steps: int = option(5, "control steps in a row within the tolerance that make a success")
+
+    def config(self, robot: str, task: str, control_hz: int = DEFAULT_HZ) -> EnvConfig:
+        """The environment; `UnknownName` for a robot or task, `UsageError` for a value."""
+        from manip_il.sim.env import EnvConfig
+        from manip_il.sim.robot import get_robot
+        from manip_il.sim.task import get_task
+
+        get_robot(robot)
+        get_task(task)
+        hz = control_hz if self.control_hz is None else self.control_hz
+        return EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon)
+
+
+@dataclass
+class PolicyGroup:
+    """`--policy.*` of what is fitted."""
+
+    type: str = option("mlp", "the policy; others of LeRobot's are fitted by lerobot-train on the same dataset")
+    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
+    width: int = option(256, "units a layer")
+    depth: int = option(3, "hidden layers")
+    activation: str = option("silu", "between layers")
+    components: int = option(5, "of the mixture")
+    bins: int = option(101, "a dimension, of categorical")
+
+    def config(self) -> MLPConfig:
+        """The policy's configuration; `UsageError` for another type, an unknown loss or a size out of range."""
+        if self.type not in POLICY_TYPES:
+            raise UsageError(
+                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's other policies (act, diffusion, ...) "
+                "train on the same dataset by: lerobot-train --dataset.root=... --policy.type=..."
+            )
+        from manip_il.learn.mlp.configuration_mlp import MLPConfig
+
+        sizes = {name: getattr(self, name) for name in ("width", "depth", "activation", "components", "bins")}
+        return MLPConfig(loss=self.loss, **sizes)
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Warnings on standard error, one line each."""
+    for line in lines:
+        print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)
+
+
+def command_line(name: str, options: Any) -> str:
+    """The command with every option that is not its default, to copy."""
+    words = ["manip-il", name]
+    for known in options_of(type(options)):
+        value = _value(options, known.name)
+        if (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
+            words.append(_word(known.name, value))
+    return shlex.join(words)
+
+
+def save_options(folder: Path, options: Any) -> None:
+    """Write the resolved options to `folder/config.yaml`."""
+    atomic_write(folder / CONFIG_FILE, dump_yaml(options))
+
+
+def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow: str | None = None) -> None:
+    """Raise `MismatchError` naming the option unless the run in `folder` was started with the same options.
+
+    free: options that may differ. may_grow: one that may be larger than it was. A folder that is not there or
+    empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
+    """
+    path = folder / CONFIG_FILE
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not path.is_file():
+        raise UsageError(f"{folder} holds no {CONFIG_FILE}, so no run to go on with; choose another folder")
+    before = from_yaml(path, type(options))
+    for known in options_of(type(options)):
+        was, now = _value(before, known.name), _value(options, known.name)
+        grown = known.name == may_grow and now >= was
+        if was != now and known.name not in (*free, "resume", "overwrite") and not grown:
+            raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
+
+
+def find_policy(path: Path) -> Path:
+    """The `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run."""
+    for place in WHERE_POLICIES_LIE:
+        if (path / place / "config.json").is_file():
+            return path / place
+    raise UsageError(f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one")
+
+
+def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:
+    """Warn where a dataset was made by something else than this machine would make it by.
+
+    Raises `MismatchError` where its numbers mean something else. A robot that is not known here is not compared.
+    """
+    from manip_il.data.fingerprint import compare_fingerprints
+    from manip_il.data.schema import check_same_spec
+    from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.robot import ROBOTS
+    from manip_il.sim.task import TASKS
+
+    if spec.robot not in ROBOTS or spec.task not in TASKS:
+        warn([f"{root} is about {spec.robot} {spec.task}, which is not known here"])
+        return
+    env = EnvConfig(spec.robot, spec.task, spec.fps)
+    check_same_spec(str(root), spec, "this program", env_spec(env))
+    # Tolerance and horizon do not matter to what is learnt, and a dataset does not say them.
+    here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
+    theirs = {key: value for key, value in fingerprint.items() if key != "config_sha256"}
+    warn(compare_fingerprints(str(root), theirs, "this machine", here))
+
+
+def _value(options: Any, name: str) -> Any:
+    return functools.reduce(getattr, name.split("."), options)
+
+
+def _word(name: str, value: Any) -> str:
+    plain = to_plain(value)
+    if isinstance(plain, list):
+        plain = ",".join(map(str, plain))
+    if isinstance(plain, bool):
+        plain = str(plain).lower()
+    return f"--{name}={'null' if plain is None else plain}"

@@ -1,0 +1,104 @@
+"""Pictures of an episode from its recorded states: films, strips, and paths for machines without OpenGL."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import replace
+from fractions import Fraction
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+import manip_il.sim  # noqa: F401  # first: it chooses the OpenGL that mujoco takes on import
+from manip_il.data import schema
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.errors import ManipError
+from manip_il.evaluation.report_data import Paths
+from manip_il.mdp import Episode, State
+from manip_il.sim.env import EnvConfig, ManipEnv
+
+AFTER_SUCCESS = 1.0  # what a film shows once the task is solved [s]
+Frames = Sequence[NDArray[np.uint8]]
+
+
+def run_states(job: RolloutJob, seed: int) -> Episode:
+    """The episode of one seed, with its states: the same that an evaluation of `job` saw."""
+    return next(iter(run_job(replace(job, labels="last"), [seed])))
+
+
+def film(
+    episode: Episode, env_config: EnvConfig, camera: str = "front", size: tuple[int, int] = (240, 320)
+) -> list[NDArray[np.uint8]]:
+    """One picture a control step, uint8 (height, width, 3), until shortly after success.
+
+    Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
+    """
+    states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz)]
+    env = ManipEnv(config=env_config, cameras=(camera,), image_size=size)
+    try:
+        return [_picture(env, State.from_vector(row), camera) for row in states]
+    finally:
+        env.close()  # one OpenGL context alive at a time
+
+
+def shown_steps(episode: Episode, fps: int) -> int:
+    """How many control steps a picture of the episode spans: to `AFTER_SUCCESS` once solved, else all."""
+    solved = episode.columns[schema.SUCCESS].ravel()
+    if not solved.any():
+        return len(episode)
+    return min(len(episode), int(np.argmax(solved)) + 1 + round(AFTER_SUCCESS * fps))
+
+
+def encode_mp4(frames: Frames, fps: int) -> bytes:
+    """An MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
+
+    Raises `ManipError` for no frames, or for a height or width that is odd, which 4:2:0 has not.
+    """
+    if len(frames) == 0:
+        raise ManipError("no frames to make a film of")
+    height, width = frames[0].shape[:2]
+    if height % 2 or width % 2:
+        raise ManipError(f"a film of {width} x {height} pixels; expected even numbers")
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for picture in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+        container.mux(stream.encode())
+    return buffer.getvalue()
+
+
+def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
+    """`count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+    return tuple((index / fps, encode_png(frames[index])) for index in chosen.tolist())
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """One picture as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, format="png", optimize=True)
+    return buffer.getvalue()
+
+
+def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "") -> Paths:
+    """Where hand, object (the hand again where the task has none) and goal were; needs no OpenGL."""
+    rows = episode.columns[schema.ENVIRONMENT_STATE][: shown_steps(episode, spec.fps)].astype(np.float64)
+    names = list(spec.environment_state_names)
+
+    def positions(thing: str) -> NDArray[np.float64]:
+        return rows[:, [names.index(f"{thing}.{axis}") for axis in "xyz"]]
+
+    hand = positions("ee")
+    obj = positions("object") if "object.x" in names else hand
+    return Paths(policy, hand, obj, positions("goal")[-1], 1 / spec.fps, caption)
+
+
+def _picture(env: ManipEnv, state: State, camera: str) -> NDArray[np.uint8]:
+    env.set_state(state)
+    return env.observe().images[camera]
