@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-fast lint format bench lock clean
+.PHONY: help setup gl demo test test-fast lint format bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= python3.12
@@ -26,11 +26,14 @@ setup: .venv/.installed  ## the environment, in .venv
 	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
 	touch $@
 
-demo: setup  ## the whole story, small: runs/quickstart/report.html
+demo: setup gl  ## the whole story, small: runs/quickstart/report.html
 	$(BIN)/manip-il quickstart --output_dir=runs/quickstart
 
+gl:  ## the system's OpenGL, where it is missing and this is root
+	@.ci/gl
+
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
-test: setup  ## every test
+test: setup gl  ## every test
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL

@@ -22,30 +22,53 @@ class Environment(Protocol):
     """What the loop needs of an environment."""
 
     @property
-    def solved(self) -> bool: ...
-    def start(self, seed: int) -> None: ...
-    def advance(self, action: F64) -> None: ...
-    def observe(self) -> Observation: ...
-    def get_state(self) -> State: ...
+    def solved(self) -> bool:
+        """Whether the task is solved now."""
+        ...
+
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed."""
+        ...
+
+    def advance(self, action: F64) -> None:
+        """Apply an action (n,) for one control step."""
+        ...
+
+    def observe(self) -> Observation:
+        """What a learner sees now."""
+        ...
+
+    def get_state(self) -> State:
+        """Everything that the future depends on."""
+        ...
 
 
 class Labeller(Protocol):
     """Answers what the expert would do."""
 
-    def label(self, state: State) -> Label: ...
+    def label(self, state: State) -> Label:
+        """The expert's action in `state`."""
+        ...
 
 
 class Driver(Protocol):
     """Chooses the executed action of every running episode."""
 
-    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]: ...
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """An action (n,) and who chose it, for every turn."""
+        ...
 
 
 class Intruder(Protocol):
     """Disturbs one episode: before a step in the environment, or in the action on its way to the robot."""
 
-    def before(self, step: int) -> None: ...
-    def action(self, action: F64) -> F64: ...
+    def before(self, step: int) -> None:
+        """Called before the state of `step` is read."""
+        ...
+
+    def action(self, action: F64) -> F64:
+        """The action as it reaches the robot, (n,)."""
+        ...
 
 
 @dataclass(slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,11 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_base, stream_seeds
+from manip_il.sim.disturb import STANDARD
 
 Table = dict[str, NDArray[Any]]
 BEST, DATASET = "best", "dataset"
-LEARNING_COLUMNS = (schema.STATE, schema.ENVIRONMENT_STATE, schema.ACTION, schema.LABEL_VALID)
+LEARNING_COLUMNS = (schema.STATE, schema.ENVIRONMENT_STATE, schema.ACTION, schema.LABEL_VALID, "episode_index")
 
 
 @dataclass(frozen=True)
@@ -191,15 +192,15 @@ def _collect_round(
     else:
         job = RolloutJob(config.env, "mixture", policy=previous, beta=beta, hold=config.hold, round=round_)
         seeds = stream_seeds(f"round/{round_}", config.episodes_per_round, config.seed)
-        collect(engine, job, seeds, journals, watch.on_episode)
+        disturbed = round(config.disturbed_share * len(seeds))
+        collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode)
+        collect(engine, job, seeds[disturbed:], journals, watch.on_episode)
         paths = list_episodes(journals)
     provenance = {"round": round_, "beta": beta, "seeds": [seeds[0], seeds[len(paths) - 1]], "driver": job.driver}
     build_dataset(paths, here / DATASET, job, f"local/{config.env.robot}_{config.env.task}_round_{round_}", provenance)
 
 
-def _validate(
-    config: DaggerConfig, here: Path, engine: Engine, watch: Watch, policy: Path, round_: int
-) -> EvalResult:
+def _validate(config: DaggerConfig, here: Path, engine: Engine, watch: Watch, policy: Path, round_: int) -> EvalResult:
     path = here / FILE_NAME
     if path.is_file():
         return EvalResult.read(path)

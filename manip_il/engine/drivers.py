@@ -19,13 +19,16 @@ F64 = NDArray[np.float64]
 class Policy(Protocol):
     """A learner: (B, n) joint states and (B, k) environment states to (B, n) absolute actions."""
 
-    def act(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> F64: ...
+    def act(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> F64:
+        """One action a row."""
+        ...
 
 
 class ExpertDriver:
     """Executes the expert's label."""
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """The label of every episode. Raises `ManipError` where the expert was not asked."""
         return [(_expert_action(turn), Actor.EXPERT) for turn in turns]
 
 
@@ -36,6 +39,7 @@ class LearnerDriver:
         self._policy = policy
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """The policy's action in every episode."""
         states = np.stack([turn.observation.state for turn in turns])
         environment_states = np.stack([turn.observation.environment_state for turn in turns])
         actions = self._policy.act(states, environment_states)
@@ -50,6 +54,7 @@ class MixtureDriver:
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """The learner's or the expert's action, drawn from each episode's own generator."""
         chosen = self._learner.act(turns)
         for i, turn in enumerate(turns):
             rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "mixture"))
@@ -66,6 +71,7 @@ class RandomDriver:
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """A drawn action for every episode."""
         return [(self._draw(turn), Actor.LEARNER) for turn in turns]
 
     def _draw(self, turn: Turn) -> F64:

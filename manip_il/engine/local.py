@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from types import TracebackType
 
 from manip_il.engine.jobs import LOCKSTEP, RolloutJob, run_job
@@ -84,17 +85,15 @@ def _run_chunk(job: RolloutJob, seeds: Sequence[int]) -> list[Episode]:
 def _result(future: Future[list[Episode]]) -> list[Episode]:
     try:
         return future.result()
-    except multiprocessing.ProcessError as error:
-        raise ManipError(f"a rollout worker died: {error}") from error
+    except BrokenExecutor as error:
+        raise ManipError("a rollout worker died (out of memory?); finished episodes are kept") from error
 
 
 def _quiet() -> None:
     """Workers leave Ctrl-C to the process that started them, and one core each to its neighbours."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import torch
-
-    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which a worker imports later
 
 
 def _import_everything() -> None:
-    import manip_il.learn.policy  # noqa: F401
+    importlib.import_module("manip_il.learn.policy")

@@ -48,7 +48,7 @@ class ArmIK:
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
     def step(self, position: F64, rotation: F64, largest: float) -> tuple[F64, float] | None:
-        """One step from the posture last given to `ee_pose` towards a pose of `ee`, no joint by more than `largest` [rad].
+        """One step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
 
         Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
         of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import ManipError
 from manip_il.mdp import Phase
 from manip_il.sim.task import CUBE_HALF_SIZE
 
@@ -36,11 +37,12 @@ CARRY_LIFT = 0.05  # of the object over the goal's height on the way there [m]
 CARRY_SLOPE = 0.6  # lift per horizontal distance still to go
 CARRY_FREE = 0.015  # horizontal distance at which no lift is left [m]
 AT_GOAL = 0.01  # [m]
+CUBE_WIDTH = 2 * CUBE_HALF_SIZE  # [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Where things are. `ee_rotation`: `ee` axes in the world, (3, 3). `width`: opening when the pads touch the cube [m]."""
+    """Where things are. ee_rotation: of `ee` in the world, (3, 3); width: opening as the pads touch the cube [m]."""
 
     ee: F64
     ee_rotation: F64
@@ -80,7 +82,7 @@ def choose(g: Geometry) -> Target:
 
 def object_in_hand(g: Geometry) -> F64:
     """The object's centre in the `ee` frame [m], (3,)."""
-    return g.ee_rotation.T @ (g.object - g.ee)
+    return g.ee_rotation.T @ (_object(g) - g.ee)
 
 
 def grasped(g: Geometry, offset: F64) -> bool:
@@ -117,7 +119,7 @@ def _reach(g: Geometry) -> Target:
 
 
 def _carry(g: Geometry) -> Target:
-    to_goal = g.goal - g.object
+    to_goal = g.goal - _object(g)
     horizontal = math.hypot(to_goal[0], to_goal[1])
     lift = min(CARRY_LIFT, CARRY_SLOPE * max(0.0, horizontal - CARRY_FREE))
     phase = Phase.AT_GOAL if math.hypot(*to_goal) < AT_GOAL else Phase.CARRY
@@ -136,15 +138,17 @@ def _approach(g: Geometry, at: F64, rotation: F64, angle: float) -> Target:
     too_low = at[2] + height - g.ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
     position = np.array([*(g.ee[:2] + sideways * to_object[:2]), at[2] + height])
+    phase = Phase.DESCEND if height < HOVER else Phase.APPROACH
     if not open_enough(g):
         phase = Phase.OPEN
-    else:
-        phase = Phase.DESCEND if height < HOVER else Phase.APPROACH
     return Target(phase, position, rotation, g.max_opening)
+
+
+def _object(g: Geometry) -> F64:
+    if g.object is None:
+        raise ManipError("this rung of the ladder needs an object, and the task has none")
+    return g.object
 
 
 def _inside(offset: F64, box: tuple[float, float, float]) -> bool:
     return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]
-
-
-CUBE_WIDTH = 2 * CUBE_HALF_SIZE  # [m]

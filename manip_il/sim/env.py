@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -46,7 +46,7 @@ class EnvConfig:
         return round(1 / (DT_SIM * self.control_hz))
 
 
-class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
+class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     """Joint-position control of one arm on one task.
 
     Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
@@ -55,7 +55,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
     "solved once" and "solved at the end" can both be told.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[np.float32]]):
         self.data = mujoco.MjData(self.scene.model)
         self.render_mode = render_mode
         self.cameras, self.image_size = tuple(cameras), image_size
-        self.metadata = {**type(self).metadata, "render_fps": self.config.control_hz}
+        self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
         self.task_description = self.scene.task.instruction
         self.task = self.config.task

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,7 +55,7 @@ def get_task(name: str) -> Task:
 
 @dataclass(frozen=True)
 class Start:
-    """What a reset draws: object on the table (x, y, yaw), goal (3,) [m], arm posture offset (arm,) [rad], opening [m]."""
+    """What a reset draws, in [m] and [rad]. object_xy: (2,); goal: (3,); joint_offset from home: (arm,)."""
 
     object_xy: F64
     object_yaw: float
@@ -76,7 +77,7 @@ def draw_start(task: Task, robot: Robot, rng: np.random.Generator) -> Start:
 _JOINT_JITTER = 0.03  # [rad]
 
 
-def _draw_until(draw, robot: Robot, task: Task) -> F64:
+def _draw_until(draw: Callable[[], F64], robot: Robot, task: Task) -> F64:
     for _ in range(_MAX_DRAWS):
         xy = draw()
         if np.linalg.norm(xy - robot.workspace) >= task.min_start_distance and in_reach(robot, _on_table(xy)):
