@@ -29,9 +29,11 @@ RISE_FIRST = 0.03  # this far under the funnel, the hand only rises [m]
 LOWEST_EE = 0.018  # of the ee site over the table: the fingertips just clear it [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
-IN_HAND = (0.022, 0.015, 0.022)  # object's centre in the ee frame, x y z: held [m]
+CLOSING = (0.022, 0.015, 0.022)  # the same once they have begun to close [m]
+IN_HAND = (0.034, 0.020, 0.036)  # object's centre in the ee frame, x y z: what closed fingers touch, they hold [m]
 GRIP_SLACK = (0.006, 0.003)  # opening below and above the cube's width that is a grip [m]
 OPEN_SLACK = 0.016  # opening beyond the cube's width at which the hand may descend [m]
+PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
 MAX_TILT = 0.3  # of the object off a face: wait over it until it has settled [rad]
 CARRY_LIFT = 0.05  # of the object over the goal's height on the way there [m]
 CARRY_SLOPE = 0.6  # lift per horizontal distance still to go
@@ -72,7 +74,7 @@ def choose(g: Geometry) -> Target:
     offset = object_in_hand(g)
     if grasped(g, offset):
         return _carry(g)
-    rotation = hand_down(g.object_yaw)
+    rotation = hand_down(grasp_yaw(g))
     angle = angle_between(g.ee_rotation, rotation)
     at = np.array([g.object[0], g.object[1], max(g.object[2], LOWEST_EE)])
     if at_grasp(g, offset, angle):
@@ -93,7 +95,7 @@ def grasped(g: Geometry, offset: F64) -> bool:
 
 def at_grasp(g: Geometry, offset: F64, angle: float) -> bool:
     """Closing the fingers now would hold the object; once they have begun to close, they go on more readily."""
-    box = AT_GRASP if open_enough(g) else IN_HAND
+    box = AT_GRASP if open_enough(g) else CLOSING
     return _inside(offset, box) and angle < AT_GRASP_ANGLE and g.object_tilt < MAX_TILT
 
 
@@ -106,6 +108,18 @@ def hand_down(yaw: float) -> F64:
     """Rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def grasp_yaw(g: Geometry) -> float:
+    """The one of a cube's four grasps that is nearest to the hand's yaw, and a little to none [rad].
+
+    Nearest to the hand, not to zero: a learner that averages both sides of the boundary between two grasps then
+    leaves it by any turn, and does not stand still in the middle.
+    """
+    hand = math.atan2(g.ee_rotation[1, 0], g.ee_rotation[0, 0])
+    quarter = math.pi / 2
+    turns = (g.object_yaw - quarter, g.object_yaw, g.object_yaw + quarter)
+    return min(turns, key=lambda yaw: abs(yaw - hand) + PREFER_ZERO * abs(yaw))
 
 
 def angle_between(a: F64, b: F64) -> float:
