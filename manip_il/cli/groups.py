@@ -6,7 +6,7 @@ import functools
 import shlex
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +27,6 @@ WHERE_POLICIES_LIE = (".", "pretrained_model", "checkpoints/last/pretrained_mode
 
 def option(default: Any, text: str) -> Any:
     """A field with one line of help."""
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata={"help": text})
     return field(default=default, metadata={"help": text})
 
 
@@ -75,9 +73,6 @@ class PolicyGroup:
     loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
     width: int = option(256, "units a layer")
     depth: int = option(3, "hidden layers")
-    activation: str = option("silu", "between layers")
-    components: int = option(5, "of the mixture")
-    bins: int = option(101, "a dimension, of categorical")
 
     def config(self) -> MLPConfig:
         """The policy's configuration; `UsageError` for another type, an unknown loss or a size out of range."""
@@ -88,8 +83,7 @@ class PolicyGroup:
             )
         from manip_il.learn.mlp.configuration_mlp import MLPConfig
 
-        sizes = {name: getattr(self, name) for name in ("width", "depth", "activation", "components", "bins")}
-        return MLPConfig(loss=self.loss, **sizes)
+        return MLPConfig(**{one.name: getattr(self, one.name) for one in fields(self) if one.name != "type"})
 
 
 def warn(lines: Iterable[str]) -> None:

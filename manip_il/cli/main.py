@@ -84,7 +84,11 @@ def _dispatch(words: list[str]) -> None:
     elif "--help" in words or "-h" in words:
         print(_command_help(words[0], load(words[0])))
     else:
-        parse(load(words[0]), words[1:]).run()
+        options = parse(load(words[0]), words[1:])
+        from manip_il.sim.gl import choose_backend
+
+        choose_backend()  # mujoco takes the OpenGL that is chosen when it is imported, never another
+        options.run()
 
 
 def _report(error: BaseException, words: list[str]) -> int:

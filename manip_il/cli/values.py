@@ -105,7 +105,9 @@ def _union_members(option_type: Any) -> tuple[Any, ...]:
 
 
 def choices(option_type: Any) -> dict[str, Any]:
-    """Name -> value of a `Literal` or an `Enum`; empty for any other type."""
+    """Name -> value of a `Literal` or an `Enum`, also within a union; empty for any other type."""
+    if members := _union_members(option_type):
+        return {name: value for member in members for name, value in choices(member).items()}
     if typing.get_origin(option_type) is Literal:
         return {str(choice): choice for choice in typing.get_args(option_type)}
     if isinstance(option_type, type) and issubclass(option_type, Enum):

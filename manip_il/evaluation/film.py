@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import io
+import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-import manip_il.sim  # noqa: F401  # first: it chooses the OpenGL that mujoco takes on import
+# First: it chooses the OpenGL that mujoco takes on import.
+import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.jobs import RolloutJob, run_job
@@ -31,13 +34,17 @@ def run_states(job: RolloutJob, seed: int) -> Episode:
 
 
 def film(
-    episode: Episode, env_config: EnvConfig, camera: str = "front", size: tuple[int, int] = (240, 320)
+    episode: Episode,
+    env_config: EnvConfig,
+    camera: str = "front",
+    size: tuple[int, int] = (240, 320),
+    every: int = 1,
 ) -> list[NDArray[np.uint8]]:
-    """One picture a control step, uint8 (height, width, 3), until shortly after success.
+    """One picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
 
     Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
     """
-    states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz)]
+    states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz) : every]
     env = ManipEnv(config=env_config, cameras=(camera,), image_size=size)
     try:
         return [_picture(env, State.from_vector(row), camera) for row in states]
@@ -63,14 +70,15 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
     height, width = frames[0].shape[:2]
     if height % 2 or width % 2:
         raise ManipError(f"a film of {width} x {height} pixels; expected even numbers")
-    buffer = io.BytesIO()
-    with av.open(buffer, "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for picture in frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
-        container.mux(stream.encode())
-    return buffer.getvalue()
+    with tempfile.TemporaryDirectory() as folder:  # moving the index to the front needs a file that can be read again
+        path = Path(folder) / "film.mp4"
+        with av.open(path, "w", options={"movflags": "faststart"}) as container:
+            stream = container.add_stream("libx264", rate=Fraction(fps), options={"crf": "24", "preset": "medium"})
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            for picture in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            container.mux(stream.encode())
+        return path.read_bytes()
 
 
 def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:

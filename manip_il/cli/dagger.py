@@ -1,0 +1,178 @@
+"""`manip-il dagger`: roll out, label, aggregate, refit, and repeat."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
+from manip_il.cli.groups import (
+    EnvGroup,
+    PolicyGroup,
+    RobotGroup,
+    TaskGroup,
+    check_same_options,
+    command_line,
+    option,
+    save_options,
+)
+from manip_il.cli.options import to_plain
+from manip_il.cli.progress import say
+
+if TYPE_CHECKING:
+    from manip_il.cli.stages import Stages
+    from manip_il.dagger.config import DaggerConfig
+    from manip_il.dagger.loop import RoundResult
+    from manip_il.engine.local import Engine
+    from manip_il.evaluation.report_data import LearningCurve, Report
+
+METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
+FREE = ("workers", "output_dir")
+
+
+@dataclass
+class DaggerOptions:
+    """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
+
+    Round 0 is behaviour cloning on the expert's own demonstrations. OUTPUT_DIR/best holds the round with the highest
+    validation success.
+    """
+
+    example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
+    robot: RobotGroup = field(default_factory=RobotGroup)
+    task: TaskGroup = field(default_factory=TaskGroup)
+    env: EnvGroup = field(default_factory=EnvGroup)
+    demonstrations: int = option(50, "successful expert episodes of round 0")
+    rounds: int = option(5, "after round 0; a resumed run may have more")
+    episodes_per_round: int = option(50, "rollouts a round")
+    disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
+    beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
+    refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
+    policy: PolicyGroup = field(default_factory=PolicyGroup)
+    steps: int = option(3_000, "gradient steps a round")
+    batch_size: int = option(512, "frames a step")
+    validation_episodes: int = option(200, "unseen episodes that choose the best round")
+    hold: int = option(10, "control steps that a rollout goes on for after success")
+    seed: int = option(0, "shifts every random stream, 0 to 1000")
+    workers: int | None = option(None, "processes; by default one a core")
+    output_dir: Path = field(default=Path("runs/dagger"), metadata={"help": "folder of the run"})
+    resume: bool = option(False, "go on with a run that was stopped")
+    overwrite: bool = option(False, "replace a run that is there")
+
+    def run(self) -> None:
+        """Run, or go on with, all rounds."""
+        config = self.config()
+        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+        if self.resume:
+            check_same_options(self.output_dir, self, FREE, may_grow="rounds")
+        save_options(self.output_dir, self)
+        from manip_il.cli.stages import Stages
+        from manip_il.engine.local import Engine, default_workers
+        from manip_il.evaluation.report import write_report
+
+        kept = f"every finished episode and round, in {self.output_dir}"
+        with Stages(kept) as stages, Engine(self.workers or default_workers()) as engine:
+            results = run_rounds(config, self.output_dir, engine, stages)
+        write_report(self.output_dir / REPORT_FILE, _report(self, config, results))
+        best = self.output_dir / "best" / "pretrained_model"
+        say(f"best policy: {best}")
+        say(f"all rounds' labels as one dataset: {self.output_dir / 'dataset'}")
+        say(f"report: {self.output_dir / REPORT_FILE}")
+        say(f"next: manip-il eval --policy.path={best} --output_dir={self.output_dir}/test")
+
+    def config(self) -> DaggerConfig:
+        """What `run_dagger` takes."""
+        policy = self.policy.config()
+        env = self.env.config(self.robot.type, self.task.type)
+        from manip_il.dagger.config import DaggerConfig, FitConfig
+
+        return DaggerConfig(
+            env=env,
+            demonstrations=self.demonstrations,
+            rounds=self.rounds,
+            episodes_per_round=self.episodes_per_round,
+            beta=self.beta,
+            refit=self.refit,
+            fit=FitConfig(policy.loss, self.steps, self.batch_size, policy.width, policy.depth),
+            validation_episodes=self.validation_episodes,
+            hold=self.hold,
+            disturbed_share=self.disturbed_share,
+            seed=self.seed,
+        )
+
+
+def run_rounds(config: DaggerConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
+    """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
+    from manip_il.dagger.loop import run_dagger
+    from manip_il.engine.describe import env_fingerprint
+
+    atomic_write(folder / FINGERPRINT_FILE, json.dumps(env_fingerprint(config.env), indent=1) + "\n")
+    results: list[RoundResult] = []
+    for result in run_dagger(config, folder, engine, stages.watch()):
+        stages.close()
+        _add_metrics(folder / METRICS_FILE, result)
+        results.append(result)
+        say(_line(result))
+        stages.check()
+    return results
+
+
+def _add_metrics(path: Path, result: RoundResult) -> None:
+    """Add the round's line, unless an earlier run has: what it took then is what is true."""
+    if all(record["round"] != result.round for record in read_jsonl(path)):
+        append_jsonl(path, result.to_json())
+
+
+def _line(result: RoundResult) -> str:
+    seconds = sum(result.seconds.values())
+    return (
+        f"round {result.round}: {result.labels:,} labels, validation success {result.validation.success}, "
+        f"{seconds:.0f} s"
+    )
+
+
+def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundResult]) -> Report:
+    from manip_il.dagger.loop import best_round
+    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.results import compare_results
+
+    best = best_round(results)
+    names = ["cloning (round 0)", *(f"DAgger, round {result.round}" for result in results[1:])]
+    rows = [
+        PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
+        for name, result in zip(names, results, strict=True)
+    ]
+    facts = []
+    if best.round > 0:
+        comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
+        facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
+    return Report(
+        title=f"DAgger on {config.env.robot} {config.env.task}",
+        verdict=(
+            f"{names[best.round]} is the best of {len(results)}: "
+            f"{best.validation.success} success on {best.validation.success.n:,} validation episodes."
+        ),
+        command=command_line("dagger", options),
+        rows=tuple(rows),
+        facts=tuple(facts),
+        curve=learning_curve(results),
+        config=to_plain(options),
+        fingerprint=best.validation.fingerprint,
+        timings=round_timings(options.output_dir),
+    )
+
+
+def learning_curve(results: list[RoundResult]) -> LearningCurve:
+    """Validation success over labels, one point a round."""
+    from manip_il.evaluation.report_data import CurvePoint, LearningCurve
+
+    points = [CurvePoint(r.labels, r.validation.success, f"round {r.round}") for r in results]
+    return LearningCurve(dagger=tuple(points))
+
+
+def round_timings(folder: Path) -> dict[str, float]:
+    """What each round's stages took [s], as the run that made them measured it."""
+    records = read_jsonl(folder / METRICS_FILE)
+    return {f"round {r['round']}, {stage}": seconds for r in records for stage, seconds in r["seconds"].items()}

@@ -1,0 +1,230 @@
+"""`manip-il quickstart`: demonstrations, cloning, DAgger, and a report that compares them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli.dagger import FREE, REPORT_FILE, DaggerOptions, learning_curve, round_timings, run_rounds
+from manip_il.cli.folders import atomic_write, prepare_output
+from manip_il.cli.groups import (
+    EnvGroup,
+    PolicyGroup,
+    RobotGroup,
+    TaskGroup,
+    check_same_options,
+    command_line,
+    option,
+    save_options,
+    warn,
+)
+from manip_il.cli.options import to_plain
+from manip_il.cli.progress import say
+from manip_il.errors import UsageError
+
+if TYPE_CHECKING:
+    from manip_il.cli.stages import Stages
+    from manip_il.cli.story import Contestant, Pictures
+    from manip_il.dagger.config import DaggerConfig
+    from manip_il.dagger.loop import RoundResult
+    from manip_il.engine.local import Engine
+    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.results import EvalResult
+
+    Measured = dict[str, dict[str, EvalResult]]
+
+TIMINGS_FILE = "timings.json"
+
+
+@dataclass
+class QuickstartOptions:
+    """The whole story, small: the expert demonstrates, a policy is cloned, DAgger mends it.
+
+    Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
+    the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows it.
+    """
+
+    example: ClassVar[str] = "manip-il quickstart --output_dir=runs/quickstart"
+    robot: RobotGroup = field(default_factory=RobotGroup)
+    task: TaskGroup = field(default_factory=TaskGroup)
+    env: EnvGroup = field(default_factory=EnvGroup)
+    demonstrations: int = option(100, "successful expert episodes to begin with")
+    rounds: int = option(3, "of DAgger")
+    episodes_per_round: int = option(50, "rollouts a round")
+    disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
+    policy: PolicyGroup = field(default_factory=PolicyGroup)
+    steps: int = option(3_000, "gradient steps a fit")
+    batch_size: int = option(512, "frames a step")
+    validation_episodes: int = option(100, "unseen episodes that choose the best round")
+    test_episodes: int = option(200, "unseen episodes that nothing is chosen on")
+    disturbed_episodes: int = option(100, "the first of them once more, disturbed")
+    seed: int = option(0, "shifts every random stream, 0 to 1000")
+    workers: int | None = option(None, "processes; by default one a core")
+    output_dir: Path = field(default=Path("runs/quickstart"), metadata={"help": "folder of the run"})
+    resume: bool = option(False, "go on with a run that was stopped")
+    overwrite: bool = option(False, "replace a run that is there")
+
+    def run(self) -> None:
+        """Run what is not there yet, print the table, write the report."""
+        started = time.monotonic()
+        for name in ("test_episodes", "disturbed_episodes"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
+        config = self._config()
+        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+        if self.resume:
+            check_same_options(self.output_dir, self, FREE)
+        save_options(self.output_dir, self)
+        from manip_il.cli.stages import Stages
+        from manip_il.engine.local import Engine, default_workers
+
+        kept = f"every finished episode, round and evaluation, in {self.output_dir}"
+        with Stages(kept) as stages, Engine(self.workers or default_workers()) as engine:
+            story = _Story(self, config, engine, stages)
+            story.add_time("start", time.monotonic() - started)
+            story.tell()
+
+    def _config(self) -> DaggerConfig:
+        shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "policy", "steps")
+        shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
+        return replace(DaggerOptions(), **{name: getattr(self, name) for name in shared}).config()
+
+
+class _Story:
+    """One run of the quickstart, chapter by chapter."""
+
+    def __init__(self, options: QuickstartOptions, config: DaggerConfig, engine: Engine, stages: Stages) -> None:
+        self.options, self.config, self.engine, self.stages = options, config, engine, stages
+        self.folder = options.output_dir
+        path = self.folder / TIMINGS_FILE
+        self.timings: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+
+    def tell(self) -> None:
+        """Every chapter, then table and report."""
+        from manip_il.cli.story import picture, telling_seed
+        from manip_il.evaluation.report import write_report
+        from manip_il.evaluation.terminal import print_results
+
+        with self._timed("demonstrations and DAgger"):
+            results = run_rounds(self.config, self.folder / "dagger", self.engine, self.stages)
+        with self._timed("cloning with as many labels"):
+            contestants = self._contestants(results)
+        with self._timed("evaluations"):
+            measured = self._measure(contestants)
+        with self._timed("films"):
+            _, cloned, _, dagger = contestants
+            seed = telling_seed(measured["nominal"][cloned.key], measured["nominal"][dagger.key])
+            pictures = picture(contestants, self.config.env, seed, self.stages)
+        if pictures.note:
+            warn([f"the report shows paths in place of films: {pictures.note}"])
+        report = self._report(results, contestants, measured, pictures)
+        write_report(self.folder / REPORT_FILE, report)
+        print_results(report.rows)
+        for sentence in (report.verdict, *report.facts):
+            say(sentence)
+        self._close(dagger)
+
+    def _contestants(self, results: list[RoundResult]) -> tuple[Contestant, ...]:
+        from manip_il.cli.story import Contestant, clone_with_labels
+        from manip_il.dagger.loop import best_round, round_folder
+
+        first, best = results[0], best_round(results)
+        round_0 = round_folder(self.folder / "dagger", 0)
+        policy, labels = clone_with_labels(
+            self.config, results[-1].labels, round_0, self.folder / "cloning", self.engine, self.stages
+        )
+        return (
+            Contestant("expert", "expert", "expert"),
+            Contestant("cloned", "cloning", "cloning", first.policy, first.labels),
+            Contestant("cloned_more", "cloning, as many labels", "cloning", policy, labels),
+            Contestant("dagger", f"DAgger (round {best.round})", "dagger", best.policy, best.labels),
+        )
+
+    def _measure(self, contestants: tuple[Contestant, ...]) -> Measured:
+        from manip_il.cli.story import measure
+        from manip_il.seeding import stream_seeds
+
+        counts = {"nominal": self.options.test_episodes, "disturbed": self.options.disturbed_episodes}
+        measured = {
+            name: measure(
+                contestants,
+                self.config.env,
+                stream_seeds("test", count, self.options.seed),
+                self.folder / "evaluation" / name,
+                self.engine,
+                self.stages,
+            )
+            for name, count in counts.items()
+        }
+        seeds = stream_seeds("validation", self.config.validation_episodes, self.options.seed)
+        folder = self.folder / "evaluation" / "validation"
+        more = [who for who in contestants if who.key == "cloned_more"]
+        return measured | {"validation": measure(more, self.config.env, seeds, folder, self.engine, self.stages)}
+
+    def _report(
+        self,
+        results: list[RoundResult],
+        contestants: tuple[Contestant, ...],
+        measured: Measured,
+        pictures: Pictures,
+    ) -> Report:
+        from manip_il.cli.story import compare
+        from manip_il.evaluation.report_data import CurvePoint, PolicyRow, Report
+
+        _, cloned, more, dagger = contestants
+        nominal, disturbed = measured["nominal"], measured["disturbed"]
+        rows = [PolicyRow.of(w.name, nominal[w.key], w.labels, disturbed[w.key], w.kind) for w in contestants]
+        pairs = [(cloned, dagger), (more, dagger)]
+        curve = learning_curve(results)
+        points = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
+        return Report(
+            title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
+            verdict=_verdict(rows),
+            command=command_line("quickstart", self.options),
+            rows=tuple(rows),
+            facts=(*compare(nominal, pairs, "Undisturbed"), *compare(disturbed, pairs, "Disturbed")),
+            curve=replace(curve, cloning=(points,)),
+            films=pictures.films,
+            strips=pictures.strips,
+            paths=pictures.paths,
+            pictures_note=pictures.note,
+            disturbance=disturbed[dagger.key].settings.disturbance,
+            config=to_plain(self.options),
+            fingerprint=nominal[dagger.key].fingerprint,
+            timings=self.timings | round_timings(self.folder / "dagger"),
+        )
+
+    @contextmanager
+    def _timed(self, chapter: str) -> Generator[None]:
+        """Add what a chapter takes, also where it is stopped, to what it took before."""
+        started = time.monotonic()
+        try:
+            yield
+        finally:
+            self.add_time(chapter, time.monotonic() - started)
+
+    def add_time(self, chapter: str, seconds: float) -> None:
+        """Add what a chapter took [s]."""
+        self.timings[chapter] = round(self.timings.get(chapter, 0.0) + seconds, 2)
+        atomic_write(self.folder / TIMINGS_FILE, json.dumps(self.timings, indent=1) + "\n")
+
+    def _close(self, dagger: Contestant) -> None:
+        from manip_il.evaluation.report_data import format_seconds
+
+        say(f"took {format_seconds(sum(self.timings.values()))} in all")
+        say(f"report: {self.folder / REPORT_FILE}")
+        say(f"next: manip-il eval --policy.path={dagger.policy} --eval.films=3 --output_dir={self.folder}_eval")
+
+
+def _verdict(rows: Sequence[PolicyRow]) -> str:
+    expert, cloned, more, dagger = rows
+    return (
+        f"On {dagger.success.n:,} unseen starts the cloned policy succeeds in {cloned.success}, "
+        f"DAgger in {dagger.success}, cloning with as many labels in {more.success}, the expert in {expert.success}; "
+        f"disturbed, {cloned.disturbed}, {dagger.disturbed}, {more.disturbed} and {expert.disturbed}."
+    )

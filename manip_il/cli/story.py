@@ -1,0 +1,169 @@
+"""The parts of the quickstart: cloning with as many labels as DAgger had, the measurements, the pictures."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from manip_il.dagger.collect import MAX_TRIES, build_dataset, collect_successes
+from manip_il.dagger.loop import LEARNING_COLUMNS, fit_policy
+from manip_il.data import schema
+from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.lerobot_io import read_table
+from manip_il.engine.describe import env_spec
+from manip_il.engine.jobs import RolloutJob
+from manip_il.errors import RenderError
+from manip_il.evaluation.film import encode_mp4, film, paths, run_states, strip
+from manip_il.evaluation.report_data import Film, Kind, Paths, Strip
+from manip_il.evaluation.results import EvalResult, compare_results
+from manip_il.evaluation.runner import evaluate
+from manip_il.seeding import stream_seeds
+from manip_il.sim.disturb import NONE, STANDARD, Disturbance
+
+if TYPE_CHECKING:
+    from manip_il.cli.stages import Stages
+    from manip_il.dagger.config import DaggerConfig
+    from manip_il.engine.local import Engine
+    from manip_il.mdp import Episode
+    from manip_il.sim.env import EnvConfig
+
+FILM_EVERY = 2  # control steps a film's frame: a software renderer takes a tenth of a second for each
+DISTURBANCES: dict[str, Disturbance] = {"nominal": NONE, "disturbed": STANDARD}
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """One policy of the comparison. labels: expert labels that it learnt from."""
+
+    key: str  # its folder
+    name: str
+    kind: Kind
+    policy: Path | None = None
+    labels: int | None = None
+
+    def job(self, env: EnvConfig, disturbance: Disturbance = NONE) -> RolloutJob:
+        """Its rollouts."""
+        driver: Literal["expert", "policy"] = "expert" if self.policy is None else "policy"
+        return RolloutJob(env, driver, policy=self.policy, labels="last", disturbance=disturbance)
+
+
+def clone_with_labels(
+    config: DaggerConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages
+) -> tuple[Path, int]:
+    """Fit a policy as every round's is fitted, to `labels` labels of demonstrations alone.
+
+    The demonstrations are those of round 0 and the ones that follow in their stream of seeds. Returns the
+    checkpoint and the number of labels.
+    """
+    if not (folder / "dataset").is_dir():
+        _demonstrate(config, labels, round_0, folder, engine, stages)
+    table = read_table(folder / "dataset", LEARNING_COLUMNS)
+    so_far = np.cumsum(table[schema.LABEL_VALID])
+    rows = int(np.searchsorted(so_far, labels)) + 1
+    stages.start("cloning with as many labels, fit", config.fit.steps)
+    policy = fit_policy(
+        config, {key: column[:rows] for key, column in table.items()}, folder / "policy", on_log=stages.log
+    )
+    stages.close()
+    return policy, min(labels, int(so_far[-1]))
+
+
+def measure(
+    contestants: Sequence[Contestant], env: EnvConfig, seeds: range, folder: Path, engine: Engine, stages: Stages
+) -> dict[str, EvalResult]:
+    """Key -> evaluation on the same seeds, under the disturbance that `folder` is named after.
+
+    What an earlier run has written is read instead.
+    """
+    results: dict[str, EvalResult] = {}
+    for who in contestants:
+        path = folder / f"{who.key}.json"
+        if not path.is_file():
+            stages.start(f"{folder.name}: {who.name}", len(seeds))
+            job = who.job(env, DISTURBANCES.get(folder.name, NONE))
+            evaluate(engine, job, seeds, who.name, stages.episode).write(path)
+            stages.close()
+        results[who.key] = EvalResult.read(path)
+    return results
+
+
+def compare(results: Mapping[str, EvalResult], pairs: Sequence[tuple[Contestant, Contestant]], words: str) -> list[str]:
+    """One sentence a pair."""
+    return [
+        f"{words}: {compare_results(results[left.key], results[right.key], (left.name, right.name)).verdict}"
+        for left, right in pairs
+    ]
+
+
+def telling_seed(loser: EvalResult, winner: EvalResult) -> int:
+    """The first seed on which only the winner succeeds, else the first of all."""
+    won = {episode.seed for episode in winner.episodes if episode.success}
+    telling = (episode.seed for episode in loser.episodes if not episode.success and episode.seed in won)
+    return next(telling, loser.episodes[0].seed)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Of one seed, of every policy; paths and a note where there is no OpenGL."""
+
+    films: tuple[Film, ...] = ()
+    strips: tuple[Strip, ...] = ()
+    paths: tuple[Paths, ...] = ()
+    note: str = ""
+
+
+def picture(contestants: Sequence[Contestant], env: EnvConfig, seed: int, stages: Stages) -> Pictures:
+    """Run one seed with every policy and show it."""
+    episodes = {who.name: run_states(who.job(env), seed) for who in contestants}
+    stages.start("films", len(episodes))
+    try:
+        shown = [_show(name, episode, env, stages) for name, episode in episodes.items()]
+    except RenderError as error:
+        spec = env_spec(env)
+        drawn = tuple(paths(episode, spec, name, _caption(episode)) for name, episode in episodes.items())
+        return Pictures(paths=drawn, note=str(error))
+    finally:
+        stages.close()
+    return Pictures(tuple(one for one, _ in shown), tuple(one for _, one in shown))
+
+
+def _show(name: str, episode: Episode, env: EnvConfig, stages: Stages) -> tuple[Film, Strip]:
+    frames = film(episode, env, every=FILM_EVERY)
+    fps = env.control_hz // FILM_EVERY or 1
+    stages.step()
+    caption = _caption(episode)
+    return Film(name, encode_mp4(frames, fps), caption), Strip(name, strip(frames, fps), caption)
+
+
+def _caption(episode: Episode) -> str:
+    return f"{'success' if episode.success else 'failure'}, seed {episode.seed}"
+
+
+def _demonstrate(
+    config: DaggerConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages
+) -> None:
+    """Record until the demonstrations hold `labels` frames; those of round 0 count."""
+    journals = folder / "journals"
+    journals.mkdir(parents=True, exist_ok=True)
+    for path in list_episodes(round_0 / "journals"):
+        shutil.copyfile(path, journals / path.name)
+    job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
+    count = config.demonstrations
+    stages.start("cloning with as many labels, record", count)
+    while True:
+        seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
+        found = collect_successes(engine, job, seeds, count, journals, stages.episode)
+        frames = sum(read_header(path).frames for path in found)
+        if frames >= labels:
+            break
+        count = max(count + 1, math.ceil(count * labels / frames))
+        stages.start("cloning with as many labels, record", count - len(found))
+    name = f"local/{config.env.robot}_{config.env.task}_demonstrations"
+    provenance = {"driver": "expert", "round": 0, "beta": 1.0, "seeds": [seeds[0], read_header(found[-1]).seed]}
+    build_dataset(found, folder / "dataset", job, name, provenance)

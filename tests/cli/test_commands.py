@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from manip_il.cli import groups
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.main import load, main
+from manip_il.cli.options import from_yaml
+from manip_il.data.lerobot_io import dataset_info, read_provenance, read_table
+from manip_il.evaluation.results import EvalResult
+from manip_il.sim.env import EnvConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+TINY_DAGGER = [
+    "--demonstrations=3",
+    "--rounds=1",
+    "--episodes_per_round=2",
+    "--steps=20",
+    "--policy.width=16",
+    "--validation_episodes=2",
+    "--env.horizon=60",
+    "--workers=1",
+]
+
+
+def record(root: Path, episodes: int, *words: str) -> list[str]:
+    return ["record", f"--dataset.root={root}", f"--dataset.num_episodes={episodes}", "--workers=1", *words]
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("demos") / "d"
+    assert main(record(root, 3)) == 0
+    return root
+
+
+@pytest.fixture(scope="module")
+def policy(demos, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "t"
+    words = ["train", f"--dataset.root={demos}", "--steps=20", "--policy.width=16", f"--output_dir={folder}"]
+    assert main(words) == 0
+    return folder
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def one_error(capsys) -> str:
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith("manip-il: error:")]
+    assert len(lines) == 1, err
+    return lines[0]
+
+
+def killed(words: list[str], is_time: Path) -> None:
+    """Start a command and kill it, hard, as soon as a file matches `is_time`."""
+    process = subprocess.Popen([sys.executable, "-m", "manip_il.cli.main", *words], stderr=subprocess.DEVNULL)
+    while not list(is_time.parent.glob(is_time.name)):
+        assert process.poll() is None, "it ended before it was killed"
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+
+
+def test_option_defaults_are_those_of_the_environment():
+    assert groups.EnvGroup().config(groups.DEFAULT_ROBOT, groups.DEFAULT_TASK) == EnvConfig()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_config_loads_by_the_command_in_its_first_line(path):
+    command = path.read_text().splitlines()[0].removeprefix("# ").split()
+    assert command[0] == "manip-il"
+    assert command[2] == f"--config_path=configs/{path.name}"
+    options = from_yaml(path, load(command[1]))
+    assert options != load(command[1])()
+
+
+def test_record_writes_successes_and_their_provenance(demos):
+    info = dataset_info(demos)
+    assert (info.episodes, info.success, info.robot, info.task) == (3, 3, "panda", "pick_place")
+    table = read_table(demos, ["seed", "actor", "label_valid"])
+    assert np.unique(table["seed"]).tolist() == [1_000_000, 1_000_001, 1_000_002]
+    assert not table["actor"].any()
+    assert table["label_valid"].all()
+    assert read_provenance(demos)["seeds"] == [1_000_000, 1_000_002]
+
+
+def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, capsys):
+    assert main(record(tmp_path / "d", 2)) == 0
+    assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
+    assert files(tmp_path / "d") == files(demos)
+    capsys.readouterr()
+    assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
+    assert "3 episodes already" in capsys.readouterr().out
+    assert main(record(tmp_path / "d", 3, "--resume=true", "--seed=1")) == 1
+    assert "--seed differs" in one_error(capsys)
+
+
+@pytest.mark.slow
+def test_a_recorded_dataset_opens_in_lerobot(demos):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("local/d", root=demos)
+    assert dataset.num_episodes == 3
+    assert dataset.hf_dataset[0]["action"].shape == (8,)
+
+
+@pytest.mark.slow
+def test_a_killed_recording_resumes_to_the_same_bytes(tmp_path):
+    killed(record(tmp_path / "cut", 6), tmp_path / "cut.journals" / "episode-*.mcap")
+    assert not (tmp_path / "cut").exists()
+    assert main(record(tmp_path / "cut", 6, "--resume=true")) == 0
+    assert main(record(tmp_path / "whole", 6)) == 0
+    assert files(tmp_path / "cut") == files(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
+    words = [sys.executable, "-m", "manip_il.cli.main", *record(tmp_path / "d", 60)]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    while not list((tmp_path / "d.journals").glob("episode-*")):
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGINT)
+    err = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "kept: every finished episode" in err
+    assert err.rstrip().endswith("--workers=1 --resume=true")
+
+
+def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
+    for words in (record(demos, 3), ["train", f"--dataset.root={demos}", f"--output_dir={policy}"]):
+        assert main(words) == 2
+        assert "exists already" in one_error(capsys)
+    assert main(record(tmp_path / "d", 1)) == 0
+    assert main(record(tmp_path / "d", 1, "--seed=2", "--overwrite=true")) == 0
+    assert read_table(tmp_path / "d", ["seed"])["seed"][0] > 200_000_000
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["record", "--robot.type=pandas"], "did you mean 'panda'?"),
+        (["record", "--task.type=pick"], "did you mean 'pick_place'?"),
+        (["record", "--num_episodes=3"], "did you mean '--dataset.num_episodes'?"),
+        (["record", "--cameras=front,wrist"], "records no pictures"),
+        (["record", "--dataset.num_episodes=0"], "expected at least 1"),
+        (["record", "--dataset.repo_id=name"], "expected USER/NAME"),
+        (["train"], "--dataset.root is missing"),
+        (["train", "--dataset.root=x", "--policy.type=mpl"], "did you mean 'mlp'?"),
+        (["train", "--dataset.root=x", "--policy.type=act"], "lerobot-train"),
+        (["train", "--dataset.root=x", "--policy.loss=mes"], "did you mean 'mse'?"),
+        (["dagger", "--beta=lineal:5"], "did you mean 'linear'?"),
+        (["dagger", "--rounds=-1"], "expected at least 0"),
+        (["eval", "--policy.type=exprt"], "did you mean 'expert'?"),
+        (["eval"], "--policy.path=DIR"),
+        (["eval", "--policy.path=configs"], "no policy in configs"),
+        (["eval", "--policy.type=expert", "--env.tolerance=2"], "tolerance is 2.0"),
+        (["quickstart", "--test_episodes=0"], "expected at least 1"),
+    ],
+    ids=lambda value: " ".join(value)[:50] if isinstance(value, list) else "",
+)
+def test_a_wrong_word_exits_2_and_says_the_right_one(words, hint, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("configs").mkdir()
+    assert main(words) == 2
+    assert hint in one_error(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["configs"]
+
+
+def test_train_refuses_a_dataset_with_nan(demos, tmp_path, capsys):
+    broken = tmp_path / "broken"
+    shutil.copytree(demos, broken)
+    [path] = broken.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    values = np.array(table["action"].combine_chunks().flatten())
+    values[8 * 5] = np.nan
+    place = table.schema.get_field_index("action")
+    column = pa.FixedSizeListArray.from_arrays(pa.array(values), 8).cast(table.schema.field("action").type)
+    pq.write_table(table.set_column(place, table.schema.field("action"), column), path)
+    assert main(["train", f"--dataset.root={broken}", f"--output_dir={tmp_path / 't'}"]) == 1
+    assert "column action, row 5" in one_error(capsys)
+
+
+def test_train_to_eval(policy, tmp_path, capsys):
+    words = ["eval", f"--policy.path={policy}", "--eval.n_episodes=2", "--workers=1", f"--output_dir={tmp_path / 'e'}"]
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert "differs" not in err
+    assert "next: manip-il eval" in out
+    result = EvalResult.read(tmp_path / "e" / "eval.json")
+    assert [episode.seed for episode in result.episodes] == [4_000_000, 4_000_001]
+    assert (result.robot, result.task, result.settings.disturbance) == ("panda", "pick_place", "none")
+    assert main(words) == 2
+    assert "--overwrite=true" in one_error(capsys)
+    assert main([*words, "--overwrite=true", "--env.tolerance=0.05", "--eval.disturbance=standard"]) == 0
+    assert "config differs" in capsys.readouterr().err
+    assert "noise" in EvalResult.read(tmp_path / "e").settings.disturbance
+    assert main([*words, "--overwrite=true", "--robot.type=fetch"]) == 1
+    assert "robot differs: the policy has panda" in one_error(capsys)
+
+
+def test_the_expert_is_measured_by_name(tmp_path):
+    words = ["eval", "--policy.type=expert", "--eval.n_episodes=2", "--eval.stream=validation", "--workers=1"]
+    assert main([*words, f"--output_dir={tmp_path / 'e'}"]) == 0
+    data = json.loads((tmp_path / "e" / "eval.json").read_text())
+    assert (data["success_rate"], data["n_episodes"], data["policy"]) == (1.0, 2, "expert")
+    assert data["episodes"][0]["seed"] == 3_000_000
+
+
+@pytest.mark.gl
+def test_eval_films_the_first_episodes(tmp_path):
+    words = ["eval", "--policy.type=expert", "--task.type=reach", "--eval.n_episodes=2", "--eval.films=1"]
+    assert main([*words, "--env.horizon=20", "--workers=1", f"--output_dir={tmp_path / 'e'}"]) == 0
+    [path] = (tmp_path / "e" / "films").iterdir()
+    assert path.name.startswith("seed_4000000_")
+    assert path.read_bytes()[4:8] == b"ftyp"
+
+
+def metrics(folder: Path) -> list[dict]:
+    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
+
+
+@pytest.mark.slow
+def test_a_killed_dagger_run_resumes_to_the_same_metrics(tmp_path, capsys):
+    words = ["dagger", *TINY_DAGGER]
+    killed([*words, f"--output_dir={tmp_path / 'cut'}"], tmp_path / "cut" / "metrics.jsonl")
+    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
+    assert main([*words, f"--output_dir={tmp_path / 'whole'}"]) == 0
+    assert metrics(tmp_path / "cut") == metrics(tmp_path / "whole")
+    assert [record["round"] for record in metrics(tmp_path / "cut")] == [0, 1]
+    assert files(tmp_path / "cut" / "dataset") == files(tmp_path / "whole" / "dataset")
+    for name in ("config.yaml", "fingerprint.json", "report.html", "best/pretrained_model/model.safetensors"):
+        assert (tmp_path / "whole" / name).is_file()
+    capsys.readouterr()
+    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true", "--beta=constant:0.5"]) == 1
+    assert "--beta differs" in one_error(capsys)
+    more = [*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true", "--rounds=2"]
+    assert main(more) == 0
+    assert [record["round"] for record in metrics(tmp_path / "cut")] == [0, 1, 2]
+    assert dataset_info(tmp_path / "cut" / "dataset").episodes == 3 + 2 * 2
+
+
+@pytest.mark.slow
+def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys):
+    sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
+    words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "report: " in out
+    page = (tmp_path / "q" / "report.html").read_text()
+    assert all(name in page for name in ("expert", "cloning, as many labels", "DAgger (round"))
+    before = files(tmp_path / "q" / "evaluation")
+    assert main([*words, "--resume=true"]) == 0
+    assert files(tmp_path / "q" / "evaluation") == before
+
+
+def test_a_command_line_can_be_copied_from_a_report():
+    options = DaggerOptions(rounds=2, output_dir=Path("runs/a b"))
+    assert groups.command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"

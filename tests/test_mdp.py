@@ -1,0 +1,83 @@
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from manip_il.errors import ManipError, NotFiniteError
+from manip_il.mdp import Episode, Label, Observation, Phase, State, require_finite
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(
+    arrays(np.float64, st.integers(0, 40), elements=finite),
+    arrays(np.float64, 3, elements=finite),
+    st.integers(0, 10_000),
+    st.integers(0, 10_000),
+    st.booleans(),
+)
+def test_a_state_survives_its_vector_bit_for_bit(physics, goal, step: int, streak: int, ever: bool):
+    state = State(physics, goal, step, streak, ever)
+    again = State.from_vector(state.to_vector())
+    assert again.physics.tobytes() == physics.tobytes()
+    assert again.goal.tobytes() == goal.tobytes()
+    assert (again.step, again.streak, again.ever) == (step, streak, ever)
+
+
+def test_a_state_from_a_vector_owns_its_numbers():
+    vector = State(np.ones(5), np.ones(3)).to_vector()
+    state = State.from_vector(vector)
+    vector[:] = 7
+    np.testing.assert_array_equal(state.physics, np.ones(5))
+    np.testing.assert_array_equal(state.goal, np.ones(3))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused_where_it_enters(bad: float):
+    with pytest.raises(NotFiniteError, match=r"State\.physics: .* at index 2"):
+        State(np.array([0.0, 0.0, bad]), np.zeros(3))
+    with pytest.raises(NotFiniteError, match=r"State\.goal: .* at index 1"):
+        State(np.zeros(4), np.array([0.0, bad, 0.0]))
+    with pytest.raises(NotFiniteError, match=r"Label\.action"):
+        Label(np.array([bad]), Phase.APPROACH, True, 0.0)
+    with pytest.raises(NotFiniteError, match=r"observation\.environment_state"):
+        Observation(np.zeros(2, np.float32), np.array([bad], np.float32))
+
+
+def test_the_row_that_is_not_finite_is_named():
+    column = np.zeros((5, 2), np.float32)
+    column[3, 1] = np.nan
+    with pytest.raises(NotFiniteError, match=r"episode 12, action: .* at frame 3 is not finite"):
+        Episode(12, {"action": column}, False, False)
+
+
+def test_whole_numbers_are_always_finite():
+    require_finite("actor", np.array([[1], [2]]))
+
+
+def test_a_goal_has_three_coordinates():
+    with pytest.raises(ManipError, match=r"State\.goal has shape \(2,\); expected \(3,\)"):
+        State(np.zeros(4), np.zeros(2))
+
+
+def test_columns_of_unequal_lengths_are_refused_with_both_numbers():
+    with pytest.raises(ManipError, match=r"'action': 3.*'actor': 4"):
+        Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((4, 1))}, False, False)
+
+
+def test_an_episode_has_frames():
+    with pytest.raises(ManipError, match="no frames"):
+        Episode(5, {"action": np.zeros((0, 2))}, False, False)
+
+
+def test_an_episodes_length_is_its_columns():
+    assert len(Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((3, 1))}, True, True)) == 3
+
+
+def test_a_state_cannot_be_changed():
+    state = State(np.zeros(2), np.zeros(3))
+    with pytest.raises(FrozenInstanceError):
+        state.step = 3  # pyright: ignore[reportAttributeAccessIssue]
