@@ -187,7 +187,11 @@ class _Story:
             verdict=_verdict(rows),
             command=command_line("quickstart", self.options),
             rows=tuple(rows),
-            facts=(*compare(nominal, pairs, "Undisturbed"), *compare(disturbed, pairs, "Disturbed")),
+            facts=(
+                *compare(nominal, pairs, "Undisturbed"),
+                *compare(disturbed, pairs, "Disturbed"),
+                f"{self.config.disturbed_share:.0%} of DAgger's rollouts ran disturbed, no demonstration did.",
+            ),
             curve=replace(curve, cloning=(points,)),
             films=pictures.films,
             strips=pictures.strips,

@@ -1,0 +1,114 @@
+"""Who drives, and that the labels are the expert's whoever does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from manip_il.data.episodes import group_episodes
+from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
+from manip_il.errors import ManipError
+from manip_il.expert.expert import Expert
+from manip_il.mdp import Actor, Episode, Label, Observation, Phase, State
+from manip_il.rollout import Rules, Turn, rollout
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import ManipEnv
+
+SEEDS = stream_seeds("certificate", 5)
+RULES = Rules(horizon=15)
+
+
+class Wave:
+    """A policy without weights: every joint waves with the hand's place."""
+
+    def act(self, states: np.ndarray, environment_states: np.ndarray) -> np.ndarray:
+        place = environment_states[:, :1].astype(np.float64) + environment_states[:, 1:2]
+        return states.astype(np.float64) + 0.05 * np.sin(20 * place + np.arange(states.shape[1]))
+
+
+def run(driver, envs: int = 1, seeds=SEEDS, robot: str = "fetch") -> dict[int, Episode]:
+    environments = [ManipEnv(robot) for _ in range(envs)]
+    transitions = rollout(environments, seeds, driver, RULES, Expert(environments[0].scene))
+    return {episode.seed: episode for episode in group_episodes(transitions)}
+
+
+def same(left: dict[int, Episode], right: dict[int, Episode]) -> bool:
+    def written(episodes: dict[int, Episode]) -> dict[int, dict[str, bytes]]:
+        return {seed: {k: v.tobytes() for k, v in episode.columns.items()} for seed, episode in episodes.items()}
+
+    return written(left) == written(right)
+
+
+def drivers() -> dict:
+    return {"random": RandomDriver(0.1, 0.1), "mixture": MixtureDriver(Wave(), 0.5), "learner": LearnerDriver(Wave())}
+
+
+@pytest.mark.parametrize("name", drivers())
+def test_labels_are_the_experts_whoever_drove(name: str):
+    expert = Expert(ManipEnv("fetch").scene)
+    for episode in run(drivers()[name]).values():
+        labels = [expert.label(State.from_vector(row)) for row in episode.columns["sim_state"]]
+        wanted = np.array([label.action for label in labels]).astype(np.float32)
+        np.testing.assert_array_equal(episode.columns["action"], wanted)
+        np.testing.assert_array_equal(episode.columns["expert_phase"].ravel(), [label.phase for label in labels])
+        by_learner = episode.columns["actor"].ravel() == Actor.LEARNER
+        assert by_learner.any()
+        assert (episode.columns["executed_action"][by_learner] != wanted[by_learner]).any()
+
+
+def test_a_mixture_of_all_expert_is_the_experts_run():
+    assert same(run(MixtureDriver(Wave(), 1.0)), run(ExpertDriver()))
+
+
+def test_a_mixture_of_no_expert_is_the_learners_run():
+    assert same(run(MixtureDriver(Wave(), 0.0)), run(LearnerDriver(Wave())))
+
+
+def test_a_mixture_executes_either_the_label_or_the_learners_action():
+    for episode in run(MixtureDriver(Wave(), 0.5)).values():
+        columns = episode.columns
+        by_expert = columns["actor"].ravel() == Actor.EXPERT
+        assert 0 < by_expert.sum() < len(episode)
+        np.testing.assert_array_equal(columns["executed_action"][by_expert], columns["action"][by_expert])
+        learner = Wave().act(columns["observation.state"], columns["observation.environment_state"])
+        np.testing.assert_array_equal(
+            columns["executed_action"][~by_expert], learner.astype(np.float32)[~by_expert]
+        )
+
+
+@pytest.mark.parametrize("beta", [0.2, 0.8])
+def test_beta_is_the_experts_share_of_the_steps(beta: float):
+    driver = MixtureDriver(Wave(), beta)
+    seen = Observation(np.zeros(8, np.float32), np.zeros(3, np.float32))
+    label = Label(np.ones(8), Phase.CARRY, True, 0.0)
+    turns = [Turn(seed, 0, seen, label) for seed in range(20)]
+    actors = [actor for _ in range(50) for _, actor in driver.act(turns)]
+    share = np.mean([actor == Actor.EXPERT for actor in actors])
+    assert share == pytest.approx(beta, abs=5 * np.sqrt(beta * (1 - beta) / len(actors)))
+
+
+@pytest.mark.parametrize("name", drivers())
+def test_five_in_lockstep_are_the_same_bits_as_one_by_one(name: str):
+    assert same(run(drivers()[name], envs=5), run(drivers()[name], envs=1))
+
+
+@pytest.mark.parametrize("name", ["random", "mixture"])
+def test_a_seed_is_its_episode_and_another_seed_another(name: str):
+    one, other = run(drivers()[name], seeds=SEEDS[:1]), run(drivers()[name], seeds=SEEDS[1:2])
+    assert same(one, {SEEDS[0]: run(drivers()[name])[SEEDS[0]]})
+    executed = [episode.columns["executed_action"] for episode in (one[SEEDS[0]], other[SEEDS[1]])]
+    assert not np.array_equal(*executed)
+
+
+def test_a_random_driver_stays_within_its_reach():
+    for episode in run(RandomDriver(0.1, 0.06), robot="panda").values():
+        step = episode.columns["executed_action"] - episode.columns["observation.state"]
+        assert np.abs(step[:, :-1]).max() <= 0.1 + 1e-6
+        assert episode.columns["executed_action"][:, -1].min() >= 0
+        assert episode.columns["executed_action"][:, -1].max() <= 0.06
+
+
+@pytest.mark.parametrize("driver", [ExpertDriver(), MixtureDriver(Wave(), 1.0)])
+def test_an_expert_that_drives_must_have_been_asked(driver):
+    with pytest.raises(ManipError, match=rf"episode {SEEDS[0]}: .* at step 0 but was not asked"):
+        list(rollout([ManipEnv("panda", "reach")], SEEDS[:1], driver, Rules(horizon=6, labels="none")))

@@ -1,0 +1,23 @@
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.mdp import State
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+
+@cache
+def visited(robot: str, task: str, driver: str) -> tuple[State, ...]:
+    job = RolloutJob(EnvConfig(robot, task, horizon=40), driver, hold=3)  # pyright: ignore[reportArgumentType]
+    episodes = run_job(job, stream_seeds("certificate", 3))
+    return tuple(State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"])
+
+
+@pytest.fixture(scope="session")
+def visited_states():
+    """States of three episodes that a driver visited."""
+    return visited

@@ -1,0 +1,69 @@
+"""The expert gets there: from the start, and from where a disturbance left it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.expert.expert import Expert
+from manip_il.seeding import stream_seeds
+from manip_il.sim.disturb import Disturbance, drop_object, jolt_joints, knock_object, set_fingers
+from manip_il.sim.env import EnvConfig, ManipEnv
+
+ROBOTS, TASKS = ("panda", "fetch"), ("reach", "lift", "pick_place")
+
+
+def failures(job: RolloutJob, count: int) -> list[int]:
+    return [episode.seed for episode in run_job(job, stream_seeds("certificate", count)) if not episode.success]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_expert_solves_every_task(robot: str, task: str):
+    assert failures(RolloutJob(EnvConfig(robot, task), "expert", hold=0), 3) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_expert_solves_every_task_from_40_starts(robot: str, task: str):
+    assert failures(RolloutJob(EnvConfig(robot, task), "expert", hold=0), 40) == []
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_expert_solves_the_task_under_noise_and_a_knock(robot: str):
+    job = RolloutJob(EnvConfig(robot), "expert", hold=0, disturbance=Disturbance(0.05, knock=(0.05, 0.08)))
+    assert failures(job, 3) == []
+
+
+Kind = Callable[[ManipEnv, np.random.Generator], object]
+KINDS: dict[str, Kind] = {
+    "joints off": lambda env, rng: jolt_joints(env, rng, 0.2),
+    "object moved": lambda env, rng: knock_object(env, rng, (0.03, 0.1)),
+    "object dropped": lambda env, rng: drop_object(env, rng, (0.0, 0.1), 0.1),
+    "wrongly closed": lambda env, rng: set_fingers(env, 0.0),
+    "wrongly open": lambda env, rng: set_fingers(env, env.scene.robot.max_opening),
+}
+
+
+def solves(env: ManipEnv, expert: Expert, steps: int, disturb: Callable[[], object], at: int) -> bool:
+    for step in range(at + steps):
+        if step == at:
+            disturb()
+        env.advance(expert.label(env.get_state()).action)
+        if step >= at and env.solved:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("at", [6, 16])  # on the way to the cube; with it in the hand
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_expert_recovers(robot: str, kind: str, at: int):
+    env = ManipEnv(robot)
+    env.start(stream_seeds("certificate", 20)[at])
+    rng = np.random.default_rng(at)
+    assert solves(env, Expert(env.scene), env.config.horizon, lambda: KINDS[kind](env, rng), at)
