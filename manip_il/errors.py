@@ -14,6 +14,10 @@ class ManipError(Exception):
 
     exit_code = 1
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle by the message: subclasses build theirs from other arguments, and a worker's error must come home."""
+        return _with_message, (type(self), str(self))
+
 
 class UsageError(ManipError):
     """The words were off: an unknown name, option or value (exit code 2)."""
@@ -49,6 +53,12 @@ class FolderExistsError(UsageError):
 
 class RenderError(ManipError):
     """No working OpenGL for off-screen pictures."""
+
+
+def _with_message(kind: type[ManipError], message: str) -> ManipError:
+    error = kind.__new__(kind)
+    error.args = (message,)
+    return error
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

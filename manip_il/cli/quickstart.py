@@ -226,9 +226,11 @@ class _Story:
 
 
 def _verdict(rows: Sequence[PolicyRow]) -> str:
-    expert, cloned, more, dagger = rows
+    from manip_il.evaluation.report_data import format_percent
+
+    _, cloned, more, dagger = rows
     return (
-        f"On {dagger.success.n:,} unseen starts the cloned policy succeeds in {cloned.success}, "
-        f"DAgger in {dagger.success}, cloning with as many labels in {more.success}, the expert in {expert.success}; "
-        f"disturbed, {cloned.disturbed}, {dagger.disturbed}, {more.disturbed} and {expert.disturbed}."
+        f"DAgger solves {format_percent(dagger.success.rate)} of {dagger.success.n:,} unseen starts, "
+        f"cloning {format_percent(more.success.rate)} with as many labels "
+        f"and {format_percent(cloned.success.rate)} with the first demonstrations alone."
     )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import clean_temporary, list_episodes, read_episode, read_header, write_episode
 from manip_il.data.lerobot_io import DatasetInfo, write_dataset
-from manip_il.data.schema import check_same_spec
+from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.local import Engine
@@ -30,8 +31,8 @@ def collect(
     spec, fingerprint = env_spec(job.env), env_fingerprint(job.env)
     there = {read_header(path).seed for path in list_episodes(journals)}
     missing = [seed for seed in seeds if seed not in there]
-    for episode in engine.run(job, missing):
-        write_episode(journals, episode, spec, fingerprint)
+    keep = partial(_write, journals, spec, fingerprint)
+    for episode in engine.run(job, missing, keep):
         if on_episode is not None:
             on_episode(episode)
 
@@ -87,6 +88,10 @@ def build_dataset(
         fingerprint=env_fingerprint(job.env),
         provenance=provenance,
     )
+
+
+def _write(journals: Path, spec: RobotTaskSpec, fingerprint: dict[str, Any], episode: Episode) -> None:
+    write_episode(journals, episode, spec, fingerprint)
 
 
 def _read(journals: Sequence[Path]) -> Iterator[Episode]:

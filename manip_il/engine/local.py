@@ -6,13 +6,15 @@ import importlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from types import TracebackType
 
 from manip_il.engine.jobs import LOCKSTEP, RolloutJob, run_job
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
+
+Keep = Callable[[Episode], object]
 
 
 class Engine:
@@ -27,13 +29,16 @@ class Engine:
         self.workers = workers
         self._pool: ProcessPoolExecutor | None = None
 
-    def run(self, job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
-        """Yield one episode a seed as they end, in no fixed order. Raises `ManipError` where a worker dies."""
+    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
+        """Yield one episode a seed as they end, in no fixed order. Raises `ManipError` where a worker dies.
+
+        keep: called in the process that ran an episode, the moment it ends (to write it to disk, say); must pickle.
+        """
         if self.workers == 1 or len(seeds) == 1:
-            yield from run_job(job, seeds)
+            yield from _run(job, seeds, keep)
             return
         pool = self._start()
-        waiting = {pool.submit(_run_chunk, job, chunk) for chunk in _chunks(seeds, self.workers)}
+        waiting = {pool.submit(_run_chunk, job, chunk, keep) for chunk in _chunks(seeds, self.workers)}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -78,8 +83,15 @@ def _chunks(seeds: Sequence[int], workers: int) -> list[Sequence[int]]:
     return [seeds[i : i + size] for i in range(0, len(seeds), size)]
 
 
-def _run_chunk(job: RolloutJob, seeds: Sequence[int]) -> list[Episode]:
-    return list(run_job(job, seeds))
+def _run(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[Episode]:
+    for episode in run_job(job, seeds):
+        if keep is not None:
+            keep(episode)
+        yield episode
+
+
+def _run_chunk(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> list[Episode]:
+    return list(_run(job, seeds, keep))
 
 
 def _result(future: Future[list[Episode]]) -> list[Episode]:

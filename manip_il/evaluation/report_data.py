@@ -21,7 +21,7 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 class PolicyRow:
     """One policy's line in the table. `labels`: expert labels it learnt from, None where it learnt from none.
 
-    success: at some time; success_at_end: at the last frame; mean_steps: [control steps];
+    success: at some time; success_at_end: at the last frame; steps_to_success: mean [control steps];
     disturbed: success under the disturbance, where measured. kind: decides the colour.
     """
 
@@ -29,7 +29,7 @@ class PolicyRow:
     success: Proportion
     labels: int | None = None
     success_at_end: Proportion | None = None
-    mean_steps: float | None = None
+    steps_to_success: float | None = None
     disturbed: Proportion | None = None
     kind: Kind = "dagger"
 
@@ -48,7 +48,7 @@ class PolicyRow:
             success=result.success,
             labels=labels,
             success_at_end=result.success_at_end,
-            mean_steps=result.mean_steps,
+            steps_to_success=result.steps_to_success,
             disturbed=disturbed.success if disturbed else None,
             kind=kind,
         )

@@ -110,9 +110,11 @@ class EvalResult:
         return Proportion.of([episode.success_at_end for episode in self.episodes], self.confidence)
 
     @property
-    def mean_steps(self) -> float:
-        """Mean length of an episode [control steps]."""
-        return sum(episode.steps for episode in self.episodes) / len(self.episodes)
+    def steps_to_success(self) -> float | None:
+        """Mean over the episodes that succeeded, until they first did [control steps]; None where none tells."""
+        steps = [episode.detail.get("steps_to_success") for episode in self.episodes if episode.success]
+        known = [float(count) for count in steps if count is not None]
+        return sum(known) / len(known) if known else None
 
     @property
     def failures(self) -> dict[str, int]:

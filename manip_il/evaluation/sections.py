@@ -63,16 +63,13 @@ def curve(data: LearningCurve) -> str:
 
 def pictures(report: Report) -> str:
     """Films, picture strips, or where there are none, paths; by policy in the order of the table."""
-    parts = [
-        *map(_film, report.films),
-        *map(_strip, report.strips),
-        *map(_paths, report.paths),
-    ]
-    if not parts and not report.pictures_note:
+    films = "".join(map(_film, report.films))
+    rest = "".join([*map(_strip, report.strips), *map(_paths, report.paths)])
+    if not films and not rest and not report.pictures_note:
         return ""
     note = f'<p class="note">{_prose(report.pictures_note)}</p>' if report.pictures_note else ""
-    kind = "films" if report.films and not (report.strips or report.paths) else "stacked"
-    return _section("How it looks", note, f'<div class="{kind}">{"".join(parts)}</div>')
+    groups = [f'<div class="{kind}">{part}</div>' for kind, part in (("films", films), ("stacked", rest)) if part]
+    return _section("How it looks", note, *groups)
 
 
 def making(report: Report) -> str:
@@ -95,7 +92,10 @@ def _table(report: Report) -> str:
         ("Expert labels", [NOT_MEASURED if r.labels is None else f"{r.labels:,}" for r in report.rows]),
         (f"Success [{confidence} interval]", [_proportion(r.success) for r in report.rows]),
         ("Success at end", [_proportion(r.success_at_end) for r in report.rows]),
-        ("Mean steps", [NOT_MEASURED if r.mean_steps is None else f"{r.mean_steps:.1f}" for r in report.rows]),
+        (
+            "Steps to success",
+            [NOT_MEASURED if r.steps_to_success is None else f"{r.steps_to_success:.1f}" for r in report.rows],
+        ),
         ("Success, disturbed", [_proportion(r.disturbed) for r in report.rows]),
     ]
     columns = [column for column in columns if any(cell != NOT_MEASURED for cell in column[1])]

@@ -26,7 +26,10 @@ def results_table(rows: Sequence[PolicyRow], color: bool = True, width: int = PL
         ("expert labels", [NOT_MEASURED if row.labels is None else f"{row.labels:,}" for row in rows]),
         (f"success [{confidence} interval]", [_cell(row.success, gap) for row in rows]),
         ("success at end", [_cell(row.success_at_end, gap) for row in rows]),
-        ("mean steps", [NOT_MEASURED if row.mean_steps is None else f"{row.mean_steps:.1f}" for row in rows]),
+        (
+            "steps to success",
+            [NOT_MEASURED if r.steps_to_success is None else f"{r.steps_to_success:.1f}" for r in rows],
+        ),
         ("success, disturbed", [_cell(row.disturbed, gap) for row in rows]),
     ]
     columns = [column for column in columns if any(cell != NOT_MEASURED for cell in column[1])]

@@ -114,7 +114,7 @@ def test_the_numbers_are_the_inputs(page: Page):
     for row in ROWS:
         for proportion in filter(None, (row.success, row.success_at_end, row.disturbed)):
             assert str(proportion) in page.text
-        assert f"{row.mean_steps:.1f}" in page.text
+        assert f"{row.steps_to_success:.1f}" in page.text
     assert "1,234" in page.text
     assert "DAgger, round 1, 1,230 labels 98.0 % [" in page.text
     assert "policy.hidden 256 policy.name none" in page.text
@@ -177,10 +177,10 @@ def test_what_cannot_be_shown_is_refused_by_name():
 
 
 def test_a_row_takes_its_numbers_from_an_evaluation():
-    episodes = tuple(EpisodeResult(i, i > 0, i > 1, 10 * i, 0.0) for i in range(4))
+    episodes = tuple(EpisodeResult(i, i > 0, i > 1, 40, 0.0, detail={"steps_to_success": 10 * i}) for i in range(4))
     result = EvalResult("mlp", "panda", "pick", {}, episodes, EvalSettings(100, 0.02))
     row = PolicyRow.of("BC", result, labels=40, disturbed=result, kind="cloning")
-    assert row == PolicyRow("BC", Proportion(3, 4), 40, Proportion(2, 4), 15.0, Proportion(3, 4), "cloning")
+    assert row == PolicyRow("BC", Proportion(3, 4), 40, Proportion(2, 4), 20.0, Proportion(3, 4), "cloning")
 
 
 def test_a_wide_span_of_labels_takes_a_logarithmic_axis():

@@ -57,7 +57,14 @@ def test_json_keeps_every_bit(outcomes: list[bool], ret: float):
 
 def test_failures_are_counted_by_phase():
     assert result([True, False, False]).failures == {"CARRY": 2}
-    assert result([True, False]).mean_steps == 40.5
+    assert result([True, False]).steps_to_success is None
+
+
+def test_steps_to_success_counts_the_episodes_that_succeeded():
+    made = result([True, True, False])
+    counts = (10, 21, None)
+    episodes = tuple(replace(e, detail={"steps_to_success": n}) for e, n in zip(made.episodes, counts, strict=True))
+    assert replace(made, episodes=episodes).steps_to_success == 15.5
 
 
 @pytest.mark.parametrize(
