@@ -57,9 +57,10 @@ def collect_successes(
         good = [path for path, header in headers if header.success and header.seed in wanted]
         if len(good) >= count:
             return good[:count]
-        tried += count - len(good)
-        if tried > min(len(seeds), MAX_TRIES * count):
+        missing = count - len(good)
+        if tried + missing > min(len(seeds), MAX_TRIES * count):
             raise ManipError(f"only {len(good)} of {tried} demonstrations succeeded; {count} were asked for")
+        tried += missing
 
 
 def check_journals(journals: Path, job: RolloutJob) -> list[str]:

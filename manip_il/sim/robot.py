@@ -62,6 +62,20 @@ def _load(xml: str, folder: Path, files: tuple[str, ...], mesh_folder: Path) -> 
     return mujoco.MjSpec.from_string(xml, include=include, assets=assets)
 
 
+def _motorise(spec: mujoco.MjSpec, arm: tuple[str, ...], fingers: tuple[str, str], gains: tuple[float, ...]) -> None:
+    """Position control of every joint, kp [N m/rad] each in `gains`; kv = kp / 20 gives a time constant of one step."""
+    for joint, kp in zip(arm, gains, strict=True):
+        element = spec.joint(joint)
+        element.damping, element.stiffness = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+        element.armature = 0.1
+        _position_actuator(spec, joint, kp=kp, kv=kp / 20, force=200.0)
+    for joint in fingers:
+        element = spec.joint(joint)
+        element.damping = np.array([10.0, 0.0, 0.0])
+        element.armature = 0.2
+        _position_actuator(spec, joint, kp=800, kv=20, force=40.0)
+
+
 def _position_actuator(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, force: float) -> None:
     """PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
     limits = spec.joint(joint)
@@ -79,17 +93,7 @@ def _build_panda() -> mujoco.MjSpec:
       <worldbody><include file="chain.xml"/></worldbody></mujoco>"""
     spec = _load(xml, folder, ("assets.xml", "chain.xml"), folder / "meshes")
     spec.meshdir = ""
-    gains = (4500, 4500, 3500, 3500, 2000, 2000, 2000)
-    for joint, kp in zip(_PANDA_ARM, gains, strict=True):
-        element = spec.joint(joint)
-        element.damping = np.array([1.0, 0.0, 0.0])
-        element.armature = 0.1
-        _position_actuator(spec, joint, kp=kp, kv=kp / 20, force=200.0)
-    for joint in _PANDA_FINGERS:
-        element = spec.joint(joint)
-        element.damping = np.array([10.0, 0.0, 0.0])
-        element.armature = 0.2
-        _position_actuator(spec, joint, kp=800, kv=20, force=40.0)
+    _motorise(spec, _PANDA_ARM, _PANDA_FINGERS, gains=(4500, 4500, 3500, 3500, 2000, 2000, 2000))
     # The shipped `end_effector` site is 5 cm above the fingertips: too high to hold anything.
     link7 = spec.body("panda0_link7")
     link7.add_site(name="ee", pos=[0, 0, 0.243], quat=_about_z(-np.pi / 4), size=[0.004] * 3, group=4)
@@ -122,20 +126,10 @@ def _build_fetch() -> mujoco.MjSpec:
     spec.body("robot0:torso_lift_link").pos = [-0.0869, 0, 0.3774 + _FETCH_TORSO_LIFT]
     for camera in list(spec.cameras):
         spec.delete(camera)
-    gains = (3000, 3000, 2000, 2000, 1000, 1000, 500)
-    for joint, kp in zip(_FETCH_ARM, gains, strict=True):
-        element = spec.joint(joint)
-        element.damping = np.array([1.0, 0.0, 0.0])
-        element.stiffness = np.array([0.0, 0.0, 0.0])
-        element.armature = 0.1
-        _position_actuator(spec, joint, kp=kp, kv=kp / 20, force=200.0)
-    for joint in _FETCH_FINGERS:
-        element = spec.joint(joint)
-        element.damping = np.array([10.0, 0.0, 0.0])
-        element.armature = 0.2
-        element.parent.mass = 0.1  # the stock 4 kg a finger are there for the mocap weld
-        element.parent.inertia = np.full(3, 1e-4)
-        _position_actuator(spec, joint, kp=800, kv=20, force=40.0)
+    _motorise(spec, _FETCH_ARM, _FETCH_FINGERS, gains=(3000, 3000, 2000, 2000, 1000, 1000, 500))
+    for joint in _FETCH_FINGERS:  # the stock 4 kg a finger are there for the mocap weld
+        spec.joint(joint).parent.mass = 0.1
+        spec.joint(joint).parent.inertia = np.full(3, 1e-4)
     hand = spec.body("robot0:gripper_link")
     # ee axes in the link: x = link z, y = -link y (the fingers' motion), z = link x (out of the hand)
     hand.add_site(name="ee", pos=[0.02, 0, 0], quat=[0, np.sqrt(0.5), 0, np.sqrt(0.5)], size=[0.004] * 3, group=4)
