@@ -21,7 +21,7 @@ from manip_il.dagger.collect import build_dataset, collect, collect_successes
 from manip_il.dagger.config import DaggerConfig
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
-from manip_il.data.journal import list_episodes
+from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_io import dataset_info, merge_datasets, read_table
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
@@ -196,7 +196,7 @@ def _collect_round(
         collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode)
         collect(engine, job, seeds[disturbed:], journals, watch.on_episode)
         paths = list_episodes(journals)
-    provenance = {"round": round_, "beta": beta, "seeds": [seeds[0], seeds[len(paths) - 1]], "driver": job.driver}
+    provenance = {"round": round_, "beta": beta, "seeds": [read_header(path).seed for path in (paths[0], paths[-1])], "driver": job.driver}
     build_dataset(paths, here / DATASET, job, f"local/{config.env.robot}_{config.env.task}_round_{round_}", provenance)
 
 

@@ -38,12 +38,16 @@ class Engine:
             yield from _run(job, seeds, keep)
             return
         pool = self._start()
-        waiting = {pool.submit(_run_chunk, job, chunk, keep) for chunk in _chunks(seeds, self.workers)}
+        waiting: set[Future[list[Episode]]] = set()
         try:
+            for chunk in _chunks(seeds, self.workers):
+                waiting.add(pool.submit(_run_chunk, job, chunk, keep))
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
-                    yield from _result(future)
+                    yield from future.result()
+        except BrokenExecutor as error:
+            raise ManipError("a rollout worker died (out of memory?); finished episodes are kept") from error
         finally:
             for future in waiting:
                 future.cancel()
@@ -92,13 +96,6 @@ def _run(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[E
 
 def _run_chunk(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> list[Episode]:
     return list(_run(job, seeds, keep))
-
-
-def _result(future: Future[list[Episode]]) -> list[Episode]:
-    try:
-        return future.result()
-    except BrokenExecutor as error:
-        raise ManipError("a rollout worker died (out of memory?); finished episodes are kept") from error
 
 
 def _quiet() -> None:

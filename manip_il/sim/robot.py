@@ -31,7 +31,9 @@ class Robot:
     workspace: tuple[float, float]  # centre of the task area on the table, x and y [m]
     shoulder: tuple[float, float, float]  # where reach is measured from [m]
     wrist_above_ee: float  # height of the wrist over the ee when the hand points down [m]
-    reach: tuple[float, float]  # shoulder to wrist, hand down: nearest and farthest with room for the IK [m]
+    reach: float  # shoulder to wrist, hand down, at which the IK still has room [m]
+    head: tuple[float, float, float] | None  # what the upper arm must not be folded against [m]
+    head_clearance: float  # of the wrist from it, hand down [m]
     build: Callable[[], mujoco.MjSpec]
 
     @property
@@ -170,7 +172,9 @@ ROBOTS = {
         workspace=(0.45, 0.0),
         shoulder=(0.0, 0.0, 0.333),
         wrist_above_ee=0.243,
-        reach=(0.0, 0.7),
+        reach=0.7,
+        head=None,
+        head_clearance=0.0,
         build=_build_panda,
     ),
     "fetch": Robot(
@@ -184,7 +188,9 @@ ROBOTS = {
         workspace=(0.64, 0.0),
         shoulder=(0.15, 0.0, 0.586),
         wrist_above_ee=0.305,
-        reach=(0.42, 0.675),
+        reach=0.675,
+        head=(-0.034, 0.0, 0.78),
+        head_clearance=0.6,
         build=_build_fetch,
     ),
 }

@@ -100,9 +100,10 @@ def _draw_goal(task: Task, robot: Robot, object_xy: F64, rng: np.random.Generato
 def in_reach(robot: Robot, position: F64, slack: float = 0.0) -> bool:
     """Whether the hand, pointing down, gets its `ee` to `position` [m], (3,); `slack` [m] widens the reach."""
     x, y, z = position
-    nearest, farthest = robot.reach
-    distance = math.dist((x, y, z + robot.wrist_above_ee), robot.shoulder)
-    return nearest - slack <= distance <= farthest + slack
+    wrist = (x, y, z + robot.wrist_above_ee)
+    if robot.head is not None and math.dist(wrist, robot.head) < robot.head_clearance - slack:
+        return False
+    return math.dist(wrist, robot.shoulder) <= robot.reach + slack
 
 
 def _on_table(xy: F64) -> F64:

@@ -71,9 +71,7 @@ def test_a_mixture_executes_either_the_label_or_the_learners_action():
         assert 0 < by_expert.sum() < len(episode)
         np.testing.assert_array_equal(columns["executed_action"][by_expert], columns["action"][by_expert])
         learner = Wave().act(columns["observation.state"], columns["observation.environment_state"])
-        np.testing.assert_array_equal(
-            columns["executed_action"][~by_expert], learner.astype(np.float32)[~by_expert]
-        )
+        np.testing.assert_array_equal(columns["executed_action"][~by_expert], learner.astype(np.float32)[~by_expert])
 
 
 @pytest.mark.parametrize("beta", [0.2, 0.8])
@@ -102,7 +100,7 @@ def test_a_seed_is_its_episode_and_another_seed_another(name: str):
 
 def test_a_random_driver_stays_within_its_reach():
     for episode in run(RandomDriver(0.1, 0.06), robot="panda").values():
-        step = episode.columns["executed_action"] - episode.columns["observation.state"]
+        step = np.subtract(episode.columns["executed_action"], episode.columns["observation.state"])
         assert np.abs(step[:, :-1]).max() <= 0.1 + 1e-6
         assert episode.columns["executed_action"][:, -1].min() >= 0
         assert episode.columns["executed_action"][:, -1].max() <= 0.06

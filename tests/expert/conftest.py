@@ -13,11 +13,11 @@ from manip_il.sim.env import EnvConfig
 @cache
 def visited(robot: str, task: str, driver: str) -> tuple[State, ...]:
     job = RolloutJob(EnvConfig(robot, task, horizon=40), driver, hold=3)  # pyright: ignore[reportArgumentType]
-    episodes = run_job(job, stream_seeds("certificate", 3))
+    episodes = run_job(job, stream_seeds("certificate", 2))
     return tuple(State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"])
 
 
 @pytest.fixture(scope="session")
 def visited_states():
-    """States of three episodes that a driver visited."""
+    """States of two episodes that a driver visited."""
     return visited

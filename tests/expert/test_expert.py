@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ DRIVERS = ("expert", "random")
 STEEPEST = 50.0  # change of a joint target per change of the object's position [rad/m]
 
 
+@cache
 def expert_of(robot: str, task: str = "pick_place") -> Expert:
     return Expert(build_scene(robot, task))
 
@@ -49,7 +51,8 @@ def test_labels_do_not_depend_on_what_was_asked_before(robot: str, driver: str, 
     order = np.random.default_rng(0).permutation(len(states))
     shuffled = {int(i): written(expert.label(states[i])) for i in order}
     assert [shuffled[i] for i in range(len(states))] == forward
-    assert [written(expert_of(robot).label(state)) for state in states[::7]] == forward[::7]
+    for i in (3, len(states) // 2):
+        assert written(Expert(build_scene(robot, "pick_place")).label(states[i])) == forward[i]
 
 
 def test_asking_changes_neither_state_nor_answer(visited_states):
@@ -74,23 +77,26 @@ import numpy as np
 from manip_il.expert.expert import Expert
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
-robot, source, target = sys.argv[1:]
-expert = Expert(build_scene(robot, "pick_place"))
-labels = [expert.label(State.from_vector(row)) for row in np.load(source)]
-np.save(target, [[*label.action, label.residual, label.phase, label.valid] for label in labels])
+for robot in ("panda", "fetch"):
+    expert = Expert(build_scene(robot, "pick_place"))
+    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{robot}_states.npy")]
+    answers = [[*label.action, label.residual, label.phase, label.valid] for label in labels]
+    np.save(f"{sys.argv[1]}/{robot}_labels.npy", answers)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_another_process_answers_the_same_bits(robot: str, visited_states, tmp_path):
-    states = visited_states(robot, "pick_place", "expert") + visited_states(robot, "pick_place", "random")
-    np.save(tmp_path / "states.npy", [state.to_vector() for state in states])
-    command = [sys.executable, "-c", IN_ANOTHER_PROCESS, robot, tmp_path / "states.npy", tmp_path / "labels.npy"]
-    subprocess.run(command, check=True)
-    labels = [expert_of(robot).label(state) for state in states]
-    here = np.array([[*label.action, label.residual, label.phase, label.valid] for label in labels])
-    assert np.load(tmp_path / "labels.npy").tobytes() == here.tobytes()
+def test_another_process_answers_the_same_bits(visited_states, tmp_path):
+    here: dict[str, np.ndarray] = {}
+    for robot in ROBOTS:
+        expert = expert_of(robot)
+        states = visited_states(robot, "pick_place", "expert") + visited_states(robot, "pick_place", "random")
+        labels = [expert.label(state) for state in states]
+        here[robot] = np.array([[*label.action, label.residual, label.phase, label.valid] for label in labels])
+        np.save(tmp_path / f"{robot}_states.npy", [state.to_vector() for state in states])
+    subprocess.run([sys.executable, "-c", IN_ANOTHER_PROCESS, tmp_path], check=True)
+    for robot in ROBOTS:
+        assert np.load(tmp_path / f"{robot}_labels.npy").tobytes() == here[robot].tobytes()
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
@@ -105,7 +111,7 @@ def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: 
         assert np.abs(label.action[:-1] - q).max() <= scene.robot.max_joint_step + 1e-9
         assert (low <= label.action[:-1]).all()
         assert (label.action[:-1] <= high).all()
-        assert 0 <= label.residual
+        assert label.residual >= 0
         assert label.valid == (label.phase != Phase.NONE) == (label.reason == "")
 
 
@@ -150,8 +156,8 @@ def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, move, rea
 
 
 def test_without_a_solution_the_arm_holds_still_and_says_so(monkeypatch, visited_states):
-    expert, scene = expert_of("panda"), build_scene("panda", "pick_place")
-    state = visited_states("panda", "pick_place", "expert")[3]
+    scene = build_scene("panda", "pick_place")
+    expert, state = Expert(scene), visited_states("panda", "pick_place", "expert")[3]
     monkeypatch.setattr(expert._ik, "step", lambda *_: None)
     label = expert.label(state)
     assert (label.valid, label.reason) == (False, "inverse kinematics has no solution")
@@ -162,14 +168,12 @@ def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label():
     env = ManipEnv("panda", "reach")
     env.start(5_000_000)
     expert = Expert(env.scene)
-    far = replace(env.get_state(), goal=np.array([3.0, 0.0, 0.3]))
+    reasons = set[str]()
     for _ in range(100):
-        label = expert.label(far)
-        if not label.valid:
-            break
+        label = expert.label(replace(env.get_state(), goal=np.array([3.0, 0.0, 0.3])))
+        reasons.add(label.reason)
         env.advance(label.action)
-        far = replace(env.get_state(), goal=far.goal)
-    assert (label.valid, label.reason) == (False, "no joint step brings the hand nearer")
+    assert reasons == {"", "no joint step brings the hand nearer"}
 
 
 def test_a_state_of_another_scene_is_refused_with_both_sizes(visited_states):

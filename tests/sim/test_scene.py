@@ -67,13 +67,12 @@ def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: st
 def test_an_untouched_cube_lies_still():
     env = ManipEnv()
     env.start(SEED)
-    at = slice(env.scene.object_q, env.scene.object_q + 3)
-    before = env.data.qpos[at].copy()
+    before = cube(env)
     command = np.append(env.data.ctrl[env.scene.arm_ctrl], 0.04)
     for _ in range(40):
         env.advance(command)
-    np.testing.assert_allclose(env.data.qpos[at], before, atol=1e-3)
-    assert env.data.qpos[at][2] == pytest.approx(CUBE_HALF_SIZE, abs=5e-4)
+    np.testing.assert_allclose(cube(env), before, atol=1e-3)
+    assert cube(env)[2] == pytest.approx(CUBE_HALF_SIZE, abs=5e-4)
 
 
 def test_the_cube_weighs_what_the_constant_says():
@@ -89,16 +88,20 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str, drive_unti
     for _ in range(5):  # the arm comes to rest
         env.advance(command)
     first = in_hand(env)
-    assert env.data.qpos[env.scene.object_q + 2] > 2 * CUBE_HALF_SIZE
+    assert cube(env)[2] > 2 * CUBE_HALF_SIZE
     for _ in range(100):
         env.advance(command)
     assert np.linalg.norm(in_hand(env) - first) < 1e-3
 
 
+def cube(env: ManipEnv) -> np.ndarray:
+    return env.data.joint("object").qpos[:3].copy()
+
+
 def in_hand(env: ManipEnv) -> np.ndarray:
     """The cube's centre in the hand's frame [m]."""
     data, scene = env.data, env.scene
-    offset = data.qpos[scene.object_q : scene.object_q + 3] - data.site_xpos[scene.ee_site]
+    offset = cube(env) - data.site_xpos[scene.ee_site]
     return data.site_xmat[scene.ee_site].reshape(3, 3).T @ offset
 
 

@@ -1,0 +1,88 @@
+"""Time of one expert label as a multiple of the bare quadratic program that it solves.
+
+python benchmarks/label_speed.py [--quick]
+
+The states are those of real episodes, driven by the expert and by chance. The limit is daqp on the same problems,
+built beforehand; both are timed in the same run, by turns, state by state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import qpsolvers
+from _machine import describe_machine
+
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.expert import ik
+from manip_il.expert.expert import Expert
+from manip_il.mdp import State
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.robot import ROBOTS
+from manip_il.sim.scene import build_scene
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few states: shows that it runs, measures little")
+    options = parser.parse_args()
+    episodes, repeats = (2, 2) if options.quick else (20, 5)
+    print(describe_machine())
+    print("robot  states  label [us]  bare QP [us]  label / QP")
+    for robot in ROBOTS:
+        expert = Expert(build_scene(robot, "pick_place"))
+        states = visited(robot, episodes)
+        problems = [problem_of(expert, state) for state in states]
+        pairs = [(s, p) for s, p in zip(states, problems, strict=True) if p is not None]
+        labels, solves = np.empty((repeats, len(pairs))), np.empty((repeats, len(pairs)))
+        for repeat in range(repeats):
+            for i, (state, problem) in enumerate(pairs):
+                labels[repeat, i] = seconds(expert.label, state)
+                solves[repeat, i] = seconds(partial(qpsolvers.solve_problem, solver="daqp"), problem)
+        label, solve = np.median(labels.min(axis=0)), np.median(solves.min(axis=0))
+        print(f"{robot:5s}  {len(pairs):6d}  {1e6 * label:10.1f}  {1e6 * solve:12.1f}  {label / solve:10.2f}")
+    return 0
+
+
+def visited(robot: str, episodes: int) -> list[State]:
+    """States of `episodes` episodes that the expert drove, and as many that chance did."""
+    states: list[State] = []
+    for driver in ("expert", "random"):
+        job = RolloutJob(EnvConfig(robot, horizon=50), driver, hold=5)
+        for episode in run_job(job, stream_seeds("certificate", episodes)):
+            states += [State.from_vector(row) for row in episode.columns["sim_state"]]
+    return states
+
+
+def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
+    """The quadratic program that a label solves, caught on its way to the solver; None where it needs none."""
+    caught: list[qpsolvers.Problem] = []
+    plain = qpsolvers.solve_problem
+
+    def catch(problem: qpsolvers.Problem, *args: object, **settings: object) -> object:
+        caught.append(problem)
+        return plain(problem, *args, **settings)  # pyright: ignore[reportArgumentType]
+
+    ik.qpsolvers.solve_problem = catch  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        expert.label(state)
+    finally:
+        ik.qpsolvers.solve_problem = plain
+    return caught[0] if caught else None
+
+
+def seconds(call: Callable[[Any], object], argument: object) -> float:
+    started = time.perf_counter()
+    call(argument)
+    return time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    sys.exit(main())

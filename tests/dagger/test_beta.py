@@ -1,0 +1,76 @@
+"""beta_i of Ross, Gordon & Bagnell (2011), section 3.6."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.dagger.beta import BetaSchedule
+from manip_il.dagger.config import DaggerConfig
+from manip_il.errors import UnknownName, UsageError
+
+
+@pytest.mark.parametrize(
+    ("text", "betas"),
+    [
+        ("constant:0", [1, 0, 0, 0]),
+        ("constant:0.3", [1, 0.3, 0.3, 0.3]),
+        ("linear:2", [1, 0.5, 0, 0]),
+        ("linear:1", [1, 0, 0, 0]),
+        ("exponential:0.5", [1, 0.5, 0.25, 0.125]),
+        ("exponential:0", [1, 0, 0, 0]),
+        ("exponential:1", [1, 1, 1, 1]),
+    ],
+)
+def test_the_values_of_a_schedule(text: str, betas: list[float]):
+    schedule = BetaSchedule.parse(text)
+    assert [schedule.at(round_) for round_ in range(4)] == pytest.approx(betas)
+
+
+@given(
+    st.one_of(
+        st.builds("{}:{}".format, st.sampled_from(["constant", "exponential"]), st.floats(0, 1)),
+        st.builds("linear:{}".format, st.floats(1, 50)),
+    )
+)
+def test_the_expert_drives_all_of_round_0_and_never_more_later(text: str):
+    betas = [BetaSchedule.parse(text).at(round_) for round_ in range(30)]
+    assert betas[0] == 1
+    assert all(0 <= later <= earlier <= 1 for earlier, later in pairwise(betas))
+
+
+def test_an_unknown_schedule_answers_with_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'linear'"):
+        BetaSchedule.parse("linaer:5")
+
+
+@pytest.mark.parametrize("text", ["linear:0", "linear:-3", "constant:1.1", "exponential:-0.1", "constant:nan"])
+def test_a_parameter_out_of_range_is_refused(text: str):
+    with pytest.raises(UsageError, match=f"beta is '{text}'; expected"):
+        BetaSchedule.parse(text)
+
+
+@pytest.mark.parametrize("text", ["linear", "constant:", "exponential:half"])
+def test_a_schedule_without_a_number_is_refused_and_shown_how(text: str):
+    with pytest.raises(UsageError, match=f"beta is '{text}'; expected {text.split(':')[0]}:NUMBER"):
+        BetaSchedule.parse(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("demonstrations", 0),
+        ("rounds", -1),
+        ("rounds", 100),
+        ("episodes_per_round", 0),
+        ("validation_episodes", 0),
+        ("disturbed_share", 1.5),
+        ("beta", "linear:0"),
+    ],
+)
+def test_a_run_that_makes_no_sense_is_refused(name: str, value: object):
+    with pytest.raises(UsageError, match=f"{name} is '?{value}"):
+        DaggerConfig(**{name: value})  # pyright: ignore[reportArgumentType]

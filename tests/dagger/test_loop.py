@@ -1,0 +1,179 @@
+"""Algorithm 3.1 on a very small scale: what it leaves on disk, and that a stopped run goes on as if it had not been."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.dagger import loop
+from manip_il.dagger.config import DaggerConfig, FitConfig
+from manip_il.dagger.loop import RoundResult, Watch, aggregate, best_round, round_folder, run_dagger
+from manip_il.data.lerobot_io import dataset_info, read_table
+from manip_il.engine.local import Engine
+from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.mdp import Actor, Episode
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+pytestmark = pytest.mark.slow  # every test here waits for a whole run
+
+CONFIG = DaggerConfig(
+    env=EnvConfig("fetch", "reach", horizon=40),
+    demonstrations=4,
+    rounds=1,
+    episodes_per_round=2,
+    beta="constant:0.5",
+    fit=FitConfig(steps=20, batch_size=32, width=16),
+    validation_episodes=2,
+)
+
+
+def files(folder: Path) -> dict[str, str]:
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> tuple[Path, list[RoundResult], list[Episode]]:
+    """One whole run: its folder, its rounds, and every episode that it made."""
+    folder, seen = tmp_path_factory.mktemp("dagger"), list[Episode]()
+    results = list(run_dagger(CONFIG, folder, Engine(), Watch(on_episode=seen.append)))
+    return folder, results, seen
+
+
+def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation(run):
+    folder, results, _ = run
+    for round_, episodes in enumerate((4, 2)):
+        here = round_folder(folder, round_)
+        assert dataset_info(here / "dataset").episodes == episodes
+        assert (results[round_].policy / "model.safetensors").is_file()
+        assert EvalResult.read(here / "eval.json") == results[round_].validation
+
+
+def test_the_numbers_of_a_round_are_those_of_its_data(run):
+    folder, results, _ = run
+    assert [result.round for result in results] == [0, 1]
+    assert [result.beta for result in results] == [1.0, 0.5]
+    assert [result.episodes for result in results] == [4, 6]
+    for result in results:
+        table = aggregate(folder, result.round)
+        assert result.labels == table["label_valid"].sum()
+        record = result.to_json()
+        assert record["validation_success"] == result.validation.success.rate
+        assert record["labels"] == result.labels
+    assert results[0].rollout_success == 1.0  # demonstrations are successes
+    assert results[0].labels < results[1].labels
+
+
+def test_every_seed_is_from_its_own_stream(run):
+    folder, _, seen = run
+    for round_, stream, count in ((0, "demonstrations", 4), (1, "round/1", 2)):
+        table = read_table(round_folder(folder, round_) / "dataset", ("seed", "round", "beta"))
+        assert set(table["seed"].ravel()) == set(stream_seeds(stream, count))
+        assert set(table["round"].ravel()) == {round_}
+    made = {episode.seed for episode in seen}
+    streams = [("demonstrations", 4), ("round/1", 2), ("validation", 2)]
+    assert made == {seed for stream, count in streams for seed in stream_seeds(stream, count)}
+
+
+def test_best_is_the_round_with_the_best_validation(run):
+    folder, results, _ = run
+    best = best_round(results)
+    assert files(folder / "best" / "pretrained_model") == files(best.policy)
+
+
+def test_of_equally_good_rounds_the_later_is_best(run):
+    _, results, _ = run
+
+    def result(round_: int, *outcomes: bool) -> RoundResult:
+        episodes = tuple(EpisodeResult(i, won, won, 1, 0.0, "carry", {}) for i, won in enumerate(outcomes))
+        return replace(results[0], round=round_, validation=replace(results[0].validation, episodes=episodes))
+
+    assert best_round([result(0, True, False), result(1, True, True), result(2, False, True)]).round == 1
+    assert best_round([result(0, True, False), result(1, False, True), result(2, False, False)]).round == 1
+
+
+def test_aggregating_is_putting_one_round_behind_the_other(run):
+    folder, _, _ = run
+    parts = [read_table(round_folder(folder, i) / "dataset", loop.LEARNING_COLUMNS) for i in range(2)]
+    table = aggregate(folder, 1)
+    for key in ("observation.state", "observation.environment_state", "action", "label_valid"):
+        np.testing.assert_array_equal(table[key], np.concatenate([part[key] for part in parts]))
+    lengths = [count for part in parts for count in np.bincount(part["episode_index"])]
+    np.testing.assert_array_equal(table["episode_index"], np.repeat(np.arange(6), lengths))
+    for key, column in aggregate(folder, 0).items():
+        np.testing.assert_array_equal(column, parts[0][key])
+
+
+def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
+    folder, _, _ = run
+    table = read_table(folder / "dataset", ("action", "executed_action", "actor", "round", "episode_index"))
+    round_, actor = table["round"].ravel(), table["actor"].ravel()
+    assert len(np.unique(table["episode_index"])) == 6
+    np.testing.assert_array_equal(table["action"], aggregate(folder, 1)["action"])
+    assert set(actor[round_ == 0]) == {Actor.EXPERT}
+    np.testing.assert_array_equal(table["action"][round_ == 0], table["executed_action"][round_ == 0])
+    assert {Actor.LEARNER} < set(actor[round_ == 1])
+    learner = actor == Actor.LEARNER
+    assert (table["action"][learner] != table["executed_action"][learner]).any(axis=1).all()
+
+
+def test_running_it_again_computes_nothing_anew(run, monkeypatch):
+    folder, results, _ = run
+    before = files(folder)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("nothing is left to do")
+
+    monkeypatch.setattr(Engine, "run", refuse)
+    logged: list[dict] = []
+    again = list(run_dagger(CONFIG, folder, Engine(), Watch(on_log=logged.append)))
+    assert logged == []
+    assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
+    assert files(folder) == before
+
+
+class Stop(Exception):
+    pass
+
+
+def is_data(name: str) -> bool:
+    return name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))
+
+
+@pytest.mark.parametrize("episodes", [2, 5, 7])  # in the demonstrations, in round 1, in a validation
+def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episodes: int):
+    whole, results, _ = run
+    count = 0
+
+    def stop(episode: Episode) -> None:
+        nonlocal count
+        count += 1
+        if count == episodes:
+            raise Stop
+
+    with pytest.raises(Stop):
+        list(run_dagger(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)))
+    again = list(run_dagger(CONFIG, tmp_path, Engine()))
+    assert [result.validation for result in again] == [result.validation for result in results]
+    mine, theirs = files(tmp_path), files(whole)
+    assert mine.keys() == theirs.keys()
+    assert {name: mine[name] for name in mine if is_data(name)} == {n: theirs[n] for n in theirs if is_data(n)}
+
+
+def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypatch):
+    begun: list[Path | None] = []
+    plain = loop.train_config
+
+    def watch(config: DaggerConfig, init_from: Path | None = None):
+        begun.append(init_from)
+        return plain(config, init_from)
+
+    monkeypatch.setattr(loop, "train_config", watch)
+    results = list(run_dagger(replace(CONFIG, refit="warm"), tmp_path, Engine()))
+    assert begun == [None, results[0].policy]
+    assert files(results[1].policy) != files(run[1][1].policy)
