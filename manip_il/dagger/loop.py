@@ -196,7 +196,8 @@ def _collect_round(
         collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode)
         collect(engine, job, seeds[disturbed:], journals, watch.on_episode)
         paths = list_episodes(journals)
-    provenance = {"round": round_, "beta": beta, "seeds": [read_header(path).seed for path in (paths[0], paths[-1])], "driver": job.driver}
+    first, last = (read_header(path).seed for path in (paths[0], paths[-1]))
+    provenance = {"round": round_, "beta": beta, "seeds": [first, last], "driver": job.driver}
     build_dataset(paths, here / DATASET, job, f"local/{config.env.robot}_{config.env.task}_round_{round_}", provenance)
 
 
