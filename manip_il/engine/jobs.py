@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Literal, cast
@@ -52,11 +52,6 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         envs, seeds, _driver(job, envs[0]), rules, _expert(job.env.robot, job.env.task), _intrude(job.disturbance)
     )
     yield from group_episodes(transitions, job.round, job.beta)
-
-
-def undisturbed(job: RolloutJob) -> RolloutJob:
-    """The same job with nothing in the learner's way."""
-    return replace(job, disturbance=Disturbance())
 
 
 @cache

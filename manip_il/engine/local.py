@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import signal
@@ -52,13 +51,6 @@ class Engine:
             for future in waiting:
                 future.cancel()
 
-    def warm_up(self) -> None:
-        """Start the processes now, beside other work, instead of at the first job."""
-        if self.workers > 1:
-            pool = self._start()
-            for _ in range(self.workers):
-                pool.submit(_import_everything)
-
     def __enter__(self) -> Engine:
         return self
 
@@ -102,7 +94,3 @@ def _quiet() -> None:
     """Workers leave Ctrl-C to the process that started them, and one core each to its neighbours."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which a worker imports later
-
-
-def _import_everything() -> None:
-    importlib.import_module("manip_il.learn.policy")
