@@ -15,7 +15,7 @@ from manip_il.data.journal import list_episodes, read_episode, write_episode
 from manip_il.data.schema import fitted_columns
 from manip_il.engine import local
 from manip_il.engine.describe import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob, run_job, undisturbed
+from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.engine.local import Engine, default_workers
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Actor, Episode
@@ -66,7 +66,7 @@ def test_disturbances_are_drawn_from_the_seed():
     first, plain = written(run_job(job, seeds)), written(run_job(EXPERT, seeds))
     assert written(run_job(job, seeds)) == first
     assert all(first[seed]["executed_action"] != plain[seed]["executed_action"] for seed in seeds)
-    assert written(run_job(undisturbed(job), seeds)) == plain
+    assert written(run_job(replace(job, disturbance=Disturbance()), seeds)) == plain
 
 
 def test_under_action_noise_the_actor_is_the_noisy_expert_and_labels_stay_the_experts():
