@@ -16,6 +16,7 @@ from manip_il.mdp import Episode
 from manip_il.rollout import Driver, Environment, Intruder, Rules, rollout
 from manip_il.sim.disturb import Disturbance, Disturber
 from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.scene import build_scene
 
 LOCKSTEP = 25  # environments that share one call of the policy
 
@@ -56,7 +57,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
 
 @cache
 def _expert(robot: str, task: str) -> Expert:
-    return Expert(ManipEnv(robot, task).scene)
+    return Expert(build_scene(robot, task))
 
 
 def _driver(job: RolloutJob, env: ManipEnv) -> Driver:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.observe import environment_state, environment_state_names
@@ -52,7 +52,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
     `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
-    "solved once" and "solved at the end" can both be told.
+    "solved once" and "solved at the end" can both be told. Raises `UnknownName` for a robot, task or camera.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -68,6 +68,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         render_mode: str | None = None,
         **settings: Any,
     ):
+        for camera in cameras:
+            if camera not in CAMERAS:
+                raise UnknownName("camera", camera, CAMERAS)
         self.config = config or EnvConfig(robot, task, **settings)
         self.scene = build_scene(self.config.robot, self.config.task)
         self.data = mujoco.MjData(self.scene.model)
@@ -214,6 +217,3 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             picture = gymnasium.spaces.Box(0, 255, (*self.image_size, 3), np.uint8)
             spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
         return gymnasium.spaces.Dict(spaces)
-
-
-__all__ = ["CAMERAS", "EnvConfig", "ManipEnv"]

@@ -226,3 +226,8 @@ def test_a_name_that_is_unknown_gets_the_nearest():
 def test_a_setting_out_of_range_is_refused(setting: dict):
     with pytest.raises(UsageError, match=str(next(iter(setting.values())))):
         EnvConfig(**setting)
+
+
+def test_an_unknown_camera_is_refused_with_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'wrist'"):
+        ManipEnv("panda", "reach", cameras=("wrst",))

@@ -8,10 +8,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import RenderError, UnknownName
-from manip_il.sim.env import CAMERAS, ManipEnv
+from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend
 from manip_il.sim.render import Renderer
-from manip_il.sim.scene import build_scene
+from manip_il.sim.scene import CAMERAS, build_scene
 
 ROBOTS = ("panda", "fetch")
 SEED = 5_000_000
