@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from manip_il.mdp import Episode, require_finite
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
+IMAGES = "observation.images."  # before a camera's name
 ACTION = "action"
 EXECUTED_ACTION = "executed_action"
 ACTOR = "actor"
@@ -41,6 +42,8 @@ class RobotTaskSpec:
     instruction: str  # LeRobot's `task` text
 
     action_meaning: str = "joint position targets [rad], gripper opening command [m]"
+    cameras: tuple[str, ...] = ()
+    image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
 
     def to_json(self) -> dict[str, Any]:
         """As JSON knows it."""
@@ -50,12 +53,15 @@ class RobotTaskSpec:
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
         """The inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
         known = {field.name for field in fields(cls)}
-        if set(data) != known:
-            odd = sorted(known.symmetric_difference(data))
+        needed = {field.name for field in fields(cls) if field.default is MISSING}
+        if odd := sorted((needed - set(data)) | (set(data) - known)):
             raise ManipError(f"a robot-task spec with wrong keys: {', '.join(odd)} missing or unknown")
-        names = ("joint_names", "environment_state_names")
-        values: dict[str, Any] = {key: tuple(value) if key in names else value for key, value in data.items()}
-        return cls(**values)
+        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+
+    @property
+    def image_keys(self) -> dict[str, str]:
+        """Column -> camera."""
+        return {IMAGES + camera: camera for camera in self.cameras}
 
 
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
@@ -64,6 +70,7 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     return {
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
+        **{key: _image_feature(spec.image_size) for key in spec.image_keys},
         ACTION: _feature("float32", joints),
         EXECUTED_ACTION: _feature("float32", joints),
         ACTOR: _feature("int64", ["actor"]),
@@ -77,6 +84,10 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
         ROUND: _feature("int64", ["round"]),
         BETA: _feature("float32", ["beta"]),
     }
+
+
+def _image_feature(size: tuple[int, int]) -> dict[str, Any]:
+    return {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
 
 
 def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
@@ -95,7 +106,8 @@ def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right:
 
 
 def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
-    """The episode's columns in the order of `features(spec)`: (T,) for scalars, (T, d) for vectors.
+    """The episode's columns in the order of `features(spec)`: (T,) for scalars, (T, d) for vectors,
+    uint8 (T, height, width, 3) for pictures.
 
     Raises `UnknownName` for a column too many, `MismatchError` for one missing or of another dtype or shape,
     `NotFiniteError` naming the frame, `ManipError` where seed or success and their columns disagree.
@@ -112,12 +124,13 @@ def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[A
 
 def _fitted(who: str, key: str, values: NDArray[Any] | None, feature: dict[str, Any]) -> NDArray[Any]:
     shape: tuple[int, ...] = feature["shape"]
-    what, need = f"column {key!r}", f"{feature['dtype']} of shape (T, {shape[0]})"
+    dtype = "uint8" if feature["dtype"] == "video" else feature["dtype"]
+    what, need = f"column {key!r}", f"{dtype} of shape (T, {', '.join(map(str, shape))})"
     if values is None:
         raise MismatchError(what, who, "no such column", "the schema", need)
     is_scalar = shape == (1,)
     fits = values.shape[1:] == shape or (is_scalar and values.ndim == 1)
-    if values.dtype != np.dtype(feature["dtype"]) or not fits:
+    if values.dtype != np.dtype(dtype) or not fits:
         raise MismatchError(what, who, f"{values.dtype} of shape {values.shape}", "the schema", need)
     require_finite(f"{who}, {key}", values)
     return values.reshape(-1) if is_scalar else values
