@@ -108,7 +108,8 @@ def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right:
 def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
     """The episode's columns in the order of `features(spec)`.
 
-    (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises `UnknownName` for a column too many, `MismatchError` for one missing or of another dtype or shape,
+    (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises
+    `UnknownName` for a column too many, `MismatchError` for one missing or of another dtype or shape,
     `NotFiniteError` naming the frame, `ManipError` where seed or success and their columns disagree.
     """
     who = f"episode with seed {episode.seed}"
