@@ -20,8 +20,8 @@ from multiprocessing import get_context
 import numpy as np
 from _machine import describe_machine
 
+from manip_il.engine.engine import Engine, default_workers
 from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.local import Engine, default_workers
 from manip_il.evaluation.statistics import Proportion
 from manip_il.expert.expert import Expert
 from manip_il.mdp import Episode

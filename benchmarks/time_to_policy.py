@@ -17,7 +17,7 @@ from _machine import describe_machine
 
 from manip_il.dagger.config import DaggerConfig, FitConfig
 from manip_il.dagger.loop import run_dagger
-from manip_il.engine.local import Engine, default_workers
+from manip_il.engine.engine import Engine, default_workers
 from manip_il.sim.env import EnvConfig
 
 LIMIT = 80.0  # [s]

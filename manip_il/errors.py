@@ -51,6 +51,13 @@ class FolderExistsError(UsageError):
         super().__init__(f"{folder} exists already; go on with it by --resume=true, or replace it by --overwrite=true")
 
 
+class FolderBusyError(ManipError):
+    """A folder that another process is writing to."""
+
+    def __init__(self, folder: object, process: object):
+        super().__init__(f"{folder} is in use by process {process}; wait until that is done, or choose another folder")
+
+
 class RenderError(ManipError):
     """No working OpenGL for off-screen pictures."""
 

@@ -7,7 +7,7 @@ opening [m].
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -147,6 +147,11 @@ class Episode:
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
+
+    def without_pictures(self) -> Episode:
+        """The same without its columns of pictures (T, height, width, 3)."""
+        columns = {key: column for key, column in self.columns.items() if column.ndim < 4}
+        return self if len(columns) == len(self.columns) else replace(self, columns=columns)
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
 from manip_il.cli.groups import (
+    ENGINE_HELP,
+    WORKERS_HELP,
     EnvGroup,
     PolicyGroup,
     RobotGroup,
@@ -25,11 +27,11 @@ if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
     from manip_il.dagger.config import DaggerConfig
     from manip_il.dagger.loop import RoundResult
-    from manip_il.engine.local import Engine
+    from manip_il.engine.engine import Engine
     from manip_il.evaluation.report_data import LearningCurve, Report
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
-FREE = ("workers", "output_dir")
+FREE = ("workers", "engine", "output_dir")
 
 
 @dataclass
@@ -56,7 +58,8 @@ class DaggerOptions:
     validation_episodes: int = option(200, "unseen episodes that choose the best round")
     hold: int = option(10, "control steps that a rollout goes on for after success")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
-    workers: int | None = option(None, "processes; by default one a core")
+    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
+    workers: int | None = option(None, WORKERS_HELP)
     output_dir: Path = field(default=Path("runs/dagger"), metadata={"help": "folder of the run"})
     resume: bool = option(False, "go on with a run that was stopped")
     overwrite: bool = option(False, "replace a run that is there")
@@ -64,16 +67,22 @@ class DaggerOptions:
     def run(self) -> None:
         """Run, or go on with, all rounds."""
         config = self.config()
+        from manip_il.data.atomic import exclusive
+
+        with exclusive(self.output_dir):
+            self._run(config)
+
+    def _run(self, config: DaggerConfig) -> None:
         prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
             check_same_options(self.output_dir, self, FREE, may_grow="rounds")
         save_options(self.output_dir, self)
         from manip_il.cli.stages import Stages
-        from manip_il.engine.local import Engine, default_workers
+        from manip_il.engine.engine import Engine
         from manip_il.evaluation.report import write_report
 
         kept = f"every finished episode and round, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers or default_workers()) as engine:
+        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
             results = run_rounds(config, self.output_dir, engine, stages)
         write_report(self.output_dir / REPORT_FILE, _report(self, config, results))
         best = self.output_dir / "best" / "pretrained_model"

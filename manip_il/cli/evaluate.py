@@ -11,6 +11,8 @@ from manip_il.cli.groups import (
     DEFAULT_HZ,
     DEFAULT_ROBOT,
     DEFAULT_TASK,
+    ENGINE_HELP,
+    WORKERS_HELP,
     EnvGroup,
     find_policy,
     option,
@@ -73,7 +75,8 @@ class EvalOptions:
     env: EnvGroup = field(default_factory=EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
     seed: int = option(0, "shifts every random stream, 0 to 1000")
-    workers: int | None = option(None, "processes; by default one a core")
+    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
+    workers: int | None = option(None, WORKERS_HELP)
     output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
     overwrite: bool = option(False, "replace an evaluation that is there")
 
@@ -128,7 +131,7 @@ class EvalOptions:
 
     def _evaluate(self, job: RolloutJob) -> tuple[EvalResult, list[Episode]]:
         from manip_il.cli.progress import progress
-        from manip_il.engine.local import Engine, default_workers
+        from manip_il.engine.engine import Engine
         from manip_il.evaluation.runner import evaluate
         from manip_il.seeding import stream_seeds
 
@@ -137,7 +140,7 @@ class EvalOptions:
         solved = 0
         with (
             progress(len(seeds), f"evaluate {self._name()}") as bar,
-            Engine(self.workers or default_workers()) as engine,
+            Engine(self.workers, self.engine) as engine,
         ):
 
             def seen(episode: Episode) -> None:

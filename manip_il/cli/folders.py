@@ -31,7 +31,7 @@ def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
         return
     if not overwrite:
         raise FolderExistsError(folder)
-    _require_ours(folder)
+    require_ours(folder)
     _delete(folder)
 
 
@@ -79,7 +79,8 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     return [*records, last] if last is not None else records
 
 
-def _require_ours(folder: Path) -> None:
+def require_ours(folder: Path) -> None:
+    """Raise `UsageError` where replacing `folder` would delete what this program did not make."""
     real = folder.resolve()
     if folder.is_symlink():
         raise UsageError(f"{folder} is a link to {real}; --overwrite=true deletes no links, name the folder itself")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,10 +18,13 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.mlp.configuration_mlp import MLPConfig
     from manip_il.sim.env import EnvConfig
+    from manip_il.sim.look import CameraConfig, Look
 
 CONFIG_FILE = "config.yaml"
 POLICY_TYPES = ("mlp",)
 DEFAULT_ROBOT, DEFAULT_TASK, DEFAULT_HZ = "panda", "pick_place", 20
+ENGINE_HELP = "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one of its own here)"
+WORKERS_HELP = "processes, or tasks at once on Ray; by default one a core"
 WHERE_POLICIES_LIE = (".", "pretrained_model", "checkpoints/last/pretrained_model", "best/pretrained_model")
 
 
@@ -63,6 +66,35 @@ class EnvGroup:
         get_task(task)
         hz = control_hz if self.control_hz is None else self.control_hz
         return EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon)
+
+
+@dataclass
+class ImageGroup:
+    """`--image.*`: the pictures of every camera."""
+
+    height: int = option(128, "of a picture [pixels]")
+    width: int = option(128, "of a picture [pixels]")
+
+    def config(self, cameras: Sequence[str], look: Look | None = None) -> CameraConfig | None:
+        """What is pictured; None without cameras. `UnknownName` for a camera, `UsageError` for a size."""
+        from manip_il.sim.look import CameraConfig, Look
+
+        return CameraConfig(tuple(cameras), self.height, self.width, look or Look()) if cameras else None
+
+
+@dataclass
+class LookGroup:
+    """`--look.*`: the light that pictures are made in. Defaults are `Look`'s."""
+
+    shadows: bool = option(False, "cast shadows; a picture then takes two to six times as long")
+    brightness: float = option(1.0, "factor on every lamp, 0.1 to 2")
+    light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
+
+    def config(self) -> Look:
+        """The look; `UsageError` for a value out of range."""
+        from manip_il.sim.look import Look
+
+        return Look(self.shadows, self.brightness, self.light_turn)
 
 
 @dataclass

@@ -11,7 +11,7 @@ import os
 import select
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import MISSING
 from typing import Any, NamedTuple
 
@@ -36,9 +36,14 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
+    "render": Command("manip_il.cli.render:RenderOptions", "a dataset anew, with other cameras, sizes or lights"),
+    "build": Command("manip_il.cli.build:BuildOptions", "build the dataset of a folder of journals again"),
     "train": Command("manip_il.cli.train:TrainOptions", "fit a policy to a dataset (behaviour cloning)"),
     "dagger": Command("manip_il.cli.dagger:DaggerOptions", "roll out, label, aggregate, refit, and repeat"),
     "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
+    "doctor": Command("manip_il.cli.doctor:DoctorOptions", "examine a dataset, and repair it from its journals"),
+    "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "a dataset as MCAP files, for Foxglove and others"),
+    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "MCAP files as a dataset, by a mapping file"),
     "quickstart": Command("manip_il.cli.quickstart:QuickstartOptions", "the whole story, small: watch it learn"),
 }
 
@@ -81,14 +86,36 @@ def _dispatch(words: list[str]) -> None:
         print(f"{PROGRAM} {__version__}")
     elif words[0].startswith("-"):
         raise UsageError(f"{words[0]!r} stands before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
+    elif len(words) == 1 and _group(words[0]):
+        print(_group_help(words[0]))
     elif "--help" in words or "-h" in words:
-        print(_command_help(words[0], load(words[0])))
+        name, _ = _split(words)
+        print(_command_help(name, load(name)) if name in COMMANDS else _group_help(name))
     else:
-        options = parse(load(words[0]), words[1:])
+        name, words = _split(words)
+        options = parse(load(name), words)
         from manip_il.sim.gl import choose_backend
 
         choose_backend()  # mujoco takes the OpenGL that is chosen when it is imported, never another
         options.run()
+
+
+def _split(words: list[str]) -> tuple[str, list[str]]:
+    """A command's name, of one word or two, and the words behind it; a group's name where only help is asked for."""
+    group = _group(words[0])
+    if not group:
+        return words[0], words[1:]
+    name = " ".join(words[:2])
+    if name in COMMANDS:
+        return name, words[2:]
+    if words[1] in ("--help", "-h"):
+        return words[0], []
+    raise UnknownName("command", name, group)
+
+
+def _group(word: str) -> list[str]:
+    """The commands of two words that begin with this one."""
+    return [name for name in COMMANDS if name.startswith(f"{word} ")]
 
 
 def _report(error: BaseException, words: list[str]) -> int:
@@ -99,6 +126,9 @@ def _report(error: BaseException, words: list[str]) -> int:
     if isinstance(error, ManipError):
         _complain(f"error: {error}")
         return error.exit_code
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        _complain(f"error: {error.strerror}: {error.filename}")
+        return 1
     _complain(f"error: {type(error).__name__}: {error}; run again with --debug for the traceback")
     return 1
 
@@ -107,7 +137,7 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
         return f"; kept: {error.kept}; go on with: {error.resume_command or resume_command(words)}"
     try:
-        can_resume = any(option.name == "resume" for option in options_of(load(words[0])))
+        can_resume = any(option.name == "resume" for option in options_of(load(_split(words)[0])))
     except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
         return ""
     return f"; what was finished is kept; go on with: {resume_command(words)}" if can_resume else ""
@@ -118,15 +148,22 @@ def _complain(text: str) -> None:
 
 
 def _help() -> str:
-    width = max(map(len, COMMANDS)) + 2
-    commands = "\n".join(f"  {name:{width}}{command.summary}" for name, command in COMMANDS.items())
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
         "Robot-arm imitation learning without a human at the controls.\n\n"
-        f"commands:\n{commands}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
+        f"commands:\n{_commands(COMMANDS)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} quickstart"
     )
+
+
+def _group_help(group: str) -> str:
+    return f"usage: {PROGRAM} {group} COMMAND [--option=value ...]\n\ncommands:\n{_commands(_group(group))}"
+
+
+def _commands(names: Collection[str]) -> str:
+    width = max(map(len, names)) + 2
+    return "\n".join(f"  {name:{width}}{COMMANDS[name].summary}" for name in names)
 
 
 def _command_help(name: str, cls: Any) -> str:

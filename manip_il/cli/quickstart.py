@@ -8,11 +8,13 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.dagger import FREE, REPORT_FILE, DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.folders import atomic_write, prepare_output
 from manip_il.cli.groups import (
+    ENGINE_HELP,
+    WORKERS_HELP,
     EnvGroup,
     PolicyGroup,
     RobotGroup,
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from manip_il.cli.story import Contestant, Pictures
     from manip_il.dagger.config import DaggerConfig
     from manip_il.dagger.loop import RoundResult
-    from manip_il.engine.local import Engine
+    from manip_il.engine.engine import Engine
     from manip_il.evaluation.report_data import PolicyRow, Report
     from manip_il.evaluation.results import EvalResult
 
@@ -64,7 +66,8 @@ class QuickstartOptions:
     test_episodes: int = option(200, "unseen episodes that nothing is chosen on")
     disturbed_episodes: int = option(100, "the first of them once more, disturbed")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
-    workers: int | None = option(None, "processes; by default one a core")
+    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
+    workers: int | None = option(None, WORKERS_HELP)
     output_dir: Path = field(default=Path("runs/quickstart"), metadata={"help": "folder of the run"})
     resume: bool = option(False, "go on with a run that was stopped")
     overwrite: bool = option(False, "replace a run that is there")
@@ -76,15 +79,21 @@ class QuickstartOptions:
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
         config = self._config()
+        from manip_il.data.atomic import exclusive
+
+        with exclusive(self.output_dir):
+            self._run(config, started)
+
+    def _run(self, config: DaggerConfig, started: float) -> None:
         prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
             check_same_options(self.output_dir, self, FREE)
         save_options(self.output_dir, self)
         from manip_il.cli.stages import Stages
-        from manip_il.engine.local import Engine, default_workers
+        from manip_il.engine.engine import Engine
 
         kept = f"every finished episode, round and evaluation, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers or default_workers()) as engine:
+        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
             story = _Story(self, config, engine, stages)
             story.add_time("start", time.monotonic() - started)
             story.tell()

@@ -3,20 +3,43 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import EnvGroup, RobotGroup, TaskGroup, check_same_options, option, save_options, warn
+from manip_il.cli.groups import (
+    ENGINE_HELP,
+    WORKERS_HELP,
+    EnvGroup,
+    ImageGroup,
+    RobotGroup,
+    TaskGroup,
+    check_same_options,
+    option,
+    save_options,
+    warn,
+)
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, UsageError
 
 if TYPE_CHECKING:
+    from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
 
 HOLD = 10  # control steps that a demonstration goes on for after success
 _REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
+
+
+@dataclass
+class EncoderGroup:
+    """`--dataset.rgb_encoder.*`: how pictures are compressed, in LeRobot's names."""
+
+    vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
+    pix_fmt: str = option("yuv420p", "pixel format")
+    g: int = option(2, "frames from one key frame to the next")
+    crf: int | None = option(None, "quality, lower is better and larger; by default 23, libsvtav1 30")
+    preset: str | None = option(None, "the codec's own; by default ultrafast, libsvtav1 12")
 
 
 @dataclass
@@ -26,6 +49,7 @@ class DatasetGroup:
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default local/ROBOT_TASK")
     root: Path | None = field(default=None, metadata={"help": "folder of the dataset; by default datasets/NAME"})
     num_episodes: int = option(50, "successful episodes")
+    rgb_encoder: EncoderGroup = field(default_factory=EncoderGroup)
 
 
 @dataclass
@@ -40,34 +64,39 @@ class RecordOptions:
     task: TaskGroup = field(default_factory=TaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
-    cameras: list[str] = field(default_factory=list, metadata={"help": "cameras to record"})
+    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both; by default no pictures"})
+    image: ImageGroup = field(default_factory=ImageGroup)
     seed: int = option(0, "shifts every random stream, 0 to 1000")
-    workers: int | None = option(None, "processes; by default one a core")
+    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
+    workers: int | None = option(None, WORKERS_HELP)
     resume: bool = option(False, "go on with a recording, also to more episodes")
     overwrite: bool = option(False, "replace a dataset that is there")
 
     def run(self) -> None:
-        """Record, then write the dataset."""
+        """Record; the dataset is written as the episodes come."""
         self._check()
-        env = self.env.config(self.robot.type, self.task.type)
+        env, cameras = self.env.config(self.robot.type, self.task.type), self.image.config(self.cameras)
+        if cameras:
+            from manip_il.data.lerobot_io import VideoConfig
+
+            VideoConfig(**asdict(self.dataset.rgb_encoder)).check(cameras.size, env.control_hz)
+        from manip_il.data.atomic import exclusive
+        from manip_il.engine.engine import Engine
         from manip_il.engine.jobs import RolloutJob
 
+        engine = Engine(self.workers, self.engine)
         root, journals = self._folders()
-        prepare_output(root, resume=self.resume, overwrite=self.overwrite)
-        prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-        if self._is_there(root, journals):
-            say(f"{root} holds its {self.dataset.num_episodes} episodes already")
-        else:
-            job = RolloutJob(env, "expert", beta=1.0, hold=HOLD)
-            self._record(job, root, journals)
+        with exclusive(root):
+            prepare_output(root, resume=self.resume, overwrite=self.overwrite)
+            prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
+            if self._is_there(root, journals):
+                say(f"{root} holds its {self.dataset.num_episodes} episodes already")
+            else:
+                job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras)
+                self._record(engine, job, root, journals)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _check(self) -> None:
-        if self.cameras:
-            raise UsageError(
-                f"--cameras={','.join(self.cameras)}: this version records no pictures; leave --cameras out "
-                "(the column sim_state is kept, so that pictures can be made later)"
-            )
         if self.dataset.num_episodes < 1:
             raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
         if not _REPO_ID.fullmatch(self._repo_id()):
@@ -81,47 +110,43 @@ class RecordOptions:
         return root, root.with_name(f"{root.name}.journals")
 
     def _is_there(self, root: Path, journals: Path) -> bool:
-        """Whether a resumed recording has nothing to do; a smaller dataset is removed, its journals hold it all."""
+        """Whether a resumed recording has nothing to do."""
         from manip_il.data.lerobot_io import dataset_info
 
         if not self.resume:
             return False
-        free = ("workers", "dataset.root", "dataset.repo_id")
+        free = ("workers", "engine", "dataset.root", "dataset.repo_id")
         check_same_options(journals, self, free, may_grow="dataset.num_episodes")
         if not root.is_dir() or not any(root.iterdir()):
             return False
         if not journals.is_dir():
             raise ManipError(f"no {journals} to go on from; record {root} anew by --overwrite=true")
-        if dataset_info(root).episodes == self.dataset.num_episodes:
-            return True
-        prepare_output(root, resume=False, overwrite=True)
-        return False
+        return dataset_info(root).episodes == self.dataset.num_episodes
 
-    def _record(self, job: RolloutJob, root: Path, journals: Path) -> None:
+    def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
         from manip_il.cli.stages import Stages
-        from manip_il.dagger.collect import MAX_TRIES, build_dataset, check_journals, collect_successes
-        from manip_il.data.journal import list_episodes, read_header
-        from manip_il.engine.local import Engine, default_workers
+        from manip_il.dagger.collect import MAX_TRIES, check_journals, collect_successes, provenance, record
+        from manip_il.data.build import Recording
+        from manip_il.data.journal import list_seeds
         from manip_il.seeding import stream_seeds
 
         count = self.dataset.num_episodes
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, self.seed)
         warn(check_journals(journals, job))
         save_options(journals, self)
-        with Stages(kept=f"every finished episode, in {journals}") as stages:
-            missing = max(0, count - len(list_episodes(journals)))
-            stages.start(f"record {job.env.robot} {job.env.task}", missing)
-            with Engine(self.workers or default_workers()) as engine:
-                paths = collect_successes(engine, job, seeds, count, journals, stages.episode)
-        last = read_header(paths[-1]).seed
-        tried = last - seeds[0] + 1
-        provenance = {"driver": "expert", "round": 0, "beta": 1.0, "seeds": [seeds[0], last], "tried": tried}
-        info = build_dataset(paths, root, job, self._repo_id(), provenance)
-        say(f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; {_left_out(tried - count)}")
-        say(f"dataset: {root} (its episodes one by one, with Foxglove's messages: {journals})")
+        video = asdict(self.dataset.rgb_encoder) if job.cameras else {}
+        recording = Recording(self._repo_id(), True, count, provenance(job), video)
+        kept = f"every finished episode, in {journals}"
+        with Stages(kept) as stages, engine:
+            stages.start(f"record {job.env.robot} {job.env.task}", max(0, count - len(list_seeds(journals))))
+            episodes = collect_successes(engine, job, seeds, count, journals, stages.episode)
+            info, failed = record(episodes, journals, root, job, recording, replace=self.resume)
+        say(f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; {left_out(failed)}")
+        say(f"dataset: {root} (its episodes one by one, to open in Foxglove: {journals})")
 
 
-def _left_out(failed: int) -> str:
+def left_out(failed: int) -> str:
+    """What became of failed demonstrations, in words."""
     if failed == 0:
         return "no demonstration failed"
     return f"{failed} failed demonstration{'s' if failed > 1 else ''} left out"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.interrupt import Interrupted, StopRequest
 from manip_il.cli.progress import Progress, progress
+from manip_il.errors import ManipError, UsageError
 
 if TYPE_CHECKING:
     from manip_il.dagger.loop import Watch
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 class Stages:
     """One progress bar at a time; use as a context manager. A stop request is honoured at every report.
 
-    kept: what to tell the user is safe on disk.
+    kept: what to tell the user is safe on disk, also where the work fails.
     """
 
     def __init__(self, kept: str):
@@ -36,6 +37,8 @@ class Stages:
     ) -> None:
         self.close()
         self._stop.__exit__(kind, error, trace)
+        if isinstance(error, ManipError) and not isinstance(error, UsageError):
+            error.args = (f"{error}; kept: {self.kept}; go on by --resume=true",)
 
     def start(self, description: str, total: int) -> None:
         """Close the bar of the stage before and open one of `total` episodes or steps."""

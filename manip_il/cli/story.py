@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from manip_il.dagger.collect import MAX_TRIES, build_dataset, collect_successes
+from manip_il.dagger.collect import MAX_TRIES, collect_successes, provenance, record
 from manip_il.dagger.loop import LEARNING_COLUMNS, fit_policy
 from manip_il.data import schema
+from manip_il.data.atomic import write_file
+from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_io import read_table
 from manip_il.engine.describe import env_spec
@@ -29,7 +30,7 @@ from manip_il.sim.disturb import NONE, STANDARD, Disturbance
 if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
     from manip_il.dagger.config import DaggerConfig
-    from manip_il.engine.local import Engine
+    from manip_il.engine.engine import Engine
     from manip_il.mdp import Episode
     from manip_il.sim.env import EnvConfig
 
@@ -152,18 +153,17 @@ def _demonstrate(
     journals = folder / "journals"
     journals.mkdir(parents=True, exist_ok=True)
     for path in list_episodes(round_0 / "journals"):
-        shutil.copyfile(path, journals / path.name)
+        write_file(journals / path.name, path.read_bytes())
     job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
     count = config.demonstrations
     stages.start("cloning with as many labels, record", count)
     while True:
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
-        found = collect_successes(engine, job, seeds, count, journals, stages.episode)
-        frames = sum(read_header(path).frames for path in found)
+        found = list(collect_successes(engine, job, seeds, count, journals, stages.episode))
+        frames = sum(header.frames for path in found if (header := read_header(path)).success)
         if frames >= labels:
             break
         count = max(count + 1, math.ceil(count * labels / frames))
-        stages.start("cloning with as many labels, record", count - len(found))
+        stages.start("cloning with as many labels, record", max(0, count - len(found)))
     name = f"local/{config.env.robot}_{config.env.task}_demonstrations"
-    provenance = {"driver": "expert", "round": 0, "beta": 1.0, "seeds": [seeds[0], read_header(found[-1]).seed]}
-    build_dataset(found, folder / "dataset", job, name, provenance)
+    record(found, journals, folder / "dataset", job, Recording(name, True, count, provenance(job)))

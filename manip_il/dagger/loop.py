@@ -6,6 +6,8 @@ where it was: an episode, a fit's last checkpoint, or an evaluation that is ther
 
 from __future__ import annotations
 
+import itertools
+import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -17,21 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.dagger.beta import BetaSchedule
-from manip_il.dagger.collect import build_dataset, collect, collect_successes
+from manip_il.dagger.collect import MAX_TRIES, check_journals, collect, collect_successes, provenance, record
 from manip_il.dagger.config import DaggerConfig
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
-from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.build import Recording
 from manip_il.data.lerobot_io import dataset_info, merge_datasets, read_table
 from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.local import Engine
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_base, stream_seeds
 from manip_il.sim.disturb import STANDARD
 
+_LOG = logging.getLogger(__name__)
 Table = dict[str, NDArray[Any]]
 BEST, DATASET = "best", "dataset"
 LEARNING_COLUMNS = (schema.STATE, schema.ENVIRONMENT_STATE, schema.ACTION, schema.LABEL_VALID, "episode_index")
@@ -185,20 +188,24 @@ def _collect_round(
     if (here / DATASET).is_dir():
         return
     journals = here / "journals"
+    repo_id = f"local/{config.env.robot}_{config.env.task}_round_{round_}"
     if previous is None:
         job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
-        seeds = stream_seeds("demonstrations", 3 * config.demonstrations, config.seed)
-        paths = collect_successes(engine, job, seeds, config.demonstrations, journals, watch.on_episode)
+        recording = Recording(repo_id, True, config.demonstrations, provenance(job))
+        seeds = stream_seeds("demonstrations", MAX_TRIES * config.demonstrations, config.seed)
+        episodes = collect_successes(engine, job, seeds, config.demonstrations, journals, watch.on_episode)
     else:
         job = RolloutJob(config.env, "mixture", policy=previous, beta=beta, hold=config.hold, round=round_)
+        recording = Recording(repo_id, provenance=provenance(job))
         seeds = stream_seeds(f"round/{round_}", config.episodes_per_round, config.seed)
         disturbed = round(config.disturbed_share * len(seeds))
-        collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode)
-        collect(engine, job, seeds[disturbed:], journals, watch.on_episode)
-        paths = list_episodes(journals)
-    first, last = (read_header(path).seed for path in (paths[0], paths[-1]))
-    provenance = {"round": round_, "beta": beta, "seeds": [first, last], "driver": job.driver}
-    build_dataset(paths, here / DATASET, job, f"local/{config.env.robot}_{config.env.task}_round_{round_}", provenance)
+        episodes = itertools.chain(
+            collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode),
+            collect(engine, job, seeds[disturbed:], journals, watch.on_episode),
+        )
+    for line in check_journals(journals, job):
+        _LOG.warning("%s", line)
+    record(episodes, journals, here / DATASET, job, recording)
 
 
 def _validate(config: DaggerConfig, here: Path, engine: Engine, watch: Watch, policy: Path, round_: int) -> EvalResult:

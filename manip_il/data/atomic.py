@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import os
 import shutil
@@ -10,20 +11,22 @@ import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
-from manip_il.errors import FolderExistsError
+from manip_il.errors import FolderBusyError, FolderExistsError
 
 PARTIAL = ".partial"  # suffix of what is not finished
 
 
 @contextlib.contextmanager
-def new_folder(root: Path) -> Generator[Path]:
+def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     """Give an empty sibling of `root` to write into; on leaving, sync it to disk and rename it to `root`.
 
     An exception removes the sibling; what a killed writer left of one is removed by the next writer.
-    Raises `FolderExistsError` where `root` holds something, before and after.
+    Raises `FolderExistsError` where `root` holds something, before and after; with `replace` that stays until the
+    new folder is whole, and is removed then.
     """
     root = root.absolute()
-    _refuse_full(root)
+    if not (replace and root.is_dir()):
+        _refuse_full(root)
     root.parent.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(root)
     partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
@@ -34,17 +37,53 @@ def new_folder(root: Path) -> Generator[Path]:
         partial.chmod(0o777 & ~_umask())
         yield partial
         _sync_tree(partial)
-        try:
-            partial.rename(root)
-        except OSError:
-            _refuse_full(root)
-            raise
+        if replace and root.exists():
+            _exchange(partial, root)
+            shutil.rmtree(partial, ignore_errors=True)
+        else:
+            _rename(partial, root)
         sync(root.parent)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
     finally:
         os.close(lock)
+
+
+@contextlib.contextmanager
+def exclusive(folder: Path) -> Generator[None]:
+    """Hold `folder`, which need not exist, for this process; others see a file `.<name>.lock` beside it.
+
+    Raises `FolderBusyError`, with the holder's process id, where another process holds it. The kernel lets go of what
+    a killed process held.
+    """
+    folder = folder.absolute()
+    path = folder.with_name(f".{folder.name}.lock")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = _lock(folder, path)
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+        yield
+    finally:
+        path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
+        os.close(handle)
+
+
+def _lock(folder: Path, path: Path) -> int:
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
+            os.close(handle)
+            raise FolderBusyError(folder, holder or "unknown") from error
+        except OSError:
+            return handle  # a network file system may know no locks
+        if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
+            return handle
+        os.close(handle)  # its last holder removed it meanwhile: take the new one
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -71,6 +110,23 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def _rename(partial: Path, root: Path) -> None:
+    try:
+        partial.rename(root)
+    except OSError:
+        _refuse_full(root)
+        raise
+
+
+def _exchange(left: Path, right: Path) -> None:
+    """Swap two names in one step (Linux's renameat2), so that there is no moment without `right`."""
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    call = ctypes.CDLL(None, use_errno=True).renameat2
+    if call(here, os.fsencode(left), here, os.fsencode(right), exchange):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), str(right))
 
 
 def _sync_tree(folder: Path) -> None:

@@ -39,6 +39,8 @@ def to_episode(frames: list[Transition], round_: int, beta: float) -> Episode:
         schema.BETA: _column([beta] * count, np.float32),
         schema.EXPERT_PHASE: _column([frame.label.phase if frame.label else Phase.NONE for frame in frames], np.int64),
     }
+    for camera in frames[0].observation.images:
+        columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
     labels = [frame.label for frame in frames if frame.label is not None]
     if len(labels) == count:
         columns[schema.ACTION] = np.stack([label.action for label in labels]).astype(np.float32)

@@ -20,6 +20,7 @@ _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
     "model_sha256": "compiled MuJoCo model",
     "config_sha256": "config",
+    "cameras_sha256": "pictures' size and look",
 }
 
 

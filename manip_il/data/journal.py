@@ -17,21 +17,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Attachment, DataEnd, Footer, McapRecord, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.records import Attachment, Chunk, DataEnd, Footer, McapRecord, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.foxglove_episode import channels, frame_times
+from manip_il.data.schema import IMAGES, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 _FORMAT = "1"
 _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
+_DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FOOTER_TAIL = 4 + 8  # the footer's own checksum and the closing magic [bytes]
 
@@ -48,15 +51,37 @@ class Header:
     fingerprint: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class JournalKeep:
+    """Makes a journal file of every episode that an engine runs."""
+
+    folder: Path
+    spec: RobotTaskSpec
+    fingerprint: dict[str, Any]
+
+    def pack(self, episode: Episode) -> bytes:
+        """The file's content."""
+        return encode_episode(episode, self.spec, self.fingerprint)
+
+    def store(self, seed: int, packed: bytes) -> None:
+        """Have the file on disk. Raises `ManipError` where the disk is full or may not be written."""
+        path = episode_path(self.folder, seed)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_file(path, packed)
+        except OSError as error:
+            raise ManipError(f"cannot write {path}: {error.strerror}") from error
+
+
 def write_episode(folder: Path, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Path:
     """Write one episode to `folder/episode-<seed>.mcap` and return that path; the same episode gives the same bytes.
 
-    An earlier file of the same seed is replaced. Raises `ManipError` for a column that numpy can only pickle.
+    An earlier file of the same seed is replaced. Raises `ManipError` for a column that numpy can only pickle, and
+    where the disk is full or may not be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"episode-{episode.seed:012d}.mcap"
-    write_file(path, _encode(episode, spec, fingerprint))
-    return path
+    keep = JournalKeep(folder, spec, fingerprint)
+    keep.store(episode.seed, keep.pack(episode))
+    return episode_path(folder, episode.seed)
 
 
 def read_episode(path: Path) -> Episode:
@@ -64,12 +89,20 @@ def read_episode(path: Path) -> Episode:
 
     Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
     """
+    return read_journal(path)[1]
+
+
+def read_journal(path: Path) -> tuple[Header, Episode]:
+    """What `read_header` and `read_episode` give, in one reading. Raises `ManipError` naming the file."""
     with _explain(path):
         records = _checked_records(path.read_bytes())
         header = _header(records)
         attachments = [record for record in records if isinstance(record, Attachment)]
         columns = {record.name.removesuffix(_NPY): _from_npy(record.data) for record in attachments}
-        return Episode(header.seed, columns, header.success, header.success_at_end)
+        if header.spec.cameras:  # else nothing in the messages is needed
+            messages = (one for record in records if isinstance(record, Chunk) for one in breakup_chunk(record))
+            columns |= {IMAGES + camera: pictures for camera, pictures in foxglove.read_images(messages).items()}
+        return header, Episode(header.seed, columns, header.success, header.success_at_end)
 
 
 def read_header(path: Path) -> Header:
@@ -78,10 +111,34 @@ def read_header(path: Path) -> Header:
         return _header(list(make_reader(stream).iter_metadata()))
 
 
+def episode_path(folder: Path, seed: int) -> Path:
+    """Where the episode of a seed lies."""
+    return folder / f"episode-{seed:012d}.mcap"
+
+
+def list_seeds(folder: Path) -> list[int]:
+    """The seeds of the folder's finished episodes, in order; none where the folder does not exist."""
+    return sorted(int(match[1]) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name)))
+
+
 def list_episodes(folder: Path) -> list[Path]:
     """The folder's finished episodes in the order of their seeds; none where the folder does not exist."""
-    found = [(int(match[1]), path) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name))]
-    return [path for _, path in sorted(found)]
+    return [episode_path(folder, seed) for seed in list_seeds(folder)]
+
+
+def set_aside_damaged(folder: Path) -> list[str]:
+    """Rename every file that cannot be read to `<name>.damaged`, so that its seed is free; what was wrong with each.
+
+    Only for when no writer is at work in `folder`.
+    """
+    wrong: list[str] = []
+    for path in list_episodes(folder):
+        try:
+            read_journal(path)
+        except ManipError as error:
+            path.rename(path.with_name(path.name + _DAMAGED))
+            wrong.append(f"{error} (set aside as {path.name}{_DAMAGED})")
+    return wrong
 
 
 def clean_temporary(folder: Path) -> list[Path]:
@@ -92,7 +149,8 @@ def clean_temporary(folder: Path) -> list[Path]:
     return leftovers
 
 
-def _encode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> bytes:
+def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> bytes:
+    """A journal file's content; the same episode gives the same bytes."""
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library=_RECORD)
@@ -110,21 +168,15 @@ def _encode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) 
     )
     _add_channels(writer, episode, spec)
     for key, column in episode.columns.items():
+        if key.startswith(IMAGES):
+            continue  # pictures travel as messages, without loss as well
         writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
     writer.finish()
     return stream.getvalue()
 
 
 def _add_channels(writer: Writer, episode: Episode, spec: RobotTaskSpec) -> None:
-    schema_ids: dict[str, int] = {}
-    for channel in foxglove.channels(episode, spec):
-        title = channel.schema["title"]
-        if title not in schema_ids:
-            schema_ids[title] = writer.register_schema(title, "jsonschema", json.dumps(channel.schema).encode())
-        channel_id = writer.register_channel(channel.topic, "json", schema_ids[title])
-        for frame, message in enumerate(channel.messages()):
-            time = foxglove.log_time(frame, spec.fps)
-            writer.add_message(channel_id, time, message, time, frame)
+    foxglove.add_channels(writer, list(channels(episode, spec)), frame_times(episode, spec))
 
 
 def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
@@ -141,11 +193,11 @@ def _from_npy(data: bytes) -> NDArray[Any]:
 
 
 def _checked_records(data: bytes) -> list[McapRecord]:
-    """All records, once both halves of the file fit their checksums.
+    """All records, chunks of messages as they are, once both halves of the file fit their checksums.
 
     The library's reader checks the first half (data), and only if it meets its closing record.
     """
-    records = list(StreamReader(io.BytesIO(data), validate_crcs=True).records)
+    records = list(StreamReader(io.BytesIO(data), validate_crcs=True, emit_chunks=True).records)
     ends = [record for record in records if isinstance(record, DataEnd)]
     if len(ends) != 1 or ends[0].data_section_crc == 0:
         raise ValueError("no checksum over its data")
@@ -180,5 +232,5 @@ def _explain(path: Path) -> Generator[None]:
     except FileNotFoundError as error:
         raise ManipError(f"no such episode file: {path}") from error
     except Exception as error:  # a damaged file can make a parser raise anything
-        why = str(error) or type(error).__name__
-        raise ManipError(f"{path} is not a whole episode: {why}; remove it and record that seed again") from error
+        why = "it ends too early" if isinstance(error, EndOfFile) else str(error) or type(error).__name__
+        raise ManipError(f"{path} is not a whole episode: {why}; --resume=true records it anew") from error

@@ -20,7 +20,9 @@ TASKS = "meta/tasks.parquet"
 OURS = "meta/manip_il.json"  # spec, fingerprint, provenance: LeRobot leaves files alone that it does not know
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 DATA_FILES = "data/*/*.parquet"
+EPISODES_FILES = "meta/episodes/*/*.parquet"
 CHUNKS_SIZE = 1000  # files in one chunk folder
 DATA_FILES_SIZE_IN_MB = 100
 VIDEO_FILES_SIZE_IN_MB = 200
@@ -39,6 +41,12 @@ _INDEX_DTYPES = {
     TASK_INDEX: "int64",
 }
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
+    "chunk_index": pa.int64(),
+    "file_index": pa.int64(),
+    "from_timestamp": pa.float64(),
+    "to_timestamp": pa.float64(),
+}
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
@@ -48,9 +56,21 @@ def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     return {**features(spec), **own}
 
 
-def info_json(spec: RobotTaskSpec, episodes: int, frames: int, file_size: float) -> dict[str, Any]:
-    """Content of `meta/info.json`, keys in LeRobot's order."""
+def table_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
+    """Those of the columns that are in the data files: all but the pictures."""
+    return {key: feature for key, feature in all_features(spec).items() if key not in spec.image_keys}
+
+
+def info_json(
+    spec: RobotTaskSpec, episodes: int, frames: int, file_sizes: tuple[float, float], videos: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
+    """Content of `meta/info.json`, keys in LeRobot's order.
+
+    file_sizes: of data and video files [MB]. videos: camera column -> what LeRobot says of its video files.
+    """
     table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in all_features(spec).items()}
+    for key, info in videos.items():
+        table[key]["info"] = info
     return {
         "codebase_version": VERSION,
         "fps": spec.fps,
@@ -59,10 +79,10 @@ def info_json(spec: RobotTaskSpec, episodes: int, frames: int, file_size: float)
         "total_frames": frames,
         "total_tasks": 1,
         "chunks_size": CHUNKS_SIZE,
-        "data_files_size_in_mb": file_size,
-        "video_files_size_in_mb": VIDEO_FILES_SIZE_IN_MB,
+        "data_files_size_in_mb": file_sizes[0],
+        "video_files_size_in_mb": file_sizes[1],
         "data_path": DATA_PATH,
-        "video_path": None,
+        "video_path": VIDEO_PATH if videos else None,
         "robot_type": spec.robot,
         "splits": {"train": f"0:{episodes}"},
     }
@@ -75,7 +95,7 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
-    for key, feature in all_features(spec).items():
+    for key, feature in table_features(spec).items():
         value = {"dtype": feature["dtype"], "_type": "Value"}
         dtype = _arrow_type(feature["dtype"])
         size: int = feature["shape"][0]
@@ -90,18 +110,22 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
 
 def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
     """Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
-    stats = [
-        pa.field(f"stats/{key}/{name}", pa.list_(pa.int64() if name == "count" else pa.float64()))
-        for key in all_features(spec)
-        for name in STAT_NAMES
-    ]
     whole = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
     return pa.schema(
         [
             pa.field(EPISODE_INDEX, pa.int64()),
             pa.field("tasks", pa.list_(pa.string())),
             *(pa.field(name, pa.int64()) for name in whole),
-            *stats,
+            *(
+                pa.field(f"videos/{key}/{name}", dtype)
+                for key in spec.image_keys
+                for name, dtype in VIDEO_COLUMNS.items()
+            ),
+            *(
+                pa.field(f"stats/{key}/{name}", _stat_type(name, key in spec.image_keys))
+                for key in all_features(spec)
+                for name in STAT_NAMES
+            ),
             pa.field("meta/episodes/chunk_index", pa.int64()),
             pa.field("meta/episodes/file_index", pa.int64()),
         ]
@@ -119,10 +143,10 @@ def tasks_table(instruction: str) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def numbered(template: str, number: int) -> tuple[str, int, int]:
-    """Path, chunk and file index of the `number`-th file."""
+def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
+    """Path, chunk and file index of the `number`-th file. names: what else the template asks for."""
     chunk, file = divmod(number, CHUNKS_SIZE)
-    return template.format(chunk_index=chunk, file_index=file), chunk, file
+    return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -133,3 +157,10 @@ def write_json(path: Path, data: Any) -> None:
 
 def _arrow_type(dtype: str) -> pa.DataType:
     return {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}[dtype]
+
+
+def _stat_type(name: str, is_picture: bool) -> pa.DataType:
+    """One number a dimension; of pictures one a channel, as (3, 1, 1)."""
+    if name == "count":
+        return pa.list_(pa.int64())
+    return pa.list_(pa.list_(pa.list_(pa.float64()))) if is_picture else pa.list_(pa.float64())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.video_read import DatasetPictures
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -54,26 +58,55 @@ def read_table(
             raise UnknownName(f"column in {root}", name, table_features)
     wanted = names if episodes is None else list(dict.fromkeys([*names, layout.EPISODE_INDEX]))
     table = pa.concat_tables(_read_file(path, wanted) for path in _data_files(root))
-    if len(table) != info["total_frames"]:
-        raise ManipError(f"{root}: {layout.INFO} counts {info['total_frames']} frames, its data files {len(table)}")
+    _check_rows(root, len(table))
     if episodes is not None:
         table = _keep(root, table, episodes, info["total_episodes"])
     return {name: _to_numpy(table.column(name), table_features[name]["shape"]) for name in names}
 
 
-def read_episodes(root: Path) -> Iterator[Episode]:
-    """The dataset's episodes in order, scalars as (T, 1) columns; success as `next.success` has it.
+def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
+    """The dataset's episodes in order, scalars as (T, 1) columns, pictures decoded unless they are not wanted.
 
-    Raises what `read_table` raises.
+    An episode's success is what `next.success` has. One data file is held at a time. Raises what `read_table` and
+    `read_frames` raise.
     """
-    shapes = {key: feature["shape"] for key, feature in s.features(read_spec(root)).items()}
-    table = read_table(root, [*shapes, layout.EPISODE_INDEX])
-    index = table.pop(layout.EPISODE_INDEX)
-    starts = np.flatnonzero(np.diff(index, prepend=-1))
-    for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
-        columns = {key: values[start:stop].reshape(-1, *shapes[key]) for key, values in table.items()}
-        success = columns[s.SUCCESS]
-        yield Episode(int(columns[s.SEED].flat[0]), columns, bool(success.any()), bool(success[-1]))
+    spec = read_spec(root)
+    cameras = list(spec.image_keys) if pictures else []
+    wanted = {key: one for key, one in s.features(spec).items() if pictures or key not in spec.image_keys}
+    shapes = {key: feature["shape"] for key, feature in wanted.items()}
+    stored = [key for key in shapes if key not in cameras]
+    _check_rows(root, sum(len(_read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
+    with closing(_pictures(root, cameras)) as frames:
+        for path in _data_files(root):
+            table = _read_file(path, [*stored, layout.EPISODE_INDEX])
+            columns = {key: _to_numpy(table.column(key), shapes[key]).reshape(-1, *shapes[key]) for key in stored}
+            index = table.column(layout.EPISODE_INDEX).to_numpy()
+            starts = np.flatnonzero(np.diff(index, prepend=-1))
+            for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
+                own = {key: values[start:stop] for key, values in columns.items()}
+                own |= {key: frames.read(key, int(index[start])) for key in cameras}
+                yield _episode({key: own[key] for key in shapes})
+
+
+def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
+    """One camera's decoded frames of one episode, (T, height, width, 3). key: `observation.images.<camera>`.
+
+    Raises `UnknownName` for a column that is no camera, `UsageError` for an episode that is not there, `ManipError`
+    for a video file that cannot be read or lacks frames.
+    """
+    if key not in (known := camera_keys(root)):
+        raise UnknownName(f"camera in {root}", key, known)
+    with closing(_pictures(root, [key])) as pictures:
+        return pictures.read(key, episode)
+
+
+def video_rows(root: Path) -> dict[Path, int]:
+    """Every video file that `meta/episodes` names, with the number of frames that it says are in it."""
+    pictures = _pictures(root, camera_keys(root))
+    rows: Counter[Path] = Counter()
+    for key, episode in itertools.product(camera_keys(root), range(len(pictures.lengths))):
+        rows[pictures.place(key, episode)[0]] += pictures.lengths[episode]
+    return dict(rows)
 
 
 def read_spec(root: Path) -> s.RobotTaskSpec:
@@ -94,6 +127,7 @@ def read_spec(root: Path) -> s.RobotTaskSpec:
             environment_state_names=tuple(info["features"][s.ENVIRONMENT_STATE]["names"]),
             sim_state_size=int(info["features"][s.SIM_STATE]["shape"][0]),
             instruction=_instruction(root),
+            **_cameras(info),
         )
     except (KeyError, TypeError) as error:
         raise ManipError(f"{root} lacks columns that this project's datasets have: {error}") from error
@@ -135,6 +169,37 @@ def dataset_info(root: Path) -> DatasetInfo:
 def camera_keys(root: Path) -> list[str]:
     """Names of the columns that are pictures."""
     return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in _PICTURES]
+
+
+def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
+    names = [f"videos/{key}/{name}" for key in keys for name in layout.VIDEO_COLUMNS]
+    tables = [_read_file(path, ["length", *names]) for path in sorted(root.glob(layout.EPISODES_FILES))]
+    if not tables:
+        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
+    return DatasetPictures(root, int(_read_info(root)["fps"]), pa.concat_tables(tables).to_pydict())
+
+
+def _episode(columns: dict[str, NDArray[Any]]) -> Episode:
+    success = columns[s.SUCCESS]
+    return Episode(int(columns[s.SEED].flat[0]), columns, bool(success.any()), bool(success[-1]))
+
+
+def _cameras(info: dict[str, Any]) -> dict[str, Any]:
+    """Cameras and their size for a spec, from LeRobot's feature table."""
+    sizes: dict[str, tuple[int, int]] = {}
+    for key, feature in info["features"].items():
+        if feature["dtype"] == "video" and key.startswith(s.IMAGES):
+            named = dict(zip(feature["names"], feature["shape"], strict=False))  # either order is about
+            sizes[key.removeprefix(s.IMAGES)] = (int(named["height"]), int(named["width"]))
+    if len(set(sizes.values())) > 1:
+        raise ManipError(f"cameras of different sizes: {sizes}; this project's datasets have one size for all")
+    return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0))}
+
+
+def _check_rows(root: Path, found: int) -> None:
+    frames = _read_info(root)["total_frames"]
+    if found != frames:
+        raise ManipError(f"{root}: {layout.INFO} counts {frames} frames, its data files {found}")
 
 
 def _read_info(root: Path) -> dict[str, Any]:
@@ -202,10 +267,15 @@ def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):  # what older versions give for no chunk at all
         array = pa.concat_arrays(array.chunks)
-    length = len(array)
-    if pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type) or pa.types.is_large_list(array.type):
-        return array.flatten().to_numpy(zero_copy_only=False).reshape(length, *shape)
-    return array.to_numpy(zero_copy_only=False)
+    length, nested = len(array), False
+    while _is_list(array.type):
+        array, nested = array.flatten(), True
+    values = array.to_numpy(zero_copy_only=False)
+    return values.reshape(length, *shape) if nested else values
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
 
 
 def _instruction(root: Path) -> str:

@@ -7,44 +7,121 @@ quantile is the value of rank ceil(q T), which LeRobot's histogram approximates,
 
 from __future__ import annotations
 
+import math
+import os
+import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES
 
 F64 = NDArray[np.float64]
+Stats = dict[str, dict[str, list[float]]]  # column -> name -> one value a dimension
+I64 = NDArray[np.int64]
+_LEVELS = np.arange(256)  # of a pixel
+_BLOCK_BYTES = 16 * 1024 * 1024  # of a dataset's numbers held at once
 
 
-def column_stats(columns: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[float]]]:
-    """Statistics {column: {min, max, mean, std, count, q01, ...: one value a dimension}} over frames.
+class RunningStats:
+    """Statistics of every episode and, in the end, of all their frames, in memory that does not grow.
 
-    columns: name -> (T,) or (T, d) numbers or booleans, all of the same T.
+    Quantiles need all numbers at once: till then they wait in a file of the folder that has no name, eight bytes each.
     """
-    flat = {key: values.reshape(len(values), -1) for key, values in columns.items()}
-    matrix = np.concatenate(list(flat.values()), axis=1, dtype=np.float64, casting="unsafe")
-    results = _matrix_stats(np.ascontiguousarray(matrix.T))
-    stats: dict[str, dict[str, list[float]]] = {}
-    start = 0
-    for key, values in flat.items():
-        stop = start + values.shape[1]
-        stats[key] = {name: results[name][start:stop].tolist() for name in STAT_NAMES if name != "count"}
-        stats[key]["count"] = [len(values)]
-        start = stop
-    return {key: {name: values[name] for name in STAT_NAMES} for key, values in stats.items()}
+
+    def __init__(self, folder: Path):
+        self._numbers = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # open until `close`
+        self._widths: dict[str, int] = {}
+        self._lengths: list[int] = []
+
+    def add(self, columns: Mapping[str, NDArray[Any]]) -> Stats:
+        """Statistics of one episode's columns, {column: {min, max, mean, std, count, q01, ...: one a dimension}}.
+
+        columns: name -> (T,) or (T, d) numbers or booleans, all of the same T; the same names and d every time.
+        """
+        flat = {key: values.reshape(len(values), -1) for key, values in columns.items()}
+        matrix = np.concatenate(list(flat.values()), axis=1, dtype=np.float64, casting="unsafe")
+        rows = np.ascontiguousarray(matrix.T)
+        self._numbers.write(rows.data)
+        self._widths = {key: values.shape[1] for key, values in flat.items()}
+        self._lengths.append(len(matrix))
+        return self._named(_row_stats(rows), len(matrix))
+
+    def result(self) -> Stats:
+        """The same of all frames so far."""
+        self._numbers.flush()
+        frames, width = sum(self._lengths), sum(self._widths.values())
+        step = max(1, _BLOCK_BYTES // (8 * frames))
+        blocks = (self._block(start, min(start + step, width), frames) for start in range(0, width, step))
+        single = [_row_stats(row[None]) for block in blocks for row in block]
+        return self._named({name: np.concatenate([stats[name] for stats in single]) for name in single[0]}, frames)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._numbers.close()
+
+    def _block(self, start: int, stop: int, frames: int) -> F64:
+        """Dimensions `start` to `stop - 1` of all frames, (stop - start, frames)."""
+        block = np.empty((stop - start, frames))
+        width, at = sum(self._widths.values()), 0
+        for length in self._lengths:
+            numbers = os.pread(self._numbers.fileno(), 8 * (stop - start) * length, 8 * (width * at + start * length))
+            block[:, at : at + length] = np.frombuffer(numbers).reshape(-1, length)
+            at += length
+        return block
+
+    def _named(self, numbers: Mapping[str, F64], count: int) -> Stats:
+        stats: Stats = {}
+        start = 0
+        for key, width in self._widths.items():
+            own = {name: values[start : start + width].tolist() for name, values in numbers.items()}
+            own["count"] = [count]
+            stats[key] = {name: own[name] for name in STAT_NAMES}
+            start += width
+        return stats
 
 
-def _matrix_stats(rows: F64) -> dict[str, F64]:
-    """Of every row of (D, T)."""
-    count = rows.shape[1]
-    ranks = {name: max(int(np.ceil(share * count)), 1) - 1 for name, share in QUANTILES.items()}
-    ordered = np.partition(rows, sorted(set(ranks.values())), axis=1)
-    return {
-        "min": rows.min(axis=1),
-        "max": rows.max(axis=1),
-        "mean": rows.mean(axis=1),
-        "std": rows.std(axis=1),
-        **{name: ordered[:, rank] for name, rank in ranks.items()},
-    }
+def pixel_counts(frames: NDArray[np.uint8]) -> I64:
+    """How often every channel has every level, (3, 256), in frames (T, height, width, 3).
+
+    Those of several episodes add up to those of all of them.
+    """
+    counts = np.zeros(3 * 256, dtype=np.int64)
+    for frame in frames:
+        counts += Image.fromarray(frame).histogram()
+    return counts.reshape(3, 256)
+
+
+def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
+    """Statistics of pictures from their `pixel_counts`: levels in [0, 1], one a channel as (3, 1, 1)."""
+    total = int(counts[0].sum())
+    stats: dict[str, list[float]] = {name: [] for name in STAT_NAMES if name != "count"}
+    for channel in counts:
+        levels = np.flatnonzero(channel)
+        first, second = int(channel @ _LEVELS), int(channel @ _LEVELS**2)  # Python's integers: nothing is rounded
+        stats["min"].append(int(levels[0]))
+        stats["max"].append(int(levels[-1]))
+        stats["mean"].append(first / total)
+        stats["std"].append(math.sqrt(total * second - first**2) / total)
+        for name, rank in _ranks(total).items():
+            stats[name].append(int(np.searchsorted(channel.cumsum(), rank + 1)))
+    shaped: dict[str, list[Any]] = {name: [[[value / 255]] for value in values] for name, values in stats.items()}
+    shaped["count"] = [frames]
+    return {name: shaped[name] for name in STAT_NAMES}
+
+
+def _row_stats(rows: F64) -> dict[str, F64]:
+    """Of every row of (D, T), which are sorted in part afterwards."""
+    moments = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
+    ranks = _ranks(rows.shape[1])
+    rows.partition(sorted(set(ranks.values())), axis=1)
+    return {**moments, **{name: rows[:, rank].copy() for name, rank in ranks.items()}}
+
+
+def _ranks(count: int) -> dict[str, int]:
+    """Where in a sorted row of `count` values each quantile stands."""
+    return {name: max(int(np.ceil(share * count)), 1) - 1 for name, share in QUANTILES.items()}

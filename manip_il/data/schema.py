@@ -56,7 +56,8 @@ class RobotTaskSpec:
         needed = {field.name for field in fields(cls) if field.default is MISSING}
         if odd := sorted((needed - set(data)) | (set(data) - known)):
             raise ManipError(f"a robot-task spec with wrong keys: {', '.join(odd)} missing or unknown")
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+        values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
+        return cls(**values)
 
     @property
     def image_keys(self) -> dict[str, str]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict
 from functools import cache
 from typing import Any
 
-from manip_il.data.fingerprint import environment_fingerprint
+from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig
 from manip_il.sim.observe import environment_state_names
 from manip_il.sim.scene import build_scene
 
@@ -16,7 +18,7 @@ _STATE_EXTRAS = 6  # goal, step, streak, ever: what State.to_vector adds to the 
 
 
 @cache
-def env_spec(config: EnvConfig) -> RobotTaskSpec:
+def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
     """Names, sizes and rate that a dataset or policy for this environment must share."""
     scene = build_scene(config.robot, config.task)
     return RobotTaskSpec(
@@ -27,12 +29,15 @@ def env_spec(config: EnvConfig) -> RobotTaskSpec:
         environment_state_names=environment_state_names(scene.task),
         sim_state_size=scene.state_size + _STATE_EXTRAS,
         instruction=scene.task.instruction,
+        cameras=cameras.names if cameras else (),
+        image_size=(cameras.height, cameras.width) if cameras else (0, 0),
     )
 
 
-def env_fingerprint(config: EnvConfig) -> dict[str, Any]:
-    """Versions, and hashes of the compiled model and of the environment's settings."""
-    return dict(_fingerprint(config))
+def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
+    """Versions, and hashes of the compiled model and of the environment's settings; with cameras, of theirs too."""
+    look = {"cameras_sha256": hashlib.sha256(canonical_json(cameras).encode()).hexdigest()} if cameras else {}
+    return {**_fingerprint(config), **look}
 
 
 @cache

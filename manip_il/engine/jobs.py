@@ -16,6 +16,7 @@ from manip_il.mdp import Episode
 from manip_il.rollout import Driver, Environment, Intruder, Rules, rollout
 from manip_il.sim.disturb import Disturbance, Disturber
 from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.look import CameraConfig
 from manip_il.sim.scene import build_scene
 
 LOCKSTEP = 25  # environments that share one call of the policy
@@ -27,6 +28,7 @@ class RolloutJob:
 
     policy: a checkpoint's `pretrained_model` folder, needed where a learner drives. beta: the share of steps
     that the expert drives (`mixture`). hold: end an episode this many steps after success; None: at the horizon.
+    cameras: what is pictured in every step; None for nothing.
     """
 
     env: EnvConfig
@@ -37,6 +39,7 @@ class RolloutJob:
     labels: Literal["all", "last"] = "all"
     disturbance: Disturbance = field(default_factory=Disturbance)
     round: int = 0
+    cameras: CameraConfig | None = None
 
     def __post_init__(self) -> None:
         if self.driver in ("policy", "mixture") and self.policy is None:
@@ -45,7 +48,7 @@ class RolloutJob:
 
 def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     """Yield one episode a seed, in the order in which they end."""
-    envs = [ManipEnv(config=job.env) for _ in range(min(LOCKSTEP, len(seeds)))]
+    envs = [_environment(job) for _ in range(min(LOCKSTEP, len(seeds)))]
     if not envs:
         return
     rules = Rules(job.env.horizon, job.hold, "all" if job.driver in ("expert", "mixture") else job.labels)
@@ -53,6 +56,13 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         envs, seeds, _driver(job, envs[0]), rules, _expert(job.env.robot, job.env.task), _intrude(job.disturbance)
     )
     yield from group_episodes(transitions, job.round, job.beta)
+
+
+def _environment(job: RolloutJob) -> ManipEnv:
+    if job.cameras is None:
+        return ManipEnv(config=job.env)
+    size, look = (job.cameras.height, job.cameras.width), job.cameras.look
+    return ManipEnv(config=job.env, cameras=job.cameras.names, image_size=size, look=look)
 
 
 @cache

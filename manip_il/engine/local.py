@@ -1,96 +1,121 @@
-"""Where episodes run: in this process or in local ones. Either way the same episodes, bit for bit."""
+"""Processes on this machine, one task at a time each; one that dies is replaced."""
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from types import TracebackType
+from collections.abc import Iterator
+from multiprocessing.connection import Connection, wait
 
-from manip_il.engine.jobs import LOCKSTEP, RolloutJob, run_job
-from manip_il.errors import ManipError, UsageError
+from manip_il.engine.engine import Event, Task, portable, run_task
 from manip_il.mdp import Episode
 
-Keep = Callable[[Episode], object]
+_CONTEXT = multiprocessing.get_context("spawn")  # a forked child would share OpenGL and threads
+_PATIENCE = 10.0  # for a worker that was told to stop [s]
 
 
-class Engine:
-    """Runs rollout jobs with `workers` processes (1: in this one); use as a context manager.
+class LocalProcesses:
+    """Up to `workers` processes, started as tasks come."""
 
-    The processes live as long as the engine, so that a command pays for their start once.
-    """
-
-    def __init__(self, workers: int = 1):
-        if workers < 1:
-            raise UsageError(f"workers is {workers}; expected at least 1")
+    def __init__(self, workers: int):
         self.workers = workers
-        self._pool: ProcessPoolExecutor | None = None
+        self._idle: list[_Worker] = []
+        self._busy: dict[Connection, _Worker] = {}
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
-        """Yield one episode a seed as they end, in no fixed order. Raises `ManipError` where a worker dies.
+    def has_room(self) -> bool:
+        """Whether a worker is free or may be started."""
+        return len(self._busy) < self.workers
 
-        keep: called in the process that ran an episode, the moment it ends (to write it to disk, say); must pickle.
-        """
-        if self.workers == 1 or len(seeds) == 1:
-            yield from _run(job, seeds, keep)
-            return
-        pool = self._start()
-        waiting: set[Future[list[Episode]]] = set()
+    def submit(self, task: Task) -> None:
+        """Hand a task to a worker."""
+        worker = self._idle.pop() if self._idle else _Worker()
+        self._busy[worker.connection] = worker
+        worker.start(task)
+
+    def wait(self) -> list[Event]:
+        """One event of every worker that has something to say."""
+        events: list[Event] = []
+        for ready in wait(list(self._busy)):
+            assert isinstance(ready, Connection)
+            event = self._busy[ready].receive()
+            events.append(event)
+            if event.kind != "episode":
+                worker = self._busy.pop(ready)
+                if event.kind != "died":
+                    self._idle.append(worker)
+        return events
+
+    def close(self, in_order: bool) -> None:
+        """End all workers."""
+        workers = [*self._idle, *self._busy.values()]
+        for worker in workers:
+            worker.stop(in_order)
+        for worker in workers:
+            worker.join()
+        self._idle.clear()
+        self._busy.clear()
+
+
+class _Worker:
+    def __init__(self) -> None:
+        self.connection, theirs = _CONTEXT.Pipe()
+        self._process = _CONTEXT.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()  # so that the pipe ends when the worker does
+        self._task: Task | None = None
+
+    def start(self, task: Task) -> None:
+        self._task = task
+        with contextlib.suppress(OSError):  # a worker that died meanwhile is found by `receive`
+            self.connection.send_bytes(pickle.dumps(task))
+
+    def receive(self) -> Event:
+        assert self._task is not None
         try:
-            for chunk in _chunks(seeds, self.workers):
-                waiting.add(pool.submit(_run_chunk, job, chunk, keep))
-            while waiting:
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield from future.result()
-        except BrokenExecutor as error:
-            raise ManipError("a rollout worker died (out of memory?); finished episodes are kept") from error
-        finally:
-            for future in waiting:
-                future.cancel()
+            kind, episode, error = self.connection.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            self.connection.close()
+            return Event(self._task, "died", error=RuntimeError(_cause(self._process.exitcode)))
+        return Event(self._task, kind, episode, error=error)
 
-    def __enter__(self) -> Engine:
-        return self
+    def stop(self, in_order: bool) -> None:
+        if not in_order:
+            self._process.kill()
+        self.connection.close()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=kind is None, cancel_futures=True)
-            self._pool = None
-
-    def _start(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.workers, mp_context=context, initializer=_quiet)
-        return self._pool
+    def join(self) -> None:
+        self._process.join(_PATIENCE)
+        self._process.kill()
+        self._process.join()
 
 
-def default_workers() -> int:
-    """As many as this process may use cores."""
-    return len(os.sched_getaffinity(0))
+def _serve(connection: Connection) -> None:
+    """A worker's life: tasks in, episodes out, until the other end goes away."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
+    os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which is imported later; one core each
+    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
+        while True:
+            for message in _answer(connection.recv_bytes()):
+                connection.send(message)
 
 
-def _chunks(seeds: Sequence[int], workers: int) -> list[Sequence[int]]:
-    """Pieces of about one lockstep batch, smaller where that leaves a worker idle."""
-    size = max(1, min(LOCKSTEP, -(-len(seeds) // workers)))
-    return [seeds[i : i + size] for i in range(0, len(seeds), size)]
+def _answer(pickled: bytes) -> Iterator[tuple[str, Episode | None, Exception | None]]:
+    try:
+        task: Task = pickle.loads(pickled)  # from the process that started this one
+        for episode, packed in run_task(task):
+            if task.keep is not None:
+                task.keep.store(episode.seed, packed)
+            yield "episode", episode, None
+        yield "done", None, None
+    except Exception as error:
+        yield "failed", None, portable(error)
 
 
-def _run(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[Episode]:
-    for episode in run_job(job, seeds):
-        if keep is not None:
-            keep(episode)
-        yield episode
-
-
-def _run_chunk(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> list[Episode]:
-    return list(_run(job, seeds, keep))
-
-
-def _quiet() -> None:
-    """Workers leave Ctrl-C to the process that started them, and one core each to its neighbours."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which a worker imports later
+def _cause(exit_code: int | None) -> str:
+    if exit_code is not None and exit_code < 0:
+        return f"killed by {signal.Signals(-exit_code).name}; out of memory?"
+    return f"exit code {exit_code}"

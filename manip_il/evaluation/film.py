@@ -19,10 +19,12 @@ import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.render import render_states
 from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Paths
-from manip_il.mdp import Episode, State
-from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.mdp import Episode
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import FILM, CameraConfig
 
 AFTER_SUCCESS = 1.0  # what a film shows once the task is solved [s]
 Frames = Sequence[NDArray[np.uint8]]
@@ -45,11 +47,7 @@ def film(
     Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
     """
     states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz) : every]
-    env = ManipEnv(config=env_config, cameras=(camera,), image_size=size)
-    try:
-        return [_picture(env, State.from_vector(row), camera) for row in states]
-    finally:
-        env.close()  # one OpenGL context alive at a time
+    return list(render_states(env_config, CameraConfig((camera,), *size, FILM), states)[schema.IMAGES + camera])
 
 
 def shown_steps(episode: Episode, fps: int) -> int:
@@ -105,8 +103,3 @@ def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "")
     hand = positions("ee")
     obj = positions("object") if "object.x" in names else hand
     return Paths(policy, hand, obj, positions("goal")[-1], 1 / spec.fps, caption)
-
-
-def _picture(env: ManipEnv, state: State, camera: str) -> NDArray[np.uint8]:
-    env.set_state(state)
-    return env.observe().images[camera]

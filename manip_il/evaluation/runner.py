@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from manip_il.data import schema
 from manip_il.engine.describe import env_fingerprint
+from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.local import Engine
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.mdp import Episode, Phase
 from manip_il.sim.disturb import Disturbance
+
+_LOG = logging.getLogger(__name__)
 
 
 def evaluate(
@@ -24,19 +27,22 @@ def evaluate(
 ) -> EvalResult:
     """Run `job` to the horizon on every seed; the result's episodes are in the order of `seeds`.
 
-    on_episode: sees every episode with its states as it ends, to film it, say.
+    A seed that kills its worker again and again is left out, and a warning names it. on_episode: sees every episode
+    with its states as it ends, to film it, say.
     """
     results: dict[int, EpisodeResult] = {}
     for episode in engine.run(job, seeds):
         results[episode.seed] = episode_result(episode)
         if on_episode is not None:
             on_episode(episode)
+    if lost := [seed for seed in seeds if seed not in results]:
+        _LOG.warning("left out of the evaluation, as each killed its worker again and again: seeds %s", lost)
     return EvalResult(
         policy=name,
         robot=job.env.robot,
         task=job.env.task,
         fingerprint=env_fingerprint(job.env),
-        episodes=tuple(results[seed] for seed in seeds),
+        episodes=tuple(results[seed] for seed in seeds if seed in results),
         settings=EvalSettings(job.env.horizon, job.env.tolerance, describe_disturbance(job.disturbance)),
     )
 

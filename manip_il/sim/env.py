@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import MismatchError, NotFiniteError, UnknownName, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
+from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.observe import environment_state, environment_state_names
-from manip_il.sim.render import Renderer
-from manip_il.sim.scene import CAMERAS, DT_SIM, STATE_KIND, build_scene
+from manip_il.sim.render import Picture, pictures
+from manip_il.sim.scene import DT_SIM, STATE_KIND, build_scene
 from manip_il.sim.task import CUBE_HALF_SIZE, draw_start
 
 F64 = NDArray[np.float64]
@@ -52,7 +53,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
     `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
-    "solved once" and "solved at the end" can both be told. Raises `UnknownName` for a robot, task or camera.
+    "solved once" and "solved at the end" can both be told. Raises `UnknownName` for a robot, task or camera,
+    `UsageError` for a size of pictures that `CameraConfig` refuses.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -65,12 +67,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         config: EnvConfig | None = None,
         cameras: tuple[str, ...] = (),
         image_size: tuple[int, int] = (128, 128),
+        look: Look | None = None,
         render_mode: str | None = None,
         **settings: Any,
     ):
-        for camera in cameras:
-            if camera not in CAMERAS:
-                raise UnknownName("camera", camera, CAMERAS)
+        self.look = look or Look()
+        self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
         self.scene = build_scene(self.config.robot, self.config.task)
         self.data = mujoco.MjData(self.scene.model)
@@ -83,7 +85,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._goal = np.zeros(3)
         self._step = self._streak = 0
         self._ever = False
-        self._renderer: Renderer | None = None
         self.action_space = self._action_space()
         self.observation_space = self._observation_space()
 
@@ -170,25 +171,17 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         scene, data = self.scene, self.data
         opening = data.qpos[scene.finger_q].sum()
         state = np.append(data.qpos[scene.arm_q], opening).astype(np.float32)
-        images = {camera: self._picture(camera, self.image_size) for camera in self.cameras}
+        images = self._pictures(self._view) if self._view else {}
         return Observation(state, environment_state(scene, data, self._goal), images)
 
-    def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture from the front camera, uint8 (480, 640, 3)."""
-        return self._picture("front", (480, 640)) if self.render_mode == "rgb_array" else None
+        if self.render_mode != "rgb_array":
+            return None
+        return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
-    def close(self) -> None:
-        """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _picture(self, camera: str, size: tuple[int, int]) -> NDArray[np.uint8]:
-        mujoco.mj_camlight(self.scene.model, self.data)  # cameras that ride on the hand
-        if self._renderer is None or self._renderer.size != size:
-            self.close()
-            self._renderer = Renderer(self.scene, *size)
-        return self._renderer.picture(self.data, camera)
+    def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
+        return pictures(self.config.robot, self.config.task, self.data, cameras)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

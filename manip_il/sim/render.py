@@ -1,44 +1,137 @@
-"""Off-screen pictures of a simulator state."""
+"""Off-screen pictures of a simulator state: one OpenGL context a process, whatever its number of environments."""
 
 from __future__ import annotations
+
+import atexit
+import os
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import RenderError, UnknownName
+from manip_il.errors import RenderError
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.scene import CAMERAS, Scene
+from manip_il.sim.look import CameraConfig, Look
+from manip_il.sim.scene import build_scene
+from manip_il.sim.view import view_model
+
+Picture = NDArray[np.uint8]
+_FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
+_MAX_GEOMS = 1_000
 
 
-class Renderer:
-    """One OpenGL context for one scene; use as a context manager, one alive at a time a process.
+def pictures(robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig) -> dict[str, Picture]:
+    """What every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    Raises `RenderError`, naming Debian's packages, where neither EGL nor OSMesa works.
+    A picture depends on `qpos` and the goal alone: whoever asks, in whatever order, gets the same bytes.
+    Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
+    renderer = _process.renderer(robot, task, cameras.look)
+    renderer.pose(data)
+    return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
-    def __init__(self, scene: Scene, height: int = 240, width: int = 320):
-        self.size = (height, width)
+
+def close() -> None:
+    """Free this process's OpenGL context; the next picture makes another."""
+    _process.close()
+
+
+class _Renderer:
+    """Draws one scene in one look, in pictures of any size. Needs a current OpenGL context."""
+
+    def __init__(self, robot: str, task: str, look: Look):
+        self._model = view_model(robot, task, look)
+        self._data = mujoco.MjData(self._model)
+        self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._cameras = {self._model.camera(i).name: i for i in range(self._model.ncam)}
+        self._context: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
+            raise RuntimeError("it has no off-screen buffers")
+
+    def pose(self, data: mujoco.MjData) -> None:
+        """Put everything where `data` has it."""
+        self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+
+    def picture(self, camera: str, size: tuple[int, int]) -> Picture:
+        height, width = (_FINER * side for side in size)
+        self._make_room(height, width)
+        self._camera.fixedcamid = self._cameras[camera]
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, everything, self._scene)
+        fine = np.empty((height, width, 3), dtype=np.uint8)
+        view = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(view, self._scene, self._context)
+        mujoco.mjr_readPixels(fine, None, view, self._context)
+        return _coarser(fine[::-1])  # OpenGL counts rows from below
+
+    def close(self) -> None:
+        self._context.free()
+
+    def _make_room(self, height: int, width: int) -> None:
+        """Pictures of all sizes share one buffer, which only grows: they may alternate at no cost."""
+        have_height, have_width = self._context.offHeight, self._context.offWidth
+        if height > have_height or width > have_width:
+            mujoco.mjr_resizeOffscreen(max(width, have_width), max(height, have_height), self._context)
+
+
+class _Process:
+    """This process's OpenGL context and the renderer that was asked for last."""
+
+    def __init__(self) -> None:
+        self._gl: Any = None
+        self._pid = 0  # of the process that made the context
+        self._key: tuple[str, str, Look] | None = None
+        self._renderer: _Renderer | None = None
+
+    def renderer(self, robot: str, task: str, look: Look) -> _Renderer:
+        key = (robot, task, look)
+        build_scene(robot, task)  # first: an unknown name is no fault of OpenGL's
+        if self._gl is not None and self._pid != os.getpid():
+            raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
         try:
-            self._renderer = mujoco.Renderer(scene.model, height=height, width=width)
+            self._make_current()
+            if self._renderer is None or self._key != key:
+                self._close_renderer()
+                self._renderer, self._key = _Renderer(*key), key
         except Exception as error:  # mujoco raises many kinds, from ImportError to its own
             raise RenderError(
                 f"no off-screen OpenGL ({type(error).__name__}: {error}); on Debian: apt-get install -y {PACKAGES}"
             ) from error
-
-    def picture(self, data: mujoco.MjData, camera: str) -> NDArray[np.uint8]:
-        """An RGB picture, uint8 (height, width, 3). Raises `UnknownName` for the camera."""
-        if camera not in CAMERAS:
-            raise UnknownName("camera", camera, CAMERAS)
-        self._renderer.update_scene(data, camera=camera)
-        return self._renderer.render()
+        return self._renderer
 
     def close(self) -> None:
-        """Free the OpenGL context."""
-        self._renderer.close()
+        if self._gl is None or self._pid != os.getpid():  # a forked child has nothing to free
+            return
+        self._make_current()
+        self._close_renderer()
+        self._gl.free()
+        self._gl = None
 
-    def __enter__(self) -> Renderer:
-        return self
+    def _make_current(self) -> None:
+        if self._gl is None:
+            from mujoco.gl_context import GLContext  # where there is no OpenGL, not even this can be imported
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+            self._gl = GLContext(1, 1)  # its size does not matter, pictures have a buffer of their own
+            self._pid = os.getpid()
+            atexit.register(self.close)
+        self._gl.make_current()
+
+    def _close_renderer(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+_process = _Process()
+
+
+def _coarser(fine: NDArray[np.uint8]) -> Picture:
+    """Means of blocks of 2 x 2 pixels, rounded."""
+    sums = np.add(fine[::2], fine[1::2], dtype=np.uint16)
+    return ((sums[:, ::2] + sums[:, 1::2] + 2) // 4).astype(np.uint8)

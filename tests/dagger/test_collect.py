@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from manip_il.dagger.collect import build_dataset, check_journals, collect, collect_successes
+from manip_il.dagger.collect import check_journals, collect, collect_successes, record
+from manip_il.data.build import Recording, build
 from manip_il.data.journal import list_episodes, read_episode, read_header
 from manip_il.data.lerobot_io import read_table
+from manip_il.engine.engine import Engine, Keep
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.local import Engine, Keep
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig
 
 JOB = RolloutJob(EnvConfig("fetch", "reach", horizon=30), "expert", hold=1)
 SEEDS = range(1_000_000, 1_000_012)
@@ -36,7 +39,7 @@ class Recorded(Engine):
                 lost = episode.columns | {"next.success": np.zeros_like(episode.columns["next.success"])}
                 episode = Episode(episode.seed, lost, False, False)
             if keep is not None:
-                keep(episode)
+                keep.store(episode.seed, keep.pack(episode))
             yield episode
 
 
@@ -46,7 +49,8 @@ def names(folder: Path) -> list[int]:
 
 def test_every_seed_becomes_a_file_that_holds_its_episode(tmp_path):
     seen: list[Episode] = []
-    collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append)
+    paths = list(collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append))
+    assert paths == list_episodes(tmp_path)
     assert names(tmp_path) == list(SEEDS[:3])
     by_seed = {episode.seed: episode for episode in seen}
     for path in list_episodes(tmp_path):
@@ -56,9 +60,9 @@ def test_every_seed_becomes_a_file_that_holds_its_episode(tmp_path):
 
 
 def test_what_is_there_is_not_run_again(tmp_path):
-    collect(Recorded(), JOB, SEEDS[:2], tmp_path)
+    list(collect(Recorded(), JOB, SEEDS[:2], tmp_path))
     engine = Recorded()
-    collect(engine, JOB, SEEDS[:4], tmp_path)
+    assert len(list(collect(engine, JOB, SEEDS[:4], tmp_path))) == 4
     assert engine.asked == list(SEEDS[2:4])
 
 
@@ -68,46 +72,82 @@ def test_an_episode_is_on_disk_before_anybody_hears_of_it(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(Recorded(), JOB, SEEDS[:3], tmp_path, stop)
+        list(collect(Recorded(), JOB, SEEDS[:3], tmp_path, stop))
     assert len(names(tmp_path)) == 1
 
 
 def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
     failing = [SEEDS[0], SEEDS[2], SEEDS[4]]
-    good = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
-    assert [read_header(path).seed for path in good] == [SEEDS[1], SEEDS[3], SEEDS[5], SEEDS[6]]
+    paths = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
+    assert [read_header(path).seed for path in paths] == list(SEEDS[:7])
 
 
 def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_path):
     failing = [SEEDS[1]]
-    first = collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "a")
-    collect(Recorded(failing), JOB, SEEDS[2:8], tmp_path / "b")
-    second = collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "b")
+    first = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "a"))
+    list(collect(Recorded(failing), JOB, SEEDS[2:8], tmp_path / "b"))
+    second = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "b"))
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
     with pytest.raises(ManipError, match="only 0 of 9 demonstrations succeeded; 3 were asked for"):
-        collect_successes(Recorded(SEEDS), JOB, SEEDS[:9], 3, tmp_path)
+        list(collect_successes(Recorded(SEEDS), JOB, SEEDS[:9], 3, tmp_path))
+
+
+class Shuffled(Recorded):
+    """Episodes end in another order than their seeds'; the seed that kills its worker never ends."""
+
+    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
+        yield from super().run(job, [seed for seed in reversed(seeds) if seed != SEEDS[2]], keep)
+
+
+def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_path, caplog):
+    paths = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
+    assert [read_header(path).seed for path in paths] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"seed {SEEDS[2]} is left out: it killed its worker again and again"
+    ]
 
 
 def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert check_journals(tmp_path, JOB) == []
-    collect(Recorded(), JOB, SEEDS[:1], tmp_path)
+    list(collect(Recorded(), JOB, SEEDS[:1], tmp_path))
     assert check_journals(tmp_path, JOB) == []
     with pytest.raises(MismatchError, match=r"robot.*fetch.*panda"):
         check_journals(tmp_path, RolloutJob(EnvConfig("panda", "reach"), "expert"))
+    with pytest.raises(MismatchError, match=r"cameras.*\(\).*front"):
+        check_journals(tmp_path, replace(JOB, cameras=CameraConfig(("front",))))
     warnings = check_journals(tmp_path, RolloutJob(EnvConfig("fetch", "reach", tolerance=0.05), "expert"))
     assert len(warnings) == 1
 
 
-@pytest.mark.slow  # imports LeRobot
-def test_a_dataset_holds_its_journals_in_the_order_given(tmp_path):
-    collect(Recorded(), JOB, SEEDS[:3], tmp_path / "journals")
-    paths = list_episodes(tmp_path / "journals")[::-1]
-    build_dataset(paths, tmp_path / "dataset", JOB, "local/x", {})
-    table = read_table(tmp_path / "dataset", ("seed", "executed_action"))
-    expected = [read_episode(path) for path in paths]
-    np.testing.assert_array_equal(table["seed"].ravel(), np.repeat(SEEDS[2::-1], list(map(len, expected))))
-    executed = np.concatenate([episode.columns["executed_action"] for episode in expected])
-    np.testing.assert_array_equal(table["executed_action"], executed)
+def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path):
+    whole = [path.read_bytes() for path in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
+    damaged = list_episodes(tmp_path)[1]
+    damaged.write_bytes(whole[1][:5000])
+    warnings = check_journals(tmp_path, JOB)
+    assert len(warnings) == 1
+    assert damaged.name in warnings[0]
+    assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
+    engine = Recorded()
+    assert [path.read_bytes() for path in collect(engine, JOB, SEEDS[:3], tmp_path)] == whole
+    assert engine.asked == [SEEDS[1]]
+
+
+def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
+    failing = [SEEDS[1]]
+    journals = tmp_path / "journals"
+    recording = Recording("local/x", only_successes=True, episodes=3, provenance={"driver": "expert"})
+    episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, journals)
+    info, failed = record(episodes, journals, tmp_path / "dataset", JOB, recording)
+    assert (info.episodes, failed) == (3, 1)
+    seeds = read_table(tmp_path / "dataset", ["seed"])["seed"]
+    assert sorted(set(seeds.tolist())) == [SEEDS[0], SEEDS[2], SEEDS[3]]
+    result = build(journals, tmp_path / "again")
+    assert (result.info.episodes, result.failed, result.damaged) == (3, 1, ())
+    assert tree(tmp_path / "again") == tree(tmp_path / "dataset")
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}

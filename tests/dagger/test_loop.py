@@ -13,7 +13,7 @@ from manip_il.dagger import loop
 from manip_il.dagger.config import DaggerConfig, FitConfig
 from manip_il.dagger.loop import RoundResult, Watch, aggregate, best_round, round_folder, run_dagger
 from manip_il.data.lerobot_io import dataset_info, read_table
-from manip_il.engine.local import Engine
+from manip_il.engine.engine import Engine
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds

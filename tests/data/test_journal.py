@@ -19,10 +19,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
 from manip_il.data import schema as s
-from manip_il.data.foxglove import JOINT_STATES
+from manip_il.data.foxglove import SCALARS
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -133,9 +134,12 @@ def test_a_column_of_objects_is_refused(tmp_path: Path, spec: s.RobotTaskSpec) -
 
 
 def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Topic -> log times and decoded messages."""
     found: dict[str, list[tuple[int, Any]]] = {}
-    for _, channel, message in make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True).iter_messages():
-        found.setdefault(channel.topic, []).append((message.log_time, json.loads(message.data)))
+    reader = make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True, decoder_factories=[DecoderFactory()])
+    for schema, channel, message in reader.iter_messages():
+        decoder = DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads
+        found.setdefault(channel.topic, []).append((message.log_time, decoder(message.data)))
     return found
 
 
@@ -150,17 +154,19 @@ def test_foxglove_sees_joints_frames_and_scalars(
     assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars", "/tf"]
     assert [time for time, _ in topics["/tf"]] == [0, 50_000_000, 100_000_000]
     _, last = topics["/joint_states"][2]
-    assert last["timestamp"] == {"sec": 0, "nsec": 100_000_000}
-    assert [joint["name"] for joint in last["joints"]] == list(spec.joint_names)
-    positions = [joint["position"] for joint in last["joints"]]
-    np.testing.assert_allclose(positions, episode.columns[s.STATE][2], atol=1e-6)
-    hand, cube = topics["/tf"][0][1]["transforms"]
-    assert (hand["parent_frame_id"], hand["child_frame_id"], cube["child_frame_id"]) == ("world", "ee", "object")
+    assert last.timestamp.ToNanoseconds() == 100_000_000
+    assert [joint.name for joint in last.joints] == list(spec.joint_names)
+    assert [joint.position for joint in last.joints] == episode.columns[s.STATE][2].tolist()
+    hand, cube = topics["/tf"][0][1].transforms
+    assert (hand.parent_frame_id, hand.child_frame_id, cube.child_frame_id) == ("world", "ee", "object")
+    place = [hand.translation.x, hand.translation.y, hand.translation.z]
+    assert place == episode.columns[s.ENVIRONMENT_STATE][0, :3].tolist()
     half = np.sqrt(0.5)
-    np.testing.assert_allclose([hand["rotation"][axis] for axis in "wxyz"], [half, 0, -half, 0], atol=1e-6)
-    np.testing.assert_allclose(cube["rotation"]["z"], np.sin(0.05), atol=1e-6)
+    np.testing.assert_allclose([getattr(hand.rotation, axis) for axis in "wxyz"], [half, 0, -half, 0], atol=1e-6)
+    np.testing.assert_allclose(cube.rotation.z, np.sin(0.05), atol=1e-6)
     scalars = {scalar["label"]: scalar["value"] for scalar in topics["/scalars"][2][1]["scalars"]}
-    assert scalars[s.SUCCESS] == 1.0
+    assert scalars[s.SUCCESS] == 1
+    assert scalars[s.REWARD] == episode.columns[s.REWARD][2].item()
     assert scalars[s.EXPERT_PHASE] == episode.columns[s.EXPERT_PHASE][2]
 
 
@@ -168,10 +174,16 @@ def test_channels_carry_foxgloves_schemas(path: Path) -> None:
     summary = make_reader(io.BytesIO(path.read_bytes())).get_summary()
     assert summary is not None
     schemas = {schema.name: schema for schema in summary.schemas.values()}
-    assert sorted(schemas) == ["foxglove.FrameTransforms", "foxglove.JointStates", "lerobot.Scalars"]
-    assert json.loads(schemas["foxglove.JointStates"].data) == JOINT_STATES
-    assert {schema.encoding for schema in schemas.values()} == {"jsonschema"}
-    assert {channel.message_encoding for channel in summary.channels.values()} == {"json"}
+    encodings = {name: schema.encoding for name, schema in schemas.items()}
+    assert encodings == {
+        "foxglove.FrameTransforms": "protobuf",
+        "foxglove.JointStates": "protobuf",
+        "lerobot.Scalars": "jsonschema",
+    }
+    assert json.loads(schemas["lerobot.Scalars"].data) == SCALARS
+    encodings = {channel.topic: channel.message_encoding for channel in summary.channels.values()}
+    assert encodings.pop("/scalars") == "json"
+    assert set(encodings.values()) == {"protobuf"}
 
 
 _RECORDER = """

@@ -17,11 +17,13 @@ import numpy as np
 import pytest
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data import lerobot_stats
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
 from manip_il.data.lerobot_io import (
     dataset_info,
     merge_datasets,
+    new_dataset,
     read_episodes,
     read_fingerprint,
     read_provenance,
@@ -115,6 +117,56 @@ def test_the_same_episodes_give_the_same_bytes(
     again = tmp_path / "elsewhere" / "again"
     write_dataset(iter(episodes), again, spec, provenance={"recorded": 3, "failed": 1}, **OPTIONS)
     assert digests(again) == digests(root)
+
+
+def test_episodes_may_come_one_by_one_and_nothing_is_there_before_the_last(
+    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
+) -> None:
+    again = tmp_path / "again"
+    with new_dataset(again, spec, **OPTIONS) as writer:
+        for episode in episodes:
+            writer.add(episode)
+            assert not again.exists()
+        info = writer.finish({"recorded": 3, "failed": 1})
+        assert not again.exists()
+        with pytest.raises(ManipError, match="is finished"):
+            writer.add(episodes[0])
+    assert info == dataset_info(again)
+    assert digests(again) == digests(root)
+
+
+@pytest.mark.parametrize(("end", "error"), [(None, ManipError), (KeyboardInterrupt(), KeyboardInterrupt)])
+def test_a_writer_that_was_not_finished_leaves_nothing(
+    tmp_path: Path,
+    episodes: list[Episode],
+    spec: s.RobotTaskSpec,
+    end: BaseException | None,
+    error: type[BaseException],
+) -> None:
+    def leave_early() -> None:
+        with new_dataset(tmp_path / "lift", spec, **OPTIONS) as writer:
+            writer.add(episodes[0])
+            if end is not None:
+                raise end
+
+    with pytest.raises(error, match="was not finished" if end is None else None):
+        leave_early()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_statistics_do_not_depend_on_how_much_memory_they_may_use(
+    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lerobot_stats, "_BLOCK_BYTES", 1)
+    write_dataset(episodes, tmp_path / "frugal", spec, **OPTIONS)
+    assert (tmp_path / "frugal" / layout.STATS).read_bytes() == (root / layout.STATS).read_bytes()
+    table = read_table(root)
+    for key, stats in json.loads((root / layout.STATS).read_text()).items():
+        values = table[key].astype(np.float64)
+        assert stats["count"] == [20]
+        np.testing.assert_allclose(stats["std"], np.atleast_1d(values.std(axis=0)), rtol=1e-12, atol=1e-12)
+        expected = np.quantile(values, 0.9, axis=0, method="inverted_cdf")
+        np.testing.assert_array_equal(stats["q90"], np.atleast_1d(expected))
 
 
 def test_a_merge_equals_writing_all_episodes(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> None:

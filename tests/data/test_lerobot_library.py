@@ -12,7 +12,13 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import dataset_info, read_episodes, read_spec, read_table, write_dataset
+from manip_il.data.lerobot_io import (
+    dataset_info,
+    read_episodes,
+    read_spec,
+    read_table,
+    write_dataset,
+)
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -70,6 +76,7 @@ def test_the_layout_is_the_librarys(spec: s.RobotTaskSpec) -> None:
     assert layout.CHUNKS_SIZE == utils.DEFAULT_CHUNK_SIZE
     assert layout.DATA_FILES_SIZE_IN_MB == utils.DEFAULT_DATA_FILE_SIZE_IN_MB
     assert layout.VIDEO_FILES_SIZE_IN_MB == utils.DEFAULT_VIDEO_FILE_SIZE_IN_MB
+    assert layout.VIDEO_PATH == utils.DEFAULT_VIDEO_PATH
     assert layout.all_features(spec) == s.features(spec) | DEFAULT_FEATURES
     hugging_face = json.loads(layout.data_schema(spec).metadata[b"huggingface"])["info"]["features"]
     assert hugging_face == get_hf_features_from_features(layout.all_features(spec)).to_dict()

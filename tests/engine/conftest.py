@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ from manip_il.engine.describe import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
+
+sys.path.insert(0, str(Path(__file__).parent))  # where workers find `kept`
 
 
 @pytest.fixture(scope="session")

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from manip_il.data.journal import list_episodes, read_episode, write_episode
 from manip_il.data.schema import fitted_columns
-from manip_il.engine import local
 from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.engine import Engine, default_workers
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.local import Engine, default_workers
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.disturb import STANDARD, Disturbance
@@ -115,14 +110,6 @@ def test_an_engine_wants_a_worker():
     assert default_workers() >= 1
 
 
-@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (60, 2), (200, 3)])
-def test_every_seed_is_in_one_chunk_and_no_worker_idles(seeds: int, workers: int):
-    chunks = local._chunks(range(seeds), workers)
-    assert [seed for chunk in chunks for seed in chunk] == list(range(seeds))
-    assert len(chunks) >= min(seeds, workers)
-    assert max(map(len, chunks)) <= 25
-
-
 @pytest.fixture(scope="module")
 def two_processes() -> Iterator[Engine]:
     with Engine(2) as engine:
@@ -138,38 +125,3 @@ def test_a_learned_policy_in_lockstep_and_in_two_processes_gives_the_same_bits(d
     for seed in SEEDS[:2]:
         assert written(run_job(job, [seed])) == {seed: together[seed]}
     assert written(two_processes.run(job, SEEDS)) == together
-
-
-@pytest.mark.slow
-def test_an_episode_is_kept_before_it_arrives(two_processes, tmp_path):
-    job = replace(EXPERT, env=EnvConfig("fetch", "reach"))
-    keep = partial(write_episode, tmp_path, spec=env_spec(job.env), fingerprint={})
-    for episode in two_processes.run(job, SEEDS, keep):
-        path = tmp_path / f"episode-{episode.seed:012d}.mcap"
-        assert written([read_episode(path)]) == written([episode])
-    assert len(list_episodes(tmp_path)) == len(SEEDS)
-
-
-class Deadly:
-    """Ends the process that unpickles it."""
-
-    def __reduce__(self):
-        return os._exit, (3,)
-
-    def __call__(self, _: Episode) -> None:
-        raise AssertionError("this never arrives anywhere")
-
-
-@pytest.mark.slow
-def test_a_worker_that_dies_is_an_error_that_says_so_again_and_again():
-    with Engine(2) as engine:
-        for _ in range(2):
-            with pytest.raises(ManipError, match="a rollout worker died"):
-                list(engine.run(EXPERT, SEEDS, Deadly()))
-
-
-@pytest.mark.slow
-def test_what_a_worker_raises_arrives(two_processes):
-    job = RolloutJob(EnvConfig(), "policy", policy=Path("no such folder"))
-    with pytest.raises(ManipError, match="no such folder"):
-        list(two_processes.run(job, SEEDS))

@@ -1,0 +1,118 @@
+"""Time of one picture against the physics model drawn as it is, and against the scene without its robot.
+
+python benchmarks/picture_speed.py [--quick]
+
+Ours is `manip_il.sim.render.pictures`, pose and antialiasing included. The peer is `mujoco.Renderer` on the model that
+is simulated, with its shadow map and OpenGL's antialiasing; the limit is `mujoco.Renderer` without the robot's meshes,
+without shadows and with one sample a pixel. All draw the same states at the same size, by turns, one OpenGL context at
+a time; the median ratio over the repeats counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+
+import mujoco
+from _machine import describe_machine
+
+from manip_il.expert.expert import Expert
+from manip_il.mdp import State
+from manip_il.seeding import stream_seeds
+from manip_il.sim import render
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.look import FILM, CameraConfig, Look
+from manip_il.sim.robot import ROBOTS
+from manip_il.sim.scene import CAMERAS
+
+SIZES = ((128, 128), (240, 320), (480, 640))
+STATES = 6  # of one expert episode, evenly apart
+APART = 5  # control steps
+HIDDEN = 5  # a geom group that is not drawn
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--quick", action="store_true", help="one size, one repeat: shows that it runs, measures little"
+    )
+    options = parser.parse_args()
+    sizes, repeats = (SIZES[:1], 1) if options.quick else (SIZES, 5)
+    print(describe_machine())
+    print("medians and ranges of all repeats")
+    print("robot  camera  height x width  look     ours [ms]  as it is / ours       ours / no robot")
+    for robot in ROBOTS:
+        env = ManipEnv(robot)
+        states = visited(env)
+        for height, width in sizes:
+            for camera in CAMERAS:
+                for name, look in (("default", Look()), ("film", FILM)):
+                    config = CameraConfig((camera,), height, width, look)
+                    row = [repeat(env, states, config) for _ in range(repeats)]
+                    shown = f"{robot:5s}  {camera:6s}  {height:6d} x {width:<5d}  {name:7s}"
+                    print(f"{shown}  {statistics.median(one[0] for one in row) * 1e3:9.1f}  {summary(row)}", flush=True)
+    return 0
+
+
+def summary(row: list[tuple[float, float, float]]) -> str:
+    """The two ratios, each with its range."""
+    texts: list[str] = []
+    for ratios in ([as_it_is / ours for ours, as_it_is, _ in row], [ours / no_robot for ours, _, no_robot in row]):
+        texts.append(f"{statistics.median(ratios):4.1f} ({min(ratios):.1f} to {max(ratios):.1f})".ljust(20))
+    return "  ".join(texts).rstrip()
+
+
+def visited(env: ManipEnv) -> list[State]:
+    """States of an expert episode."""
+    expert = Expert(env.scene)
+    states: list[State] = []
+    env.start(stream_seeds("certificate", 1)[0])
+    for step in range(STATES * APART):
+        states += [env.get_state()] if step % APART == 0 else []
+        env.advance(expert.label(env.get_state()).action)
+    return states
+
+
+def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[float, float, float]:
+    """Seconds a picture: ours, the physics model as it is, the scene without its robot."""
+    robot, task = env.config.robot, env.config.task
+    ours = seconds(env, states, lambda: render.pictures(robot, task, env.data, config))
+    render.close()
+    no_robot = copy.copy(env.scene.model)
+    no_robot.geom_group[no_robot.geom_type == mujoco.mjtGeom.mjGEOM_MESH] = HIDDEN
+    no_robot.vis.quality.shadowsize = no_robot.vis.quality.offsamples = 0
+    return ours, plain(env, states, config, env.scene.model), plain(env, states, config, no_robot)
+
+
+def plain(env: ManipEnv, states: list[State], config: CameraConfig, model: mujoco.MjModel) -> float:
+    """Seconds a picture of `mujoco.Renderer`."""
+    with closing(mujoco.Renderer(model, config.height, config.width)) as renderer:
+
+        def draw() -> None:
+            mujoco.mj_camlight(env.scene.model, env.data)
+            renderer.update_scene(env.data, camera=config.names[0])
+            renderer.render()
+
+        return seconds(env, states, draw)
+
+
+def seconds(env: ManipEnv, states: list[State], draw: Callable[[], object]) -> float:
+    """The median time of one call, over the states; a first call warms up."""
+    env.set_state(states[0])
+    draw()
+    times: list[float] = []
+    for state in states:
+        env.set_state(state)
+        started = time.perf_counter()
+        draw()
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""Frames a second into a LeRobot dataset: our writer against LeRobot's own loop, fed the same frames in the same run.
+
+python benchmarks/writer_speed.py [--quick]
+
+Ours is `new_dataset` with `add` an episode and `finish`; the peer is `add_frame` a frame, `save_episode` an episode and
+`finalize`, with its pictures encoded after every episode (its default) or while it records (streaming). Both have
+the whole dataset on file in the end, both with LeRobot's default video settings. By turns in the same run; the median
+ratio over the repeats counts. The peer's time an episode grows with its video file, ours does not: longer datasets
+than these are further apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from _machine import describe_machine
+from lerobot.datasets import LeRobotDataset
+
+import datasets
+from manip_il.data import schema as s
+from manip_il.data.lerobot_io import new_dataset
+from manip_il.mdp import Episode
+
+LENGTH = 100  # frames of an episode
+REPO = "someone/benchmark"
+STATE_ONLY = s.RobotTaskSpec(
+    robot="benchmark",
+    task="benchmark",
+    fps=25,
+    joint_names=tuple(f"joint_{index}" for index in range(8)),
+    environment_state_names=tuple(f"number_{index}" for index in range(20)),
+    sim_state_size=60,
+    instruction="Measure.",
+)
+FILMED = replace(STATE_ONLY, cameras=("front", "wrist"), image_size=(128, 128))
+
+Write = Callable[[Path, s.RobotTaskSpec, list[Episode]], None]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    options = parser.parse_args()
+    repeats = 1 if options.quick else 3
+    datasets.disable_progress_bars()
+    logging.disable(logging.WARNING)
+    os.environ["SVT_LOG"] = "1"  # the peer's encoders greet otherwise
+    print(describe_machine())
+    print("dataset                            LeRobot, frames/s  ours, frames/s  ratio (median, all repeats)")
+    for name, spec, episodes, peer in (
+        ("state only", STATE_ONLY, 20, peer_default),
+        ("two 128 x 128 cameras, default", FILMED, 6, peer_default),
+        ("two 128 x 128 cameras, streaming", FILMED, 6, peer_streaming),
+    ):
+        frames = [make_episode(spec, seed) for seed in range(2 if options.quick else episodes)]
+        measured = np.array([[rate(write, spec, frames) for write in (peer, ours)] for _ in range(repeats)])
+        ratios = measured[:, 1] / measured[:, 0]
+        theirs, mine = np.median(measured, axis=0)
+        spread = f"{ratios.min():.1f} to {ratios.max():.1f}"
+        print(f"{name:33s}  {theirs:17,.0f}  {mine:14,.0f}  {np.median(ratios):.1f} ({spread})")
+    return 0
+
+
+def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
+    """Frames a second, from nothing to a whole dataset."""
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.perf_counter()
+        write(Path(folder) / "dataset", spec, episodes)
+        return sum(map(len, episodes)) / (time.perf_counter() - started)
+
+
+def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
+    with new_dataset(root, spec, repo_id=REPO, fingerprint={}) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        writer.finish()
+
+
+def peer_default(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode], streaming: bool = False) -> None:
+    dataset = LeRobotDataset.create(
+        REPO,
+        spec.fps,
+        s.features(spec),
+        root=root,
+        robot_type=spec.robot,
+        use_videos=bool(spec.cameras),
+        streaming_encoding=streaming,
+        encoder_queue_maxsize=LENGTH,  # it drops frames where its queue is full
+    )
+    for episode in episodes:
+        for frame in range(len(episode)):
+            row = {key: values[frame] for key, values in episode.columns.items()}
+            dataset.add_frame(row | {"task": spec.instruction})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def peer_streaming(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
+    peer_default(root, spec, episodes, streaming=True)
+
+
+def make_episode(spec: s.RobotTaskSpec, seed: int) -> Episode:
+    rng = np.random.default_rng(seed)
+    columns = {key: column(rng, feature) for key, feature in s.features(spec).items()}
+    columns[s.SEED][:] = seed
+    columns[s.SUCCESS][:] = False
+    return Episode(seed, columns, success=False, success_at_end=False)
+
+
+def column(rng: np.random.Generator, feature: dict) -> np.ndarray:
+    """Slow random walks: arms move little from one frame to the next; in pictures a square moves on a gradient."""
+    shape = (LENGTH, *feature["shape"])
+    if feature["dtype"] == "video":
+        return film(rng, *feature["shape"][:2])
+    if feature["dtype"].startswith("float"):
+        return (rng.normal(size=shape).cumsum(axis=0) / 100).astype(feature["dtype"])
+    return rng.integers(0, 2, shape).astype(feature["dtype"])
+
+
+def film(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    rows, columns = np.mgrid[:height, :width]
+    still = np.stack([rows + columns, 2 * rows, 2 * columns], axis=-1) // 2 + rng.integers(0, 4, (height, width, 3))
+    frames = np.repeat(still[None].astype(np.uint8), LENGTH, axis=0)
+    for t, frame in enumerate(frames):
+        frame[40:70, t % (width - 30) :][:, :30] = (200, 40, 30)
+    return frames
+
+
+if __name__ == "__main__":
+    sys.exit(main())

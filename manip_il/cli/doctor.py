@@ -1,0 +1,105 @@
+"""`manip-il doctor DATASET`: what is wrong with a dataset, and what can be put right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from manip_il.cli.groups import option
+from manip_il.cli.progress import progress, say
+from manip_il.errors import ManipError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from manip_il.data.doctor.dataset import Dataset
+    from manip_il.data.doctor.finding import Finding
+
+_MODEL = "model_sha256"
+
+
+@dataclass
+class DoctorOptions:
+    """Examine any LeRobot v3.0 dataset: files, rows, decoded video frames, statistics, journals.
+
+    One line a finding on standard output; exit code 1 where something is wrong, 0 with warnings alone.
+    --repair builds the dataset again from its journals; without them it computes statistics and moves leftovers away.
+    What it replaces is kept in DATASET.before-repair.
+    """
+
+    example: ClassVar[str] = "manip-il doctor datasets/demos"
+    dataset: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset", "positional": True})
+    repair: bool = option(False, "put right what can be put right, and keep a copy")
+
+    def run(self) -> None:
+        """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
+        if not self.dataset.is_dir():
+            raise UsageError(f"{self.dataset} is no folder; expected the folder of a LeRobot dataset")
+        from manip_il.data.doctor.examine import has_errors, verdict
+        from manip_il.data.doctor.finding import NotWhole
+        from manip_il.data.doctor.repair import repair
+
+        dataset, findings = self._examine()
+        if self.repair and any(finding.remedy.name != "NONE" for finding in findings):
+            for line in repair(dataset, findings):
+                say(f"repair   {line}")
+            dataset, findings = self._examine()
+        elif self.repair:
+            say("repair   nothing to repair" if not findings else "repair   nothing that can be repaired")
+        if has_errors(findings):
+            raise NotWhole(verdict(dataset, findings))
+        say(verdict(dataset, findings))
+
+    def _examine(self) -> tuple[Dataset, list[Finding]]:
+        from manip_il.data.doctor.dataset import Dataset
+        from manip_il.data.doctor.examine import CHECKS, examine
+
+        findings: list[Finding] = []
+        with progress(None, "files examined") as bar:
+            named = self.dataset.name not in ("", "..")  # what stands beside it has its name
+            dataset = Dataset(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
+            for finding in examine(dataset, (*CHECKS, check_robot)):
+                say(str(finding))
+                findings.append(finding)
+        return dataset, findings
+
+
+def check_robot(dataset: Dataset) -> Iterator[Finding]:
+    """Joints and state are those of the robot and task as this program has them; so is the compiled model."""
+    from manip_il.data.doctor.finding import error, warning
+    from manip_il.data.doctor.ours import read_spec
+    from manip_il.data.fingerprint import compare_fingerprints
+    from manip_il.data.lerobot_layout import OURS
+    from manip_il.data.lerobot_read import read_fingerprint
+
+    if not dataset.is_ours:
+        return
+    try:
+        spec, fingerprint = read_spec(dataset), read_fingerprint(dataset.root)
+    except (OSError, ValueError, TypeError, RecursionError, ManipError):
+        return  # named by the check of the spec
+    from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.robot import ROBOTS
+    from manip_il.sim.task import TASKS
+
+    if spec.robot not in ROBOTS or spec.task not in TASKS:
+        yield warning(OURS, f"is about {spec.robot} {spec.task}, which is not known here")
+        return
+    env = EnvConfig(spec.robot, spec.task, spec.fps)
+    here = env_spec(env)
+    for what in ("joint_names", "environment_state_names", "sim_state_size", "action_meaning"):
+        found, wanted = getattr(spec, what), getattr(here, what)
+        if found != wanted:
+            yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
+    # Of the rest, versions are compared already, and tolerance and horizon are not what a dataset says.
+    if _MODEL in fingerprint:
+        theirs, ours = ({_MODEL: table[_MODEL]} for table in (fingerprint, env_fingerprint(env)))
+        for text in compare_fingerprints("the dataset", theirs, "this program", ours):
+            yield warning(OURS, text)
+
+
+def _short(value: Any) -> str:
+    text = ", ".join(value) if isinstance(value, tuple) else str(value)
+    return text if len(text) <= 100 else f"{text[:97]}..."

@@ -1,0 +1,103 @@
+"""`manip-il mcap export` and `manip-il mcap import`: datasets to MCAP files and back."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli.folders import prepare_output
+from manip_il.cli.groups import option, save_options
+from manip_il.cli.progress import progress, say
+from manip_il.errors import UsageError
+
+if TYPE_CHECKING:
+    from manip_il.data.mcap_import import Import
+    from manip_il.data.mcap_mapping import Mapping
+
+
+@dataclass
+class McapExportOptions:
+    """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file an episode, one topic a column.
+
+    Beside the files, mapping.yaml says how `manip-il mcap import` makes the same dataset of them again.
+    """
+
+    example: ClassVar[str] = "manip-il mcap export datasets/demos demos_mcap"
+    dataset: Path = field(metadata={"help": "the dataset's folder", "positional": True})
+    out: Path = field(metadata={"help": "folder for the files", "positional": True})
+    overwrite: bool = option(False, "replace an export that is there")
+
+    def run(self) -> None:
+        """Export every episode; the folder appears when it is whole."""
+        from manip_il.data.atomic import new_folder
+        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.mcap_export import MAPPING, export_dataset, open_source
+
+        source = open_source(self.dataset)
+        if self.dataset.resolve().is_relative_to(self.out.resolve()):
+            raise UsageError(f"{self.out} holds the dataset itself; expected another folder for the files")
+        total = dataset_info(self.dataset).episodes
+        prepare_output(self.out, resume=False, overwrite=self.overwrite)
+        with new_folder(self.out) as folder, progress(total, "export") as bar:
+            count = 0
+            for _ in export_dataset(source, folder):
+                count += 1
+                bar.advance()
+            save_options(folder, self)
+        say(f"exported {count:,} episodes to {self.out}")
+        say(f"back to a dataset: manip-il mcap import {self.out} DATASET --mapping={self.out / MAPPING}")
+
+
+@dataclass
+class McapImportOptions:
+    """Write MCAP files as a LeRobot v3.0 dataset: one episode a file, in the order of their names.
+
+    The mapping names the topic and the field of every column, and how its messages are brought to the dataset's rate:
+    nearest, hold or interpolate, with a tolerance in seconds. A gap beyond it is an error.
+    """
+
+    example: ClassVar[str] = "manip-il mcap import demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
+    source: Path = field(metadata={"help": "an MCAP file, or a folder of them", "positional": True})
+    dataset: Path = field(metadata={"help": "folder for the dataset", "positional": True})
+    mapping: Path = field(metadata={"help": "YAML: columns in terms of topics (see configs/mcap/panda.yaml)"})
+
+    def run(self) -> None:
+        """Import every file; the dataset appears when it is whole."""
+        from manip_il.data.mcap_import import list_files
+        from manip_il.data.mcap_mapping import load_mapping
+
+        mapping = load_mapping(self.mapping)
+        paths = list_files(self.source)
+        if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
+            raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
+        counts: Counter[str] = Counter()
+        used: Counter[str] = Counter()
+        episodes = frames = 0
+        for done in self._import(paths, mapping):
+            counts.update(done.counts)
+            used.update(done.used)
+            episodes, frames = episodes + 1, frames + done.frames
+        say(_table(counts, used))
+        say(f"imported {episodes:,} episodes, {frames:,} frames to {self.dataset}")
+
+    def _import(self, paths: list[Path], mapping: Mapping) -> Iterator[Import]:
+        from manip_il.data.mcap_import import import_files
+
+        with progress(len(paths), "import") as bar:
+            for done in import_files(paths, self.dataset, mapping):
+                bar.advance()
+                yield done
+
+
+def _table(counts: Counter[str], used: Counter[str]) -> str:
+    """Messages of every topic: how many there are, had a part in the dataset, and had none."""
+    width = max(map(len, ["topic", *counts]))
+    lines = [f"{'topic':{width}}  {'messages':>10}  {'used':>10}  {'unused':>10}"]
+    for topic in sorted(counts):
+        rest = counts[topic] - used[topic]
+        note = "" if topic in used else "  not in the mapping"
+        lines.append(f"{topic:{width}}  {counts[topic]:>10,}  {used[topic]:>10,}  {rest:>10,}{note}")
+    return "\n".join(lines)

@@ -1,0 +1,142 @@
+"""Journals to a LeRobot dataset: one by one while they are recorded, or all at once, with the same bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from manip_il.data.atomic import write_file
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.journal import Header, list_episodes, read_journal
+from manip_il.data.lerobot_io import DatasetInfo, DatasetWriter, VideoConfig, new_dataset
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mdp import Episode
+
+_LOG = logging.getLogger(__name__)
+RECORDING = "recording.json"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a folder of journals becomes: its `recording.json`.
+
+    only_successes: failed episodes are left out. episodes: at most so many, the first in seed order; None: all.
+    provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it.
+    """
+
+    repo_id: str
+    only_successes: bool = False
+    episodes: int | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+    video: dict[str, Any] = field(default_factory=dict)
+
+    def open(
+        self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
+    ) -> AbstractContextManager[DatasetWriter]:
+        """The dataset's writer; raises what `new_dataset` raises."""
+        video = VideoConfig(**self.video)
+        return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
+
+    def write(self, journals: Path) -> None:
+        """Write it beside the episodes."""
+        journals.mkdir(parents=True, exist_ok=True)
+        write_file(journals / RECORDING, (json.dumps(asdict(self), indent=1) + "\n").encode())
+
+    @classmethod
+    def read(cls, journals: Path) -> Recording:
+        """The folder's own; where it has none, one that takes every episode."""
+        path = journals / RECORDING
+        if not path.is_file():
+            return cls(f"local/{journals.name.removesuffix('.journals') or 'journals'}")
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise ManipError(f"cannot read {path}: {type(error).__name__}: {error}") from error
+
+
+@dataclass(frozen=True)
+class BuildResult:
+    """A built dataset. failed: episodes left out as they failed. damaged: what is wrong with each unreadable file."""
+
+    info: DatasetInfo
+    failed: int
+    damaged: tuple[str, ...]
+
+
+class Builder:
+    """Feeds journals, given in seed order, to a dataset's writer; the result depends on the journals alone."""
+
+    def __init__(self, writer: DatasetWriter, recording: Recording):
+        self._writer, self._recording = writer, recording
+        self._first: Header | None = None
+        self._seeds: list[int] = []  # first and last
+        self.count = self.failed = 0  # episodes taken and left out
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every asked episode is in."""
+        return self._recording.episodes is not None and self.count >= self._recording.episodes
+
+    def add(self, header: Header, episode: Episode) -> None:
+        """Take one journal's episode. Raises `MismatchError` for one that is about something else than the first."""
+        self._first = self._first or header
+        if header.spec != self._first.spec:
+            who = f"the journal of seed {header.seed}"
+            raise MismatchError("robot, task or cameras", who, header.spec, "the first", self._first.spec)
+        for line in compare_fingerprints(
+            f"the journal of seed {header.seed}", header.fingerprint, "the first", self._first.fingerprint
+        ):
+            _LOG.warning("%s", line)
+        self._seeds = [*self._seeds[:1], header.seed]
+        if self._recording.only_successes and not episode.success:
+            self.failed += 1
+            return
+        self._writer.add(episode)
+        self.count += 1
+
+    def finish(self) -> DatasetInfo:
+        """Make the dataset whole, with where it came from."""
+        seeds = {"seeds": [self._seeds[0], self._seeds[-1]], "tried": self.count + self.failed} if self._seeds else {}
+        return self._writer.finish({**self._recording.provenance, **seeds})
+
+
+def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> BuildResult:
+    """The LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
+
+    Files that cannot be read are left out and named in the result. Raises `ManipError` where no episode is left,
+    `FolderExistsError` where `root` holds something, unless `replace` is to swap it for the new one at the end.
+    """
+    recording = Recording.read(journals)
+    if repo_id is not None:
+        recording = dataclasses.replace(recording, repo_id=repo_id)
+    damaged: list[str] = []
+    readable = _read_all(journals, damaged)
+    first = next(readable, None)
+    if first is None:
+        raise ManipError(f"{journals} holds no readable episode{f': {damaged[0]}' if damaged else ''}")
+    header = first[0]
+    with recording.open(root, header.spec, header.fingerprint, replace=replace) as writer:
+        builder = Builder(writer, recording)
+        for one in itertools.chain([first], readable):
+            builder.add(*one)
+            if builder.is_full:
+                break
+        info = builder.finish()
+    return BuildResult(info, builder.failed, tuple(damaged))
+
+
+def _read_all(journals: Path, damaged: list[str]) -> Iterator[tuple[Header, Episode]]:
+    for path in list_episodes(journals):
+        try:
+            yield read_journal(path)
+        except ManipError as error:
+            damaged.append(str(error))

@@ -1,0 +1,135 @@
+"""Parquet files as they are found: footers, columns as numpy arrays, and what is wrong with either."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+MAGIC = b"PAR1"
+NO_FOOTER = "has no footer: its writer died before it closed the file, or the file was cut"
+_ROWS = 16_384  # held at once
+UNREADABLE = (OSError, pa.ArrowException, ValueError, MemoryError)  # ArrowInvalid and its like are ValueErrors too
+
+
+class BadColumn(ValueError):
+    """A column that is not what its dataset says; the message says how."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One parquet file. problem: why it cannot be read; then it has no rows and no schema."""
+
+    name: str  # in the dataset
+    path: Path
+    problem: str = ""
+    rows: int = 0
+    schema: pa.Schema | None = None
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of its columns."""
+        return list(self.schema.names) if self.schema else []
+
+    def tables(self, columns: Sequence[str] | None = None, rows: int = _ROWS) -> Iterator[pa.Table]:
+        """The rows in order, about `rows` at a time. Raises one of `UNREADABLE`; checksums of pages are compared."""
+        with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
+            groups: list[int] = []
+            held = 0
+            for group in range(file.num_row_groups):
+                groups.append(group)
+                held += file.metadata.row_group(group).num_rows
+                if held >= rows or group == file.num_row_groups - 1:
+                    yield file.read_row_groups(groups, columns=columns, use_threads=False)
+                    groups, held = [], 0
+
+    def batches(self, column: str, rows: int) -> Iterator[pa.Array]:
+        """One column, at most `rows` at a time: pictures need not fit in memory."""
+        with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
+            for batch in file.iter_batches(rows, columns=[column], use_threads=False):
+                yield batch.column(0)
+
+
+def find_shards(root: Path, pattern: str) -> list[Shard]:
+    """Every parquet file that matches, in LeRobot's order; none of them has to be readable."""
+    paths = sorted(path for path in root.glob(pattern) if path.is_file())
+    return [open_shard(path.relative_to(root).as_posix(), path) for path in paths]
+
+
+def open_shard(name: str, path: Path) -> Shard:
+    """The file with its footer read."""
+    try:
+        with path.open("rb") as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            first = stream.read(4)
+            stream.seek(max(0, size - 4))
+            last = stream.read(4)
+        if size == 0:
+            return Shard(name, path, "is empty")
+        if first != MAGIC:
+            return Shard(name, path, "is no parquet file")
+        if last != MAGIC or size < 12:
+            return Shard(name, path, NO_FOOTER)
+        metadata = pq.read_metadata(path)
+        return Shard(name, path, rows=metadata.num_rows, schema=metadata.schema.to_arrow_schema())
+    except UNREADABLE as problem:
+        return Shard(name, path, f"cannot be read: {problem}")
+
+
+def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
+    """Rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
+    array: Any = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    if isinstance(array, pa.ChunkedArray):  # what combining no chunk at all gives
+        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.array([], array.type)
+    rows, size = len(array), int(np.prod(shape, dtype=np.int64))
+    while True:
+        if isinstance(array.type, pa.BaseExtensionType):
+            array = array.storage
+        if array.null_count:
+            raise BadColumn(f"holds {array.null_count:,} empty values")
+        if not _is_list(array.type):
+            break
+        array = array.flatten()
+    if str(_numpy_type(array.type)) != dtype:
+        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
+    if len(array) != rows * size:
+        raise BadColumn(f"holds {len(array):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
+    return array.to_numpy(zero_copy_only=False).reshape(rows, size)
+
+
+def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
+    """A column of whole numbers, (T,). Raises `BadColumn` for a missing one, empty values or another type."""
+    if name not in table.column_names:
+        raise BadColumn(f"has no column {name!r}")
+    column = table.column(name)
+    if not pa.types.is_integer(column.type) or column.null_count:
+        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} empty values; expected integers")
+    return column.to_numpy().astype(np.int64)
+
+
+def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
+    """A column of numbers, (T,). Raises `BadColumn` as `integers` does."""
+    if name not in table.column_names:
+        raise BadColumn(f"has no column {name!r}")
+    column = table.column(name)
+    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)) or column.null_count:
+        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} empty values; expected numbers")
+    return column.to_numpy().astype(np.float64)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+def _numpy_type(kind: pa.DataType) -> Any:
+    try:
+        return np.dtype(kind.to_pandas_dtype())
+    except (NotImplementedError, TypeError):
+        return kind

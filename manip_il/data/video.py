@@ -1,0 +1,252 @@
+"""Encode cameras as LeRobot does, but as they come: every episode is appended to a file that stays open.
+
+LeRobot writes one file an episode and then copies all that is there so far into a new one. Its settings are restated
+here, and held against the library by the tests, because importing `lerobot.configs.video` imports torch (seconds).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast
+
+import av
+import av.logging
+import numpy as np
+from av.video.codeccontext import VideoCodecContext
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data.lerobot_stats import I64, pixel_counts
+from manip_il.data.video_read import count_packets
+from manip_il.errors import ManipError, UnknownName, UsageError
+
+# crf and preset where nothing else is asked. LeRobot's own codec and settings are those of libsvtav1; h264 takes a
+# sixth of its time for the same error, which is what lets encoding keep up with drawing on one core.
+CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
+QUEUE_BYTES = 128 * 1024 * 1024  # of pictures that wait to be encoded; an episode that is alone may be larger
+_MIB = 1024 * 1024
+
+Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
+
+
+@dataclass(frozen=True)
+class VideoConfig:
+    """How pictures are compressed, by the names of LeRobot's `RGBEncoderConfig`; `libsvtav1` also has its defaults.
+
+    Raises `UnknownName` for the codec, `UsageError` for g; what a codec makes of the rest, only `check` can tell.
+    """
+
+    vcodec: str = "h264"
+    pix_fmt: str = "yuv420p"
+    g: int | None = 2  # frames from one key frame to the next: what reading any single one costs
+    crf: float | None = None  # lower is better and larger
+    preset: int | str | None = None  # the codec's own
+
+    def __post_init__(self) -> None:
+        if self.vcodec not in CODECS:
+            raise UnknownName("video codec", self.vcodec, CODECS)
+        if self.g is not None and self.g < 1:
+            raise UsageError(f"video setting g={self.g}; expected 1 or more frames from one key frame to the next")
+        crf, preset = CODECS[self.vcodec]
+        object.__setattr__(self, "crf", crf if self.crf is None else self.crf)
+        object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
+
+    def options(self) -> dict[str, str]:
+        """The codec's own options. One thread: a second saves no work, and of h264 it changes the bytes."""
+        named = {"g": self.g, "crf": self.crf, "preset": self.preset}
+        options = {name: str(value) for name, value in named.items() if value is not None}
+        if self.vcodec == "libsvtav1":
+            return {**options, "svtav1-params": "fast-decode=0:lp=1"}
+        return {**options, "threads": "1", "bf": "0"}  # frames in their order: so that an episode can follow another
+
+    def check(self, size: tuple[int, int], fps: int) -> None:
+        """Encode one picture of this height and width; raises `UsageError` with the encoder's reason."""
+        level = av.logging.get_level()
+        av.logging.set_level(av.logging.ERROR)  # else there is no reason to read
+        with av.logging.Capture() as log:
+            try:
+                if len(av.VideoFormat(self.pix_fmt).components) < 3:
+                    raise ValueError(f"{self.pix_fmt} has no colours")
+                encoder = _encoder(self, size, fps)
+                encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+                encoder.encode(None)
+            except (av.FFmpegError, ValueError) as error:
+                reason = log[0][2].strip() if log else str(error)
+                raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {self}: {reason}") from error
+            finally:
+                av.logging.set_level(level)
+
+    def info(self, path: Path) -> dict[str, Any]:
+        """What LeRobot's `info.json` says of a camera whose video files are like `path`."""
+        with contextlib.closing(av.open(str(path))) as container:
+            stream = container.streams.video[0]
+            found = {
+                "video.height": stream.height,
+                "video.width": stream.width,
+                "video.codec": stream.codec.canonical_name,
+                "video.pix_fmt": stream.pix_fmt,
+                "video.fps": int(stream.base_rate or 0),
+                "video.channels": len(stream.format.components),
+                "has_audio": False,
+            }
+        chosen = {"video.g": self.g, "video.crf": self.crf, "video.preset": self.preset, "video.fast_decode": 0}
+        return {**found, **chosen, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Where one camera's frames of one episode are: from frame `first` of a file on; their `pixel_counts`."""
+
+    chunk: int
+    file: int
+    first: int
+    frames: int
+    counts: I64
+
+
+class CameraFiles:
+    """One camera's numbered video files, one open at a time; the same episodes give the same bytes."""
+
+    def __init__(self, folder: Path, key: str, config: VideoConfig, fps: int, file_size_in_mb: float):
+        self._folder, self._key, self._config, self._fps = folder, key, config, fps
+        self._limit = file_size_in_mb * _MIB
+        self._number = 0
+        self._file: _VideoFile | None = None
+
+    def write(self, frames: Pictures) -> Clip:
+        """Append the frames of an episode. Raises `ManipError` where they cannot be encoded or written."""
+        # the rule of the data files: a new one where this episode, at the file's size a frame so far, would fill it
+        file = self._file
+        if file and file.bytes + file.bytes / file.frames * len(frames) >= self._limit:
+            self.close()
+        name, chunk, number = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
+        try:
+            if self._file is None:
+                path = self._folder / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = _VideoFile(path, self._config, (frames.shape[1], frames.shape[2]), self._fps)
+            clip = Clip(chunk, number, self._file.frames, len(frames), pixel_counts(frames))
+            self._file.append(frames)
+        except (av.FFmpegError, OSError) as error:
+            raise ManipError(f"cannot write {name}: {error.strerror}") from error
+        return clip
+
+    def close(self) -> None:
+        """Finish the open file, if any. Raises `ManipError` where it does not hold all frames that it was given."""
+        if self._file is None:
+            return
+        file, self._file = self._file, None  # first: a full disk lets no file be closed twice
+        name, _, _ = layout.numbered(layout.VIDEO_PATH, self._number, video_key=self._key)
+        self._number += 1
+        try:
+            file.close()
+        except (av.FFmpegError, OSError) as error:
+            raise ManipError(f"cannot write {name}: {error.strerror}") from error
+        if (found := count_packets(file.path)) != file.frames:
+            raise ManipError(f"{name} holds {found} frames; {file.frames} were encoded")
+
+    def info(self) -> dict[str, Any]:
+        """`VideoConfig.info` of the first file, which must be closed."""
+        return self._config.info(self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0])
+
+
+class CameraThreads:
+    """Every camera's files, each encoded by a thread beside the caller (PyAV lets go of Python while it encodes)."""
+
+    def __init__(self, cameras: Mapping[str, CameraFiles]):
+        self._cameras = cameras
+        self._threads = {key: ThreadPoolExecutor(1, f"encode-{key}") for key in cameras}
+        self._waiting: deque[tuple[Future[Clip], int]] = deque()  # with bytes of pictures, oldest first
+        self._bytes = 0
+
+    def write(self, pictures: Mapping[str, Pictures]) -> dict[str, Future[Clip]]:
+        """Hand over an episode's frames, which must not change from now on; wait while too many wait already.
+
+        Raises the `ManipError` of an earlier episode that could not be encoded.
+        """
+        clips: dict[str, Future[Clip]] = {}
+        for key, frames in pictures.items():
+            self._make_room(frames.nbytes)
+            clips[key] = self._threads[key].submit(self._cameras[key].write, frames)
+            self._waiting.append((clips[key], frames.nbytes))
+            self._bytes += frames.nbytes
+        return clips
+
+    def finish(self) -> dict[str, dict[str, Any]]:
+        """Wait for all frames to be on file; return `CameraFiles.info` of every camera. Raises what `write` raises."""
+        self._make_room(QUEUE_BYTES)
+        for camera in self._cameras.values():
+            camera.close()
+        return {key: camera.info() for key, camera in self._cameras.items()}
+
+    def stop(self) -> None:
+        """End the threads without a word, whatever they were at."""
+        for thread in self._threads.values():
+            thread.shutdown(cancel_futures=True)
+        for camera in self._cameras.values():
+            with contextlib.suppress(ManipError):
+                camera.close()
+
+    def _make_room(self, size: int) -> None:
+        while self._waiting and (self._waiting[0][0].done() or self._bytes + size > QUEUE_BYTES):
+            clip, taken = self._waiting.popleft()
+            clip.result()
+            self._bytes -= taken
+
+
+class _VideoFile:
+    """One MP4 file that is being written."""
+
+    def __init__(self, path: Path, config: VideoConfig, size: tuple[int, int], fps: int):
+        self.path, self._config, self._size, self._fps = path, config, size, fps
+        self.frames = self.bytes = 0
+        # without bitexact the muxer's version is in the file; with faststart a reader finds the index at its begin
+        self._container = av.open(str(path), "w", options={"movflags": "faststart", "fflags": "+bitexact"})
+        self._stream = cast(VideoStream, self._container.add_stream(config.vcodec, fps, options=config.options()))
+        _set_up(self._stream.codec_context, config, size, fps)
+
+    def append(self, frames: Pictures) -> None:
+        """Encode the frames as a stream of its own: so their bytes, and the file's size here, depend on no timing."""
+        first = self.frames == 0
+        encoder = self._stream.codec_context if first else _encoder(self._config, self._size, self._fps)
+        for frame in frames:
+            self._mux(encoder, _video_frame(frame, self.frames, self._fps))
+            self.frames += 1
+        self._mux(encoder, None)
+
+    def close(self) -> None:
+        self._container.close()
+
+    def _mux(self, encoder: VideoCodecContext, frame: av.VideoFrame | None) -> None:
+        for packet in encoder.encode(frame):
+            packet.stream = self._stream
+            self.bytes += packet.size
+            self._container.mux_one(packet)
+
+
+def _encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodecContext:
+    encoder = cast(VideoCodecContext, av.CodecContext.create(config.vcodec, "w"))
+    encoder.options = config.options()
+    _set_up(encoder, config, size, fps)
+    return encoder
+
+
+def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: it greets on standard error whenever an encoder opens
+    encoder.height, encoder.width = size
+    encoder.pix_fmt = config.pix_fmt
+    encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)
+
+
+def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoFrame:
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+    frame.pts, frame.time_base = number, Fraction(1, fps)
+    return frame

@@ -1,0 +1,127 @@
+"""A Ray cluster: the one that `RAY_ADDRESS` names or that runs on this machine, else a local one of its own.
+
+Workers send what is to be stored back here, and get the policy's files from here: nodes need the program, no disk
+that they share.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from manip_il.data.atomic import new_folder
+from manip_il.engine.engine import Event, Task, portable, run_task
+from manip_il.errors import FolderExistsError, ManipError
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
+try:
+    import ray
+    from ray import exceptions
+except ImportError as missing:
+    raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
+
+_DIED = (
+    exceptions.WorkerCrashedError,
+    exceptions.NodeDiedError,
+    exceptions.ObjectLostError,
+    exceptions.OutOfMemoryError,
+)
+Files = dict[str, bytes]
+
+
+class RayCluster:
+    """Up to `workers` tasks at once, one core each; by default as many as the cluster has cores."""
+
+    def __init__(self, workers: int | None):
+        self._running: dict[Any, Task] = {}  # Ray's generator of a task's answers -> the task
+        self._policies: dict[Path, Any] = {}  # folder -> its files in Ray's store
+        self._ours = not ray.is_initialized()
+        if self._ours:
+            try:
+                ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+            except (ConnectionError, RuntimeError, ValueError) as error:
+                raise ManipError(f"no Ray cluster: {error}; check RAY_ADDRESS, or unset it for a local one") from error
+        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+
+    def has_room(self) -> bool:
+        """Whether fewer tasks run than may."""
+        return len(self._running) < self.workers
+
+    def submit(self, task: Task) -> None:
+        """Hand a task to the cluster."""
+        # Deaths are counted by the engine, which knows which seeds had ended: Ray itself is to try once.
+        remote = _run_remote.options(num_returns="streaming", max_retries=0)
+        self._running[remote.remote(task, self._ship(task.job.policy))] = task
+
+    def wait(self) -> list[Event]:
+        """One event of every task that has something to say."""
+        ready, _ = ray.wait(list(self._running), num_returns=1, fetch_local=False)
+        return [self._next(answers) for answers in ready]
+
+    def close(self, in_order: bool) -> None:
+        """Cancel what runs; a cluster that was started here ends."""
+        for answers in self._running:
+            ray.cancel(answers, force=True)
+        self._running.clear()
+        self._policies.clear()
+        if self._ours and ray.is_initialized():
+            ray.shutdown()
+
+    def _next(self, answers: Any) -> Event:
+        task = self._running[answers]
+        try:
+            kind, episode, packed, error = ray.get(next(answers))
+        except StopIteration:
+            del self._running[answers]
+            return Event(task, "done")
+        except _DIED as death:
+            del self._running[answers]
+            return Event(task, "died", error=death)
+        except exceptions.RayError as failure:  # what the task itself raises comes as an answer
+            kind, episode, packed, error = "failed", None, None, portable(failure)
+        if kind == "failed":
+            del self._running[answers]
+        return Event(task, kind, episode, packed, error)
+
+    def _ship(self, policy: Path | None) -> Any:
+        if policy is None:
+            return None
+        if policy not in self._policies:
+            files = {path.relative_to(policy).as_posix(): path.read_bytes() for path in sorted(policy.rglob("*.*"))}
+            self._policies[policy] = ray.put(files)
+        return self._policies[policy]
+
+
+@ray.remote(num_cpus=1)
+def _run_remote(task: Task, files: Files | None) -> Iterator[tuple[str, Any, Any, Any]]:
+    try:
+        if files is not None:
+            task = replace(task, job=replace(task.job, policy=_unpack(files)))
+        for episode, packed in run_task(task):
+            yield "episode", episode, packed, None
+    except Exception as error:
+        yield "failed", None, None, portable(error)
+
+
+def _unpack(files: Files) -> Path:
+    """The policy's folder on this node, written once for all tasks that bring the same files."""
+    content = hashlib.sha256()
+    for name, data in sorted(files.items()):
+        content.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
+    folder = Path(tempfile.gettempdir()) / f"manip_il-policy-{os.getuid()}-{content.hexdigest()[:32]}"
+    if folder.is_dir():
+        return folder
+    try:
+        with new_folder(folder) as new:
+            for name, data in files.items():
+                (new / name).parent.mkdir(parents=True, exist_ok=True)
+                (new / name).write_bytes(data)
+    except FolderExistsError:  # another task on this node was faster
+        pass
+    return folder

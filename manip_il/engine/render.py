@@ -1,0 +1,167 @@
+"""Pictures of recorded states: another dataset with other cameras, sizes or lights, without simulating again."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data import schema
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.lerobot_io import (
+    DatasetInfo,
+    new_dataset,
+    read_episodes,
+    read_fingerprint,
+    read_provenance,
+    read_spec,
+)
+from manip_il.data.lerobot_layout import OURS
+from manip_il.data.lerobot_read import UNKNOWN_TASK
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mdp import Episode, State
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.look import CameraConfig
+from manip_il.sim.robot import ROBOTS
+from manip_il.sim.task import TASKS
+
+Pictures = dict[str, NDArray[np.uint8]]
+_DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that pictures of a state depend on
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset whose states can be pictured. warnings: what may make the pictures differ from the recorded world."""
+
+    root: Path
+    spec: RobotTaskSpec
+    warnings: tuple[str, ...]
+
+    @property
+    def env(self) -> EnvConfig:
+        """An environment that its states fit."""
+        return EnvConfig(self.spec.robot, self.spec.task)
+
+
+def open_source(root: Path) -> Source:
+    """Read what a dataset says of itself.
+
+    Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
+    a robot and task that are known here, `MismatchError` where its states do not fit them.
+    """
+    spec = read_spec(root)
+    if spec.task == UNKNOWN_TASK:
+        raise ManipError(f"{root} does not name its task: {OURS} is missing; LeRobot's tools drop it, so render first")
+    for kind, name, known in (("robot", spec.robot, ROBOTS), ("task", spec.task, TASKS)):
+        if name not in known:
+            raise ManipError(
+                f"{root} is about the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
+                "so its states cannot be pictured"
+            )
+    env = EnvConfig(spec.robot, spec.task)
+    size = env_spec(env).sim_state_size
+    if spec.sim_state_size != size:
+        raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
+    here, there = env_fingerprint(env), read_fingerprint(root)
+    sides = [{key: side.get(key, "nothing") for key in _DECIDE} for side in (there, here)]
+    return Source(root, spec, tuple(compare_fingerprints(str(root), sides[0], "this machine", sides[1])))
+
+
+def render_dataset(
+    source: Source,
+    target: Path,
+    cameras: CameraConfig,
+    *,
+    repo_id: str,
+    workers: int = 1,
+    replace: bool = False,
+    on_episode: Callable[[Episode], None] | None = None,
+) -> DatasetInfo:
+    """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
+
+    replace: what `target` holds stays until the new dataset is whole, and goes then. on_episode: sees each episode once
+    it is written. Raises `RenderError` where there is no OpenGL, and what reading and `new_dataset` raise.
+    """
+    look = env_fingerprint(source.env, cameras)["cameras_sha256"]
+    spec = dataclasses.replace(source.spec, cameras=cameras.names, image_size=cameras.size)
+    fingerprint = {**read_fingerprint(source.root), "cameras_sha256": look}
+    rendered = {"from": source.root.name, "cameras": dataclasses.asdict(cameras)}
+    states = read_episodes(source.root, pictures=False)
+    with (
+        new_dataset(target, spec, repo_id=repo_id, fingerprint=fingerprint, replace=replace) as writer,
+        closing(render_episodes(states, source.env, cameras, workers)) as episodes,
+    ):
+        for episode in episodes:
+            writer.add(episode)
+            if on_episode is not None:
+                on_episode(episode)
+        return writer.finish({**read_provenance(source.root), "rendered": rendered})
+
+
+def render_episodes(
+    episodes: Iterable[Episode], env: EnvConfig, cameras: CameraConfig, workers: int = 1
+) -> Generator[Episode]:
+    """Yield the episodes, in order, with pictures of their states; at most `workers` + 1 of them wait in memory.
+
+    Raises `RenderError` where there is no OpenGL, `ManipError` where a worker dies.
+    """
+    render = partial(render_states, env, cameras)
+    if workers == 1:
+        for episode in episodes:
+            yield _with_pictures(episode, render(episode.columns[schema.SIM_STATE]))
+        return
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_leave_interrupts_alone)
+    waiting: deque[tuple[Episode, Future[Pictures]]] = deque()
+    try:
+        for episode in episodes:
+            waiting.append((episode, pool.submit(render, episode.columns[schema.SIM_STATE])))
+            if len(waiting) > workers:
+                yield _next(waiting)
+        while waiting:
+            yield _next(waiting)
+    except BrokenExecutor as error:
+        raise ManipError("a rendering worker died (out of memory?); fewer --workers need less") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Pictures:
+    """Pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
+
+    The bytes are those that an environment with these cameras gave when it was in these states.
+    """
+    world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+    pictures = {
+        schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
+    }
+    for row, state in enumerate(states):
+        world.set_state(State.from_vector(state))
+        for name, picture in world.observe().images.items():
+            pictures[schema.IMAGES + name][row] = picture
+    return pictures
+
+
+def _with_pictures(episode: Episode, pictures: Pictures) -> Episode:
+    return dataclasses.replace(episode, columns={**episode.columns, **pictures})
+
+
+def _next(waiting: deque[tuple[Episode, Future[Pictures]]]) -> Episode:
+    episode, pictures = waiting.popleft()
+    return _with_pictures(episode, pictures.result())
+
+
+def _leave_interrupts_alone() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one

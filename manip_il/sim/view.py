@@ -1,0 +1,128 @@
+"""The model that pictures are drawn from: the physics model's copy with few faces, lit by a `Look`.
+
+A software renderer pays for every triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.look import Look
+from manip_il.sim.scene import build_scene
+
+F64 = NDArray[np.float64]
+Indices = NDArray[np.integer]
+_CELLS = 22  # grid cells along a mesh's diagonal: what still looks right at 480 x 640 pixels
+_LEAST_CELL = 0.008  # what a pixel spans at 128 x 128 [m]
+_PLAIN_FACES = 1_600  # meshes up to here stay as they are
+_PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
+_LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
+
+
+def view_model(robot: str, task: str, look: Look) -> mujoco.MjModel:
+    """A model to draw from, not to simulate: every name, address and pose is the physics model's."""
+    model = copy.copy(_with_few_faces(robot, task))
+    _light(model, look)
+    return model
+
+
+@cache
+def _with_few_faces(robot: str, task: str) -> mujoco.MjModel:
+    model = copy.copy(build_scene(robot, task).model)
+    for mesh in range(model.nmesh):
+        if model.mesh_facenum[mesh] > _PLAIN_FACES:
+            _simplify(model, mesh)
+    return model
+
+
+def _simplify(model: mujoco.MjModel, mesh: int) -> None:
+    """Overwrite the first of a mesh's vertices, normals and faces by fewer of them; what follows is never drawn."""
+    vertices = _rows(model.mesh_vert, model.mesh_vertadr[mesh], model.mesh_vertnum[mesh])
+    normals = _rows(model.mesh_normal, model.mesh_normaladr[mesh], model.mesh_normalnum[mesh])
+    faces = _rows(model.mesh_face, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
+    face_normals = _rows(model.mesh_facenormal, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
+    normal_of = np.zeros(len(vertices), dtype=np.int64)
+    normal_of[faces] = face_normals
+    positions, originals, few = cluster(vertices.astype(np.float64), faces)
+    vertices[: len(positions)], normals[: len(positions)] = positions, normals[normal_of[originals]]
+    faces[: len(few)] = face_normals[: len(few)] = few
+    model.mesh_facenum[mesh] = len(few)
+
+
+def cluster(vertices: F64, faces: Indices) -> tuple[F64, Indices, Indices]:
+    """Merge the vertices (v, 3) in each cell of a grid: positions (c, 3), an original vertex each (c,), faces (f, 3).
+
+    The original is the one nearest to the mean of its cell; its normal shades a coarse mesh like the fine one.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size = max(float(np.linalg.norm(high - low)) / _CELLS, _LEAST_CELL)
+    grid = ((vertices - low) / size).astype(np.int64)
+    _, cell, counts = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
+    means = _sums(cell, vertices, len(counts)) / counts[:, None]
+    moves = _flattest(vertices, faces, cell, means) - means
+    moves *= size / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), size)  # by a cell's size at most
+    by_distance = np.lexsort([np.linalg.norm(vertices - means[cell], axis=1), cell])
+    originals = by_distance[np.cumsum(counts) - counts]
+    return means + moves, originals, _distinct(cell[faces])
+
+
+def _flattest(vertices: F64, faces: Indices, cell: Indices, means: F64) -> F64:
+    """Where the squared distances to the planes of a cell's faces, weighted by area, are least: sharp edges stay.
+
+    After P. Lindstrom, Out-of-core simplification of large polygonal models (2000).
+    """
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.maximum(areas, _LEAST_PULL)
+    matrices = (areas[:, :, None] * normals[:, :, None] * normals[:, None, :]).reshape(-1, 9)
+    rights = areas * normals * (normals * a).sum(axis=1, keepdims=True)
+    # A face counts in the cells of its three corners.
+    corners, face = cell[faces].ravel(), np.arange(len(faces)).repeat(3)
+    matrix = _sums(corners, matrices[face], len(means)).reshape(-1, 3, 3)
+    right = _sums(corners, rights[face], len(means))
+    pull = _PULL * np.trace(matrix, axis1=1, axis2=2)[:, None] + _LEAST_PULL
+    return np.linalg.solve(matrix + pull[:, :, None] * np.eye(3), (right + pull * means)[:, :, None])[:, :, 0]
+
+
+def _distinct(faces: Indices) -> Indices:
+    """The faces with three different corners, each once, wound as they were."""
+    first, second, third = faces.T
+    faces = faces[(first != second) & (second != third) & (third != first)]
+    turned = (faces.argmin(axis=1)[:, None] + [0, 1, 2]) % 3
+    return np.unique(np.take_along_axis(faces, turned, axis=1), axis=0)
+
+
+def _sums(groups: Indices, values: F64, count: int) -> F64:
+    """Sums of the rows of each group, (count, d)."""
+    sums = np.zeros((count, values.shape[1]))
+    np.add.at(sums, groups, values)
+    return sums
+
+
+def _rows(array: NDArray[Any], start: int, count: int) -> NDArray[Any]:
+    return array[start : start + count]
+
+
+def _light(model: mujoco.MjModel, look: Look) -> None:
+    """Lamps and shadow map as `look` has them; antialiasing is the renderer's affair."""
+    quality = model.vis.quality
+    quality.offsamples = 0
+    if not look.shadows:
+        quality.shadowsize = 0
+    lamp = model.vis.headlight
+    for colours in (model.light_ambient, model.light_diffuse, model.light_specular):
+        colours *= look.brightness
+    for colour in (lamp.ambient, lamp.diffuse, lamp.specular):
+        colour *= look.brightness
+    turn = np.deg2rad(look.light_turn)
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    in_world = model.light_bodyid == 0
+    for vectors in (model.light_pos, model.light_dir):
+        vectors[in_world] = vectors[in_world] @ rotation.T

@@ -1,0 +1,91 @@
+"""`manip-il build` gives again what `manip-il record` gave, and says what it could not read."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.data.journal import list_episodes
+from manip_il.data.lerobot_io import dataset_info, read_episodes, read_table
+
+
+def record(root: Path, *words: str) -> list[str]:
+    return ["record", "--robot.type=fetch", f"--dataset.root={root}", "--dataset.num_episodes=3", "--workers=1", *words]
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "demos"
+    assert main(record(root, "--dataset.repo_id=me/demos")) == 0
+    return root
+
+
+def journals_of(root: Path) -> Path:
+    return root.with_name(f"{root.name}.journals")
+
+
+def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
+    assert main(["build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
+    assert files(tmp_path / "again") == files(recorded)
+
+
+def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
+    journals = tmp_path / "x.journals"
+    shutil.copytree(journals_of(recorded), journals)
+    cut = list_episodes(journals)[1]
+    cut.write_bytes(cut.read_bytes()[:-40])
+    assert main(["build", str(journals), str(tmp_path / "x")]) == 1
+    err = capsys.readouterr().err
+    assert f"warning: {cut} is not a whole episode" in err
+    assert "error: 1 journal could not be read" in err
+    assert dataset_info(tmp_path / "x").episodes == 2
+    capsys.readouterr()
+    assert main(["record", *record(tmp_path / "x", "--dataset.repo_id=me/demos", "--resume=true")[1:]]) == 0
+    assert files(tmp_path / "x") == files(recorded)
+    assert cut.with_name(f"{cut.name}.damaged").exists()
+
+
+def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, capsys):
+    words = ["build", str(journals_of(recorded)), str(tmp_path / "x")]
+    assert main(words) == 0
+    before = files(tmp_path / "x")
+    assert main(words) == 2
+    assert "replace it by --overwrite=true" in capsys.readouterr().err
+    assert main([*words, "--overwrite=true", "--repo_id=you/demos"]) == 0
+    assert {name for name, data in files(tmp_path / "x").items() if data != before[name]} == {"meta/manip_il.json"}
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    assert main([*words[:2], str(tmp_path / "mine"), "--overwrite=true"]) == 2
+    assert (tmp_path / "mine" / "thesis.tex").exists()
+
+
+def test_no_journals_are_an_error(tmp_path, capsys):
+    (tmp_path / "empty.journals").mkdir()
+    assert main(["build", str(tmp_path / "empty.journals"), str(tmp_path / "x")]) == 1
+    assert "holds no readable episode" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_or_two(tmp_path):
+    pictured = ["--cameras=front,wrist", "--image.height=64", "--image.width=80", "--task.type=reach"]
+    assert main(record(tmp_path / "one", *pictured)) == 0
+    assert main(record(tmp_path / "two", *pictured, "--workers=2")) == 0
+    assert files(tmp_path / "one") == files(tmp_path / "two")
+    assert main(["build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
+    assert files(tmp_path / "again") == files(tmp_path / "one")
+    frames = read_table(tmp_path / "one", ["index"])["index"]
+    episodes = list(read_episodes(tmp_path / "one"))
+    for camera in ("front", "wrist"):
+        decoded = np.concatenate([episode.columns[f"observation.images.{camera}"] for episode in episodes])
+        assert decoded.shape == (len(frames), 64, 80, 3)
+        assert len(np.unique(decoded)) > 50  # something is to be seen

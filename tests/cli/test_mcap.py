@@ -1,0 +1,120 @@
+"""`manip-il mcap export` and `manip-il mcap import`, as typed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.data.lerobot_io import read_table, write_dataset
+from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.mdp import Episode
+
+SPEC = RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("mcap") / "d"
+    rng = np.random.default_rng(0)
+    episodes = []
+    for seed in range(2):
+        table = features(SPEC).items()
+        columns = {key: rng.normal(size=(4, *f["shape"])).astype(f["dtype"]) for key, f in table}
+        columns["seed"][:] = seed
+        columns["next.success"][:] = True
+        episodes.append(Episode(seed, columns, True, True))
+    write_dataset(episodes, root, SPEC, repo_id="local/d", fingerprint={})
+    return root
+
+
+def error(capsys) -> str:
+    captured = capsys.readouterr()
+    assert captured.err.count("manip-il: error:") == 1
+    return captured.err.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_export_then_import_gives_equal_numbers(dataset, tmp_path, capsys):
+    out, new = tmp_path / "out", tmp_path / "new"
+    assert main(["mcap", "export", str(dataset), str(out)]) == 0
+    assert f"manip-il mcap import {out} DATASET --mapping={out / 'mapping.yaml'}" in capsys.readouterr().out
+    assert main(["mcap", "import", str(out), str(new), f"--mapping={out / 'mapping.yaml'}"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert rows[0] == ["topic", "messages", "used", "unused"]
+    assert ["/sim_state", "8", "8", "0"] in rows
+    left, right = read_table(dataset), read_table(new)
+    assert {key: values.tobytes() for key, values in left.items()} == {
+        key: values.tobytes() for key, values in right.items()
+    }
+
+
+@pytest.mark.slow
+def test_what_the_mapping_leaves_out_is_said(dataset, tmp_path, capsys):
+    out, mapping = tmp_path / "out", tmp_path / "m.yaml"
+    assert main(["mcap", "export", str(dataset), str(out)]) == 0
+    feature = "{topic: /action, field: 'joints[name=b].position', dtype: float32, resample: hold, tolerance: 0.1}"
+    mapping.write_text(f"fps: 10\ntask: t\nfeatures:\n  action: {feature}\n")
+    assert main(["mcap", "import", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert next(line.split() for line in lines if line.startswith("/action ")) == ["/action", "8", "4", "4"]
+    assert next(line for line in lines if line.startswith("/seed ")).endswith("8  not in the mapping")
+    np.testing.assert_array_equal(read_table(tmp_path / "new")["action"], read_table(dataset)["action"][::2, 1])
+
+
+def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["mcap", "export", str(dataset), str(out)]
+    assert main(words) == 0
+    before = {path.name: path.read_bytes() for path in out.glob("*.mcap")}
+    assert len(before) == 2
+    assert main(words) == 2
+    assert "out exists already" in error(capsys)
+    (out / "episode_000000.mcap").unlink()
+    assert main([*words, "--overwrite=true"]) == 0
+    assert {path.name: path.read_bytes() for path in out.glob("*.mcap")} == before
+
+
+def test_an_export_never_overwrites_its_own_dataset(dataset, capsys):
+    for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
+        assert main(["mcap", "export", str(dataset), str(out), "--overwrite=true"]) == 2
+        assert "holds the dataset itself" in error(capsys)
+    assert len(read_table(dataset)["seed"]) == 8
+
+
+def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path, capsys):
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text("fps: 10\ntask: t\nfeatures: {a: {topic: /a, video: true, resample: hold, tolerance: 1}}\n")
+    (tmp_path / "a.mcap").touch()
+    words = ["mcap", "import", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
+    assert main(words) == 2
+    assert error(capsys).endswith("exists already; choose another folder, or delete it first")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "why"),
+    [
+        (["expotr", "a", "b"], 2, "unknown command 'mcap expotr' (did you mean 'mcap export'?); known: mcap export, "),
+        (["export"], 2, "DATASET is missing"),
+        (["export", "nothing", "b"], 1, "nothing is not a LeRobot dataset"),
+        (["import", "a", "b"], 2, "--mapping is missing"),
+        (["import", "a", "b", "--mapping=nothing.yaml"], 2, "cannot read nothing.yaml"),
+        (["import", "a", "b", "--maping=x"], 2, "(did you mean '--mapping'?)"),
+    ],
+)
+def test_wrong_words_are_one_line(words, code, why, capsys):
+    assert main(["mcap", *words]) == code
+    assert why in error(capsys)
+
+
+def test_help_of_two_words(capsys):
+    for words in (["mcap"], ["mcap", "--help"]):
+        assert main(words) == 0
+        out = capsys.readouterr().out
+        assert "usage: manip-il mcap COMMAND" in out
+        assert "  mcap import  " in out
+        assert "record" not in out
+    assert main(["mcap", "import", "--help"]) == 0
+    assert "usage: manip-il mcap import SOURCE DATASET [--option=value ...]" in capsys.readouterr().out

@@ -1,0 +1,100 @@
+"""Files and folders are whole or absent, and a folder has one writer."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from manip_il.data.atomic import exclusive, new_folder, write_file
+from manip_il.errors import FolderBusyError, FolderExistsError
+
+
+def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
+    root = tmp_path / "a" / "new"
+    with new_folder(root) as folder:
+        (folder / "x").write_text("1")
+        assert not root.exists()
+    assert (root / "x").read_text() == "1"
+    with pytest.raises(ZeroDivisionError), new_folder(tmp_path / "other"):
+        _ = 1 / 0
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_one_is_whole(tmp_path):
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "old").touch()
+    with pytest.raises(FolderExistsError), new_folder(root):
+        pass
+    with pytest.raises(ZeroDivisionError), new_folder(root, replace=True):
+        _ = 1 / 0
+    assert (root / "old").exists()
+    with new_folder(root, replace=True) as folder:
+        (folder / "new").touch()
+        assert (root / "old").exists()
+    assert [path.name for path in root.iterdir()] == ["new"]
+    assert [path.name for path in tmp_path.iterdir()] == ["root"]
+
+
+def test_a_killed_writers_folder_is_removed_by_the_next_and_a_living_ones_is_not(tmp_path):
+    writer = start("new_folder", tmp_path / "root")
+    with new_folder(tmp_path / "root"):
+        assert len(list(tmp_path.glob(".root.*.partial"))) == 2
+        kill(writer)
+        assert len(list(tmp_path.glob(".root.*.partial"))) == 2
+    (tmp_path / "root").rmdir()
+    with new_folder(tmp_path / "root"):
+        assert len(list(tmp_path.glob(".root.*.partial"))) == 1
+
+
+def test_a_second_writer_is_refused_by_the_firsts_process_id(tmp_path):
+    writer = start("exclusive", tmp_path / "root")
+    with pytest.raises(FolderBusyError, match=f"in use by process {writer.pid}"), exclusive(tmp_path / "root"):
+        pass
+    kill(writer)
+    with exclusive(tmp_path / "root"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_process_may_hold_a_folder_again_and_two_folders_at_once(tmp_path):
+    with exclusive(tmp_path / "a"), exclusive(tmp_path / "b"):
+        pass
+    with exclusive(tmp_path / "a"):
+        pass
+
+
+def test_a_file_holds_what_it_held_where_writing_fails(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    write_file(path, b"old")
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        write_file(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def full_disk(handle: int) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def start(what: str, root: Path) -> subprocess.Popen[str]:
+    """A process that holds `root` until it is killed."""
+    code = (
+        f"import pathlib, sys, time; from manip_il.data.atomic import {what}\n"
+        f"with {what}(pathlib.Path(sys.argv[1])): print('in', flush=True); time.sleep(60)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(root)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "in\n"
+    return process
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    process.send_signal(signal.SIGKILL)
+    process.wait()

@@ -1,0 +1,278 @@
+"""Cameras: every row's picture is where the dataset says, and comes back."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data import video
+from manip_il.data.lerobot_io import (
+    VideoConfig,
+    camera_keys,
+    count_frames,
+    dataset_info,
+    merge_datasets,
+    new_dataset,
+    read_episodes,
+    read_frames,
+    read_spec,
+    read_table,
+    video_rows,
+    write_dataset,
+)
+from manip_il.data.lerobot_stats import pixel_counts
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.mdp import Episode
+
+from .pictures import numbered_episodes, numbers_of, with_cameras
+
+MakeEpisode = Callable[..., Episode]
+OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": {}}
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+
+
+@pytest.fixture(scope="module")
+def two(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
+    return with_cameras(spec, "front", "wrist")
+
+
+@pytest.fixture(scope="module")
+def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
+    return numbered_episodes(make_episode, two)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
+    root = tmp_path_factory.mktemp("filmed") / "lift"
+    write_dataset(filmed, root, two, **OPTIONS)
+    return root
+
+
+def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options: Any) -> None:
+    with new_dataset(root, spec, **OPTIONS, **options) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        writer.finish()
+
+
+def assert_pictures_come_back(root: Path, episodes: list[Episode]) -> None:
+    for mine, yours in zip(read_episodes(root), episodes, strict=True):
+        assert list(mine.columns) == list(yours.columns)
+        for key, values in yours.columns.items():
+            if key in (FRONT, WRIST):
+                assert numbers_of(mine.columns[key]) == numbers_of(values)
+            else:
+                np.testing.assert_array_equal(mine.columns[key], values)
+
+
+def test_every_frame_comes_back_in_its_place(root: Path, filmed: list[Episode]) -> None:
+    assert_pictures_come_back(root, filmed)
+    assert numbers_of(read_frames(root, FRONT, 2)) == list(range(8, 21))
+    assert numbers_of(read_frames(root, WRIST, 1)) == [28]
+
+
+def test_compression_loses_little(root: Path, filmed: list[Episode]) -> None:
+    frames = read_frames(root, FRONT, 0)
+    assert frames.dtype == np.uint8
+    assert np.abs(frames.astype(float) - filmed[0].columns[FRONT]).mean() < 2
+
+
+def test_rows_equal_decoded_frames(root: Path) -> None:
+    rows = video_rows(root)
+    assert {str(path.relative_to(root)): count for path, count in rows.items()} == {
+        "videos/observation.images.front/chunk-000/file-000.mp4": 21,
+        "videos/observation.images.wrist/chunk-000/file-000.mp4": 21,
+    }
+    assert {path: count_frames(path) for path in rows} == rows
+
+
+def test_a_new_file_starts_between_episodes(tmp_path: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec) -> None:
+    episodes = numbered_episodes(make_episode, two, 9)
+    write(episodes, tmp_path / "small", two, video_files_size_in_mb=0.001)
+    rows = video_rows(tmp_path / "small")
+    assert sum(path.parts[-3] == FRONT for path in rows) > 2
+    assert {path: count_frames(path) for path in rows} == rows
+    assert sorted((tmp_path / "small").rglob("*.mp4")) == sorted(rows)
+    assert_pictures_come_back(tmp_path / "small", episodes)
+
+
+@pytest.mark.parametrize("g", [2, None])
+def test_h264_frames_come_back_too(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec, g: int | None) -> None:
+    write(filmed, tmp_path / "lift", two, video=VideoConfig("h264", g=g, crf=20, preset="veryfast"))
+    assert_pictures_come_back(tmp_path / "lift", filmed)
+    feature = json.loads((tmp_path / "lift" / layout.INFO).read_text())["features"][FRONT]
+    assert (feature["info"]["video.codec"], feature["info"]["video.preset"]) == ("h264", "veryfast")
+
+
+def test_timestamps_are_exact(root: Path, two: s.RobotTaskSpec) -> None:
+    path = next(iter(video_rows(root)))
+    with closing(av.open(str(path))) as container:
+        stream = container.streams.video[0]
+        times = [packet.pts * packet.time_base for packet in container.demux(stream) if packet.pts is not None]
+        assert stream.average_rate == two.fps  # by which torchcodec finds a frame
+    assert times == [Fraction(number, two.fps) for number in range(21)]
+
+
+def test_the_same_episodes_give_the_same_bytes(
+    root: Path, tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec
+) -> None:
+    write(filmed, tmp_path / "again", two)
+    names = {path.relative_to(root) for path in root.rglob("*") if path.is_file()}
+    assert names == {path.relative_to(tmp_path / "again") for path in (tmp_path / "again").rglob("*") if path.is_file()}
+    for name in names:
+        assert (root / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+
+
+def test_statistics_of_pictures_are_those_of_every_pixel(root: Path, filmed: list[Episode]) -> None:
+    stats = json.loads((root / layout.STATS).read_text())[FRONT]
+    assert stats["count"] == [21]
+    pixels = np.concatenate([episode.columns[FRONT] for episode in filmed]).reshape(-1, 3).astype(np.float64) / 255
+    expected = {"min": pixels.min(axis=0), "max": pixels.max(axis=0), "mean": pixels.mean(axis=0)}
+    expected |= {"std": pixels.std(axis=0)}
+    for name, share in layout.QUANTILES.items():
+        expected[name] = np.quantile(pixels, share, axis=0, method="inverted_cdf")
+    for name, values in expected.items():
+        assert np.shape(stats[name]) == (3, 1, 1)
+        np.testing.assert_allclose(np.ravel(stats[name]), values, rtol=1e-10, err_msg=name)
+
+
+def test_pixels_of_episodes_add_up(filmed: list[Episode]) -> None:
+    parts = [episode.columns[FRONT] for episode in filmed]
+    np.testing.assert_array_equal(sum(map(pixel_counts, parts)), pixel_counts(np.concatenate(parts)))
+    noise = np.random.default_rng(0).integers(0, 256, (4, 5, 6, 3), dtype=np.uint8)
+    expected = [np.bincount(noise[..., channel].ravel(), minlength=256) for channel in range(3)]
+    np.testing.assert_array_equal(pixel_counts(noise), expected)
+
+
+def test_a_queue_shorter_than_an_episode_only_slows(
+    tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video, "QUEUE_BYTES", 1)
+    write(filmed, tmp_path / "lift", two)
+    assert_pictures_come_back(tmp_path / "lift", filmed)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"vcodec": "libsvtav2"}, UnknownName, r"unknown video codec 'libsvtav2' \(did you mean 'libsvtav1'\?\)"),
+        ({"g": 0}, UsageError, "g=0; expected 1 or more"),
+        ({"crf": 99}, UsageError, r"cannot encode 96 x 72 pictures .*crf=99.*'crf' out of range \[0 - 63\]"),
+        ({"preset": "slow"}, UsageError, "preset='slow'"),
+        ({"pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
+        ({"pix_fmt": "gray"}, UsageError, "gray has no colours"),
+        ({"pix_fmt": "colourful"}, UsageError, "not a pixel format: 'colourful'"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_before_anything_is_written(
+    tmp_path: Path, two: s.RobotTaskSpec, settings: dict[str, Any], error: type[ManipError], message: str
+) -> None:
+    with (
+        pytest.raises(error, match=message),
+        new_dataset(tmp_path / "lift", two, **OPTIONS, video=VideoConfig(**settings)),
+    ):
+        raise AssertionError("a writer was given")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_of_another_size_are_refused(
+    tmp_path: Path, make_episode: MakeEpisode, filmed: list[Episode], two: s.RobotTaskSpec
+) -> None:
+    larger = dataclasses.replace(two, image_size=(96, 128))
+    with pytest.raises(MismatchError, match=r"'observation\.images\.front' differs.*\(7, 72, 96, 3\)"):
+        write(filmed, tmp_path / "lift", larger)
+    with pytest.raises(MismatchError, match="no such column"):
+        write([make_episode(1)], tmp_path / "lift", two)
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """What a full disk does, for files beyond a size."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("cameras", [(), ("front", "wrist")])
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(
+    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec, cameras: tuple[str, ...]
+) -> None:
+    spec = with_cameras(spec, *cameras)
+    episodes = numbered_episodes(make_episode, spec, 30)
+    with largest_file(6_000), pytest.raises(ManipError, match=r"cannot write .*File too large"):
+        write(episodes, tmp_path / "lift", spec)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_fails_is_one_clear_error(
+    tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: object, frames: object) -> None:
+        raise ManipError("the encoder died")
+
+    monkeypatch.setattr(video.CameraFiles, "write", fail)
+    with pytest.raises(ManipError, match="the encoder died"):
+        write(filmed, tmp_path / "lift", two)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_got_lost_are_counted(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> None:
+    camera = video.CameraFiles(tmp_path, FRONT, VideoConfig(), two.fps, 200)
+    camera.write(filmed[0].columns[FRONT])
+    assert camera._file is not None
+    camera._file.frames += 1
+    with pytest.raises(ManipError, match=r"file-000\.mp4 holds 7 frames; 8 were encoded"):
+        camera.close()
+
+
+def test_a_video_cut_short_is_named(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> None:
+    write(filmed, tmp_path / "lift", two)
+    path = next(iter(video_rows(tmp_path / "lift")))
+    content = path.read_bytes()
+    for size in (0, 100, len(content) // 2, len(content) - 200):
+        path.write_bytes(content[:size])
+        with pytest.raises(ManipError, match=r"file-000\.mp4"):
+            list(read_episodes(tmp_path / "lift"))
+    path.unlink()
+    with pytest.raises(ManipError, match=r"cannot read .*file-000\.mp4: No such file"):
+        read_frames(tmp_path / "lift", FRONT, 0)
+
+
+def test_names_and_numbers_that_are_not_there_are_refused(root: Path) -> None:
+    with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
+        read_frames(root, "observation.images.fron", 0)
+    with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
+        read_frames(root, FRONT, 3)
+
+
+def test_a_dataset_with_cameras_tells_of_itself(
+    tmp_path: Path, root: Path, filmed: list[Episode], two: s.RobotTaskSpec
+) -> None:
+    assert camera_keys(root) == [FRONT, WRIST]
+    assert (dataset_info(root).episodes, dataset_info(root).frames) == (3, 21)
+    assert FRONT not in read_table(root)
+    assert read_spec(root) == two
+    with pytest.raises(ManipError, match="has cameras"):
+        merge_datasets([root, root], tmp_path / "merged", repo_id="x/y")
+    write(filmed, tmp_path / "lift", two)
+    (tmp_path / "lift" / layout.OURS).unlink()  # as LeRobot's tools do
+    assert (read_spec(tmp_path / "lift").cameras, read_spec(tmp_path / "lift").image_size) == (
+        two.cameras,
+        two.image_size,
+    )

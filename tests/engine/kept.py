@@ -1,0 +1,51 @@
+"""What workers do with an episode in these tests; imported by name in their processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+from manip_il.data.journal import JournalKeep
+from manip_il.mdp import Episode
+
+
+@dataclass(frozen=True)
+class DeadlyKeep:
+    """Journals; but the process that packs one of `seeds` is killed, at most `times` times a seed.
+
+    folder: where deaths are counted.
+    """
+
+    journals: JournalKeep
+    folder: Path
+    seeds: tuple[int, ...]
+    times: int
+
+    def pack(self, episode: Episode) -> bytes:
+        """Die, or make the file's content."""
+        if episode.seed in self.seeds and self._deaths(episode.seed) < self.times:
+            (self.folder / f"{episode.seed}-{os.getpid()}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.journals.pack(episode)
+
+    def store(self, seed: int, packed: bytes) -> None:
+        """Write the file."""
+        self.journals.store(seed, packed)
+
+    def _deaths(self, seed: int) -> int:
+        return len(list(self.folder.glob(f"{seed}-*")))
+
+
+@dataclass(frozen=True)
+class FailingKeep:
+    """Cannot store anything."""
+
+    def pack(self, episode: Episode) -> bytes:
+        """Nothing."""
+        return b"x"
+
+    def store(self, seed: int, packed: bytes) -> None:
+        """Fail as a disk does."""
+        raise OSError(28, "No space left on device", f"episode of seed {seed}")

@@ -1,0 +1,99 @@
+"""On Ray the same episodes come home, whatever becomes of a node."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import ray
+from kept import DeadlyKeep
+from ray.cluster_utils import Cluster
+
+from manip_il.data.journal import JournalKeep, list_episodes
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.errors import ManipError
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+pytestmark = pytest.mark.slow
+
+SEEDS = stream_seeds("certificate", 16)
+JOB = RolloutJob(EnvConfig("fetch"), "expert", hold=3)
+
+
+def journal(folder, job: RolloutJob = JOB) -> JournalKeep:
+    return JournalKeep(folder, env_spec(job.env), env_fingerprint(job.env))
+
+
+def contents(folder) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in list_episodes(folder)}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> dict[str, bytes]:
+    """What this process alone writes."""
+    folder = tmp_path_factory.mktemp("here")
+    list(Engine().run(JOB, SEEDS, journal(folder)))
+    return contents(folder)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Two nodes of one core each on this machine, whose workers find `kept`."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    two = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    two.add_node(num_cpus=1)
+    two.wait_for_nodes()
+    ray.init(address=two.address, log_to_driver=False, logging_level=logging.ERROR)
+    yield two
+    ray.shutdown()
+    two.shutdown()
+    patch.undo()
+
+
+def test_a_cluster_writes_what_this_process_writes(cluster, tmp_path, expected):
+    with Engine(None, "ray") as engine:
+        assert len(list(engine.run(JOB, SEEDS, journal(tmp_path)))) == len(SEEDS)
+    assert contents(tmp_path) == expected
+
+
+def test_a_policy_acts_the_same_on_a_cluster(cluster, checkpoint):
+    job = RolloutJob(EnvConfig(horizon=10), "policy", policy=checkpoint)
+    with Engine(2, "ray") as engine:
+        there = {episode.seed: episode for episode in engine.run(job, SEEDS[:4])}
+    for episode in Engine().run(job, SEEDS[:4]):
+        for key, column in episode.columns.items():
+            assert there[episode.seed].columns[key].tobytes() == column.tobytes()
+
+
+def test_a_seed_that_kills_its_worker_is_left_out_there_too(cluster, tmp_path, expected):
+    (tmp_path / "deaths").mkdir()
+    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    with Engine(2, "ray") as engine:
+        done = {episode.seed for episode in engine.run(JOB, SEEDS[:5], keep)}
+        assert engine.given_up == [SEEDS[2]]
+    assert done == {SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]}
+    assert contents(tmp_path / "journals").items() <= expected.items()
+    assert len(list((tmp_path / "deaths").iterdir())) == 3
+
+
+def test_what_the_work_raises_comes_home(cluster):
+    with Engine(2, "ray") as engine, pytest.raises(ManipError, match="unknown robot 'nobody'"):
+        list(engine.run(replace(JOB, env=replace(JOB.env, robot="nobody")), SEEDS))
+
+
+def test_a_node_that_is_killed_costs_no_episode(cluster, tmp_path, expected):
+    node = cluster.add_node(num_cpus=2)
+    cluster.wait_for_nodes()
+    with Engine(4, "ray") as engine:
+        for count, _ in enumerate(engine.run(JOB, SEEDS, journal(tmp_path))):
+            if count == 3:
+                cluster.remove_node(node, allow_graceful=False)
+        assert engine.given_up == []
+    assert contents(tmp_path) == expected

@@ -1,0 +1,147 @@
+"""Where episodes run does not matter, and a worker that dies costs no episode."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from kept import DeadlyKeep, FailingKeep
+
+from manip_il.data.journal import JournalKeep, list_episodes, list_seeds
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.engine import Engine, _tasks
+from manip_il.engine.jobs import RolloutJob
+from manip_il.errors import ManipError
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+SEEDS = stream_seeds("certificate", 6)
+JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=3)
+
+
+def journal(folder: Path, job: RolloutJob = JOB) -> JournalKeep:
+    return JournalKeep(folder, env_spec(job.env), env_fingerprint(job.env))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in list_episodes(folder)}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> dict[str, bytes]:
+    """What this process alone writes."""
+    folder = tmp_path_factory.mktemp("here")
+    assert len(list(Engine().run(JOB, SEEDS, journal(folder)))) == len(SEEDS)
+    return contents(folder)
+
+
+@pytest.fixture(scope="module")
+def two_processes() -> Iterator[Engine]:
+    with Engine(2) as engine:
+        yield engine
+
+
+@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (60, 2), (200, 3)])
+def test_every_seed_is_in_one_task_and_no_worker_idles(seeds: int, workers: int):
+    learner = replace(JOB, driver="policy", policy=Path("x"))
+    for job in (JOB, learner):
+        tasks = _tasks(job, range(seeds), None, workers)
+        assert [seed for task in tasks for seed in task.seeds] == list(range(seeds))
+        assert len(tasks) >= min(seeds, workers)
+    assert max(len(task.seeds) for task in tasks) <= 25
+
+
+@pytest.mark.slow
+def test_an_episode_is_on_disk_before_it_arrives(two_processes, tmp_path, expected):
+    for episode in two_processes.run(JOB, SEEDS, journal(tmp_path)):
+        assert episode.seed in list_seeds(tmp_path)
+    assert contents(tmp_path) == expected
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_replaced_and_its_seed_runs_again(two_processes, tmp_path, expected):
+    (tmp_path / "deaths").mkdir()
+    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[1], SEEDS[4]), times=2)
+    episodes = list(two_processes.run(JOB, SEEDS, keep))
+    assert sorted(episode.seed for episode in episodes) == list(SEEDS)
+    assert contents(tmp_path / "journals") == expected
+    assert len(list((tmp_path / "deaths").iterdir())) == 4
+    assert two_processes.given_up == []
+
+
+@pytest.mark.slow
+def test_a_seed_that_kills_its_worker_three_times_is_left_out_and_named(tmp_path, expected):
+    (tmp_path / "deaths").mkdir()
+    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    with Engine(2) as engine:
+        episodes = list(engine.run(JOB, SEEDS, keep))
+        assert engine.given_up == [SEEDS[2]]
+        assert [*engine.run(JOB, [SEEDS[2]], keep)] == []  # known by now
+    assert sorted(episode.seed for episode in episodes) == [seed for seed in SEEDS if seed != SEEDS[2]]
+    assert len(list((tmp_path / "deaths").iterdir())) == 3
+
+
+@pytest.mark.slow
+def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tmp_path):
+    job = RolloutJob(EnvConfig(horizon=10), "policy", policy=checkpoint, labels="all")
+    (tmp_path / "deaths").mkdir()
+    keep = DeadlyKeep(journal(tmp_path / "journals", job), tmp_path / "deaths", (SEEDS[0],), times=1000)
+    with Engine(2) as engine:
+        done = {episode.seed for episode in engine.run(job, SEEDS, keep)}
+        assert engine.given_up == [SEEDS[0]]
+    assert done == set(SEEDS[1:]) == set(list_seeds(tmp_path / "journals"))
+
+
+@pytest.mark.slow
+def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
+    (tmp_path / "deaths").mkdir()
+    seeds = stream_seeds("certificate", 40)
+    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", tuple(seeds), times=1000)
+    with Engine(2) as engine, pytest.raises(ManipError, match=r"rollout workers died one after the other.*SIGKILL"):
+        list(engine.run(JOB, seeds, keep))
+
+
+@pytest.mark.slow
+def test_what_a_worker_raises_arrives_and_the_engine_goes_on(two_processes, tmp_path):
+    with pytest.raises(ManipError, match="no such folder"):
+        list(two_processes.run(RolloutJob(EnvConfig(), "policy", policy=Path("no such folder")), SEEDS))
+    with pytest.raises(ManipError, match=r"No space left on device.*episode of seed"):
+        list(two_processes.run(JOB, SEEDS, FailingKeep()))
+    assert len(list(two_processes.run(JOB, SEEDS[:2]))) == 2
+
+
+@pytest.mark.slow
+def test_workers_end_with_the_process_that_started_them():
+    code = (
+        "from manip_il.engine.engine import *\n"
+        "from manip_il.sim.env import EnvConfig\n"
+        "engine = Engine(2)\n"
+        "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
+        "    print([worker._process.pid for worker in engine._place._busy.values()], flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pids = [int(pid) for pid in parent.stdout.readline().strip("[]\n").split(",")]
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while any(alive(pid) for pid in pids):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as stat:
+            return stat.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+    finally:
+        os.sched_yield()

@@ -1,0 +1,63 @@
+"""A journal that is cut at any byte costs its own episode and no other."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from manip_il.data.build import build
+from manip_il.data.doctor.examine import examine_folder
+from manip_il.data.journal import JournalKeep, list_episodes
+from manip_il.data.lerobot_io import read_table
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+CUTS = 200
+JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=1)
+SEEDS = stream_seeds("demonstrations", 3)
+
+
+@pytest.fixture(scope="module")
+def journals(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recorded") / "demos.journals"
+    list(Engine().run(JOB, SEEDS, JournalKeep(folder, env_spec(JOB.env), env_fingerprint(JOB.env))))
+    return folder
+
+
+@pytest.mark.slow
+def test_no_cut_loses_another_episode_or_stops_the_doctor(journals, tmp_path):
+    build(journals, tmp_path / "whole")
+    rng = np.random.default_rng(0)
+    for number in range(CUTS):
+        folder, root = tmp_path / f"{number}.journals", tmp_path / str(number)
+        shutil.copytree(journals, folder)
+        cut = list_episodes(folder)[number % len(SEEDS)]
+        cut.write_bytes(cut.read_bytes()[: rng.integers(cut.stat().st_size)])
+        result = build(folder, root)
+        others = [seed for index, seed in enumerate(SEEDS) if index != number % len(SEEDS)]
+        assert np.unique(read_table(root, ["seed"])["seed"]).tolist() == others
+        assert len(result.damaged) == 1
+        assert cut.name in result.damaged[0]
+        assert any(cut.name in finding.place + finding.text for finding in examine_folder(root))
+        shutil.rmtree(root)
+        shutil.copytree(tmp_path / "whole", root)  # the dataset from before the damage holds what the journal lost
+        assert any(cut.name in finding.place + finding.text for finding in examine_folder(root))
+        shutil.rmtree(root)
+        shutil.rmtree(folder)
+
+
+def test_a_single_changed_byte_is_noticed(journals, tmp_path):
+    shutil.copytree(journals, tmp_path / "x.journals")
+    path = list_episodes(tmp_path / "x.journals")[1]
+    whole = path.read_bytes()
+    for place in np.random.default_rng(1).integers(len(whole), size=40).tolist():
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        result = build(tmp_path / "x.journals", tmp_path / "x")
+        assert len(result.damaged) == 1, place
+        assert result.info.episodes == 2
+        shutil.rmtree(tmp_path / "x")

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+
+import pytest
+
+from manip_il.data.fingerprint import canonical_json
+from manip_il.errors import UnknownName, UsageError
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.look import FILM, CameraConfig, Look
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"names": ()}, "cameras are none; expected at least one"),
+        ({"names": ("front", "front")}, "front, front; expected at least one, each once"),
+        ({"height": 127}, "height 127 and width 128; expected even numbers from 16 to 2048"),
+        ({"width": 14}, "height 128 and width 14"),
+        ({"width": 4096}, "width 4096"),
+    ],
+)
+def test_pictures_that_no_video_takes_are_refused(arguments, words):
+    with pytest.raises(UsageError, match=words):
+        CameraConfig(**{"names": ("front",), **arguments})
+
+
+def test_an_unknown_camera_answers_with_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'front'"):
+        CameraConfig(("frnt",))
+    with pytest.raises(UnknownName, match="did you mean 'wrist'"):
+        ManipEnv("panda", "reach", cameras=("wrst",))
+
+
+@pytest.mark.parametrize("brightness", [0.0, 2.1, -1.0, float("nan"), float("inf")])
+def test_a_brightness_out_of_range_is_refused(brightness):
+    with pytest.raises(UsageError, match=r"brightness is .*; expected a factor from 0\.1 to 2"):
+        Look(brightness=brightness)
+
+
+@pytest.mark.parametrize("turn", [-181.0, 360.0, float("nan")])
+def test_a_turn_out_of_range_is_refused(turn):
+    with pytest.raises(UsageError, match=r"light_turn is .* degrees"):
+        Look(light_turn=turn)
+
+
+def test_equal_configurations_have_one_canonical_text_and_others_another():
+    config = CameraConfig(("front", "wrist"), 96, 128, FILM)
+    same = pickle.loads(pickle.dumps(config))
+    assert same == config
+    assert canonical_json(same) == canonical_json(config)
+    texts = {canonical_json(dataclasses.replace(config, look=look)) for look in (FILM, Look(), Look(light_turn=90))}
+    assert len(texts) == 3
+    assert json.loads(canonical_json(config)) == json.loads(json.dumps(dataclasses.asdict(config)))
