@@ -160,7 +160,7 @@ def _demonstrate(
     while True:
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
         found = list(collect_successes(engine, job, seeds, count, journals, stages.episode))
-        frames = sum(header.frames for path in found if (header := read_header(path)).success)
+        frames = sum(read_header(one.path).frames for one in found if one.success)
         if frames >= labels:
             break
         count = max(count + 1, math.ceil(count * labels / frames))

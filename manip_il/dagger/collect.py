@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from manip_il.data.build import Builder, Recording
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import (
+    Header,
     JournalKeep,
     clean_temporary,
     episode_path,
@@ -20,7 +23,7 @@ from manip_il.data.journal import (
     set_aside_damaged,
 )
 from manip_il.data.lerobot_io import DatasetInfo
-from manip_il.data.schema import check_same_spec
+from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
@@ -29,35 +32,69 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
+_IN_HAND = 64  # episodes that may wait in memory; others are read again
 MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
+
+
+@dataclass(frozen=True)
+class Collected:
+    """One episode on disk. episode: all of it, where it is in memory still; else None."""
+
+    path: Path
+    success: bool
+    episode: Episode | None
+
+    def read(self, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> tuple[Header, Episode]:
+        """What `read_journal` gives. spec, fingerprint: of what was run here."""
+        if self.episode is None:
+            return read_journal(self.path)
+        return Header.of(self.episode, spec, fingerprint), self.episode
 
 
 def collect(
     engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
-) -> Iterator[Path]:
+) -> Iterator[Collected]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
-    Yields the journals in the order of the seeds, as soon as all before one are there. A seed that kills its worker
-    again and again has none: a warning names it. on_episode is called once an episode is on disk; what it raises
-    ends the run, and what is on disk stays.
+    Yields them in the order of the seeds, as soon as all before one are there. A seed that kills its worker again
+    and again is left out: a warning names it. on_episode is called once an episode is on disk; what it raises ends
+    the run, and what is on disk stays.
     """
-    there = set(list_seeds(journals))
-    missing = [seed for seed in seeds if seed not in there]
+    shelf = _Shelf(job, journals)
+    missing = [seed for seed in seeds if seed not in shelf.there]
     keep = JournalKeep(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
-    waiting = iter(seeds)
-    seed = next(waiting, None)
+    waiting = deque(seeds)
     for episode in engine.run(job, missing, keep):
-        there.add(episode.seed)
+        shelf.put(episode)
         if on_episode is not None:
             on_episode(episode)
-        while seed in there:
-            yield episode_path(journals, seed)
-            seed = next(waiting, None)
-    for left in seeds[len(seeds) if seed is None else seeds.index(seed) :]:
-        if left in there:
-            yield episode_path(journals, left)
+        while waiting and waiting[0] in shelf.there:
+            yield shelf.take(waiting.popleft())
+    for seed in waiting:
+        if seed in shelf.there:
+            yield shelf.take(seed)
         else:
-            _LOG.warning("seed %d is left out: it killed its worker again and again", left)
+            _LOG.warning("seed %d is left out: it killed its worker again and again", seed)
+
+
+class _Shelf:
+    """Episodes on disk, some of them in memory for those before them."""
+
+    def __init__(self, job: RolloutJob, journals: Path):
+        self._journals = journals
+        self._pictured = job.cameras is not None
+        self._in_hand: dict[int, Episode] = {}
+        self.there = dict.fromkeys(list_seeds(journals), False)  # seed -> whether it was run here and succeeded
+
+    def put(self, episode: Episode) -> None:
+        self.there[episode.seed] = episode.success
+        whole = not self._pictured or any(key.startswith(IMAGES) for key in episode.columns)
+        if whole and len(self._in_hand) < _IN_HAND:
+            self._in_hand[episode.seed] = episode
+
+    def take(self, seed: int) -> Collected:
+        path, episode = episode_path(self._journals, seed), self._in_hand.pop(seed, None)
+        return Collected(path, self.there[seed] or read_header(path).success, episode)
 
 
 def collect_successes(
@@ -67,8 +104,8 @@ def collect_successes(
     count: int,
     journals: Path,
     on_episode: OnEpisode | None = None,
-) -> Iterator[Path]:
-    """Run seeds in order until `count` episodes succeeded; yields the journals of all of them, in seed order.
+) -> Iterator[Collected]:
+    """Run seeds in order until `count` episodes succeeded; yields all of them, in seed order.
 
     Which episodes come out depends on the seeds alone. Raises `ManipError` where too few succeed.
     """
@@ -78,13 +115,18 @@ def collect_successes(
         if tried + count - good > min(len(seeds), MAX_TRIES * count):
             raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} were asked for")
         tried += len(more)
-        for path in collect(engine, job, more, journals, on_episode):
-            good += read_header(path).success
-            yield path
+        for collected in collect(engine, job, more, journals, on_episode):
+            good += collected.success
+            yield collected
 
 
 def record(
-    episodes: Iterable[Path], journals: Path, root: Path, job: RolloutJob, recording: Recording, replace: bool = False
+    episodes: Iterable[Collected],
+    journals: Path,
+    root: Path,
+    job: RolloutJob,
+    recording: Recording,
+    replace: bool = False,
 ) -> tuple[DatasetInfo, int]:
     """Write the dataset as the episodes come; its counts, and how many failed episodes were left out.
 
@@ -94,8 +136,8 @@ def record(
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
     with recording.open(root, spec, fingerprint, replace=replace) as writer:
         builder = Builder(writer, recording)
-        for path in episodes:
-            builder.add(*read_journal(path))
+        for collected in episodes:
+            builder.add(*collected.read(spec, fingerprint))
         return builder.finish(), builder.failed
 
 

@@ -50,6 +50,11 @@ class Header:
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
 
+    @classmethod
+    def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
+        """What the journal of an episode says."""
+        return cls(episode.seed, episode.success, episode.success_at_end, len(episode), spec, fingerprint)
+
 
 @dataclass(frozen=True)
 class JournalKeep:

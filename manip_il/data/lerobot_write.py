@@ -160,6 +160,12 @@ class DatasetWriter:
             success_at_end=self._success_at_end,
         )
 
+    def wait(self) -> None:
+        """Until every picture so far is encoded."""
+        for _, clips in self._encoding:
+            for clip in clips.values():
+                clip.result()
+
     def close(self) -> None:
         """Let go of files and threads, finished or not."""
         self._cameras.stop()

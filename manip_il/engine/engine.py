@@ -46,7 +46,7 @@ class Task:
 class Event:
     """What became of a task: an episode ended, all did, its worker died, or the work itself failed.
 
-    episode: without pictures, which stay where they were made. packed: what is still to be stored here.
+    episode: without pictures. packed: what is still to be stored here.
     """
 
     task: Task
@@ -97,9 +97,10 @@ class Engine:
         self._place: Place | None = None
 
     def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
-        """Yield one episode a seed as they end, without pictures, in no fixed order, each once it is kept.
+        """Yield one episode a seed as they end, in no fixed order, each once it is kept.
 
-        Raises what the work raises, and `ManipError` where workers die without one episode getting done.
+        Pictures stay in the process that made them: episodes from another one come without. Raises what the work
+        raises, and `ManipError` where workers die without one episode getting done.
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
         if self.where == "local" and (self.workers == 1 or (len(wanted) == 1 and self._place is None)):
@@ -169,8 +170,7 @@ class Engine:
 def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
     """In a worker: each episode as it ends, without pictures, and what there is to store of it."""
     for episode in run_job(task.job, task.seeds):
-        packed = task.keep.pack(episode) if task.keep is not None else None
-        yield episode.without_pictures(), packed
+        yield episode.without_pictures(), task.keep.pack(episode) if task.keep is not None else None
 
 
 def portable(error: Exception) -> Exception:
@@ -179,9 +179,9 @@ def portable(error: Exception) -> Exception:
 
 
 def _run_here(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[Episode]:
-    for episode, packed in run_task(Task(job, tuple(seeds), keep)):
+    for episode in run_job(job, seeds):
         if keep is not None:
-            keep.store(episode.seed, packed)
+            keep.store(episode.seed, keep.pack(episode))
         yield episode
 
 

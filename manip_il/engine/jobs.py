@@ -48,7 +48,8 @@ class RolloutJob:
 
 def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     """Yield one episode a seed, in the order in which they end."""
-    envs = [_environment(job) for _ in range(min(LOCKSTEP, len(seeds)))]
+    side_by_side = LOCKSTEP if job.policy is not None else 1  # alone, an environment has the processor's cache
+    envs = [_environment(job) for _ in range(min(side_by_side, len(seeds)))]
     if not envs:
         return
     rules = Rules(job.env.horizon, job.hold, "all" if job.driver in ("expert", "mixture") else job.labels)

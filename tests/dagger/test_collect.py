@@ -49,7 +49,7 @@ def names(folder: Path) -> list[int]:
 
 def test_every_seed_becomes_a_file_that_holds_its_episode(tmp_path):
     seen: list[Episode] = []
-    paths = list(collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append))
+    paths = [one.path for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append)]
     assert paths == list_episodes(tmp_path)
     assert names(tmp_path) == list(SEEDS[:3])
     by_seed = {episode.seed: episode for episode in seen}
@@ -79,7 +79,7 @@ def test_an_episode_is_on_disk_before_anybody_hears_of_it(tmp_path):
 def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
     failing = [SEEDS[0], SEEDS[2], SEEDS[4]]
     paths = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
-    assert [read_header(path).seed for path in paths] == list(SEEDS[:7])
+    assert [read_header(one.path).seed for one in paths] == list(SEEDS[:7])
 
 
 def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_path):
@@ -87,7 +87,8 @@ def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_pat
     first = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "a"))
     list(collect(Recorded(failing), JOB, SEEDS[2:8], tmp_path / "b"))
     second = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "b"))
-    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    assert [one.path.read_bytes() for one in first] == [one.path.read_bytes() for one in second]
+    assert [one.success for one in first] == [one.success for one in second] == [True, False, True, True]
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
@@ -104,7 +105,7 @@ class Shuffled(Recorded):
 
 def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_path, caplog):
     paths = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
-    assert [read_header(path).seed for path in paths] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
+    assert [read_header(one.path).seed for one in paths] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
     assert [record.getMessage() for record in caplog.records] == [
         f"seed {SEEDS[2]} is left out: it killed its worker again and again"
     ]
@@ -123,7 +124,7 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
 
 
 def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path):
-    whole = [path.read_bytes() for path in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
+    whole = [one.path.read_bytes() for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
     damaged = list_episodes(tmp_path)[1]
     damaged.write_bytes(whole[1][:5000])
     warnings = check_journals(tmp_path, JOB)
@@ -131,7 +132,7 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path):
     assert damaged.name in warnings[0]
     assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
     engine = Recorded()
-    assert [path.read_bytes() for path in collect(engine, JOB, SEEDS[:3], tmp_path)] == whole
+    assert [one.path.read_bytes() for one in collect(engine, JOB, SEEDS[:3], tmp_path)] == whole
     assert engine.asked == [SEEDS[1]]
 
 

@@ -42,7 +42,10 @@ def filmed(make_episode: Callable[..., Episode], filming: s.RobotTaskSpec) -> li
 @pytest.fixture(scope="module")
 def our_film(tmp_path_factory: pytest.TempPathFactory, filming: s.RobotTaskSpec, filmed: list[Episode]) -> Path:
     root = tmp_path_factory.mktemp("ours") / "film"
-    write_dataset(filmed, root, filming, repo_id=REPO, fingerprint={})
+    with new_dataset(root, filming, repo_id=REPO, fingerprint={}, video=VideoConfig("libsvtav1")) as writer:
+        for episode in filmed:
+            writer.add(episode)
+        writer.finish()
     return root
 
 
@@ -66,7 +69,7 @@ def test_video_settings_are_the_librarys() -> None:
     for ours, theirs in (
         (VideoConfig("libsvtav1"), RGBEncoderConfig()),
         (VideoConfig("libsvtav1", "yuv420p10le", 5, 20, 8), RGBEncoderConfig("libsvtav1", "yuv420p10le", 5, 20, 8)),
-        (VideoConfig("h264"), RGBEncoderConfig("h264")),
+        (VideoConfig("h264", crf=30, preset="fast"), RGBEncoderConfig("h264", preset="fast")),
     ):
         for field in dataclasses.fields(ours):
             assert getattr(ours, field.name) == getattr(theirs, field.name), field.name

@@ -164,14 +164,21 @@ def test_a_queue_shorter_than_an_episode_only_slows(
     assert_pictures_come_back(tmp_path / "lift", filmed)
 
 
+AV1 = {"vcodec": "libsvtav1"}
+
+
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
         ({"vcodec": "libsvtav2"}, UnknownName, r"unknown video codec 'libsvtav2' \(did you mean 'libsvtav1'\?\)"),
         ({"g": 0}, UsageError, "g=0; expected 1 or more"),
-        ({"crf": 99}, UsageError, r"cannot encode 96 x 72 pictures .*crf=99.*'crf' out of range \[0 - 63\]"),
-        ({"preset": "slow"}, UsageError, "preset='slow'"),
-        ({"pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
+        (
+            {"vcodec": "libsvtav1", "crf": 99},
+            UsageError,
+            r"cannot encode 96 x 72 pictures .*crf=99.*'crf' out of range \[0 - 63\]",
+        ),
+        ({**AV1, "preset": "slow"}, UsageError, "preset='slow'"),
+        ({**AV1, "pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
         ({"pix_fmt": "gray"}, UsageError, "gray has no colours"),
         ({"pix_fmt": "colourful"}, UsageError, "not a pixel format: 'colourful'"),
     ],
