@@ -2,8 +2,9 @@
 
 python benchmarks/recording_flat.py [--episodes=10000]
 
-`manip-il record`'s own path on one worker: simulate, label, journal, dataset, and the dataset's end, with exact
-statistics over all frames. Every thousand episodes: seconds an episode, and resident memory of the process.
+Fetch's reach, the cheapest to simulate, on one worker by `manip-il record`'s own path: simulate, label, journal,
+dataset, and the dataset's end, with exact statistics over all frames. Every thousand episodes: seconds an episode,
+and resident memory of the process.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=10_000)
     count = parser.parse_args().episodes
     print(describe_machine())
-    job = RolloutJob(EnvConfig("fetch"), "expert", beta=1.0, hold=10)
+    job = RolloutJob(EnvConfig("fetch", "reach"), "expert", beta=1.0, hold=10)
     part = count // PARTS
     clock: list[float] = []
     memory: list[float] = []

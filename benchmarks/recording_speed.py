@@ -4,6 +4,7 @@ python benchmarks/recording_speed.py [--quick]
 
 One core: this process is held on one core, threads that encode video included. The limit is `mj_step` replaying the
 recorded controls from the same starts; with cameras, that and drawing the same pictures; episode by episode by turns.
+Beside it: as `record` runs, with a second core for video, recordings and their limits by turns.
 Two workers: the same recording with two processes against one, all warm, beside two processes of bare physics against
 one, which is what the machine can give. The median ratio over the repeats counts.
 """
@@ -24,9 +25,11 @@ from pathlib import Path
 import numpy as np
 from _machine import describe_machine
 
+os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
+
 from manip_il.dagger.collect import collect, provenance
 from manip_il.data.build import Builder, Recording
-from manip_il.data.journal import read_episode
+from manip_il.data.journal import list_episodes, read_episode
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
@@ -53,6 +56,7 @@ def main() -> int:
     for robot in ROBOTS:
         job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD, cameras=CAMERAS)
         report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 10, 2 if quick else 5))
+        report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 10, 2 if quick else 5))
     print("two workers against one       recording              bare physics: the machine's limit")
     for robot in ROBOTS:
         job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD)
@@ -75,6 +79,23 @@ def one_core(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float],
     finally:
         os.sched_setaffinity(0, cores)
     return [ours for ours, _ in measured], [limit for _, limit in measured]
+
+
+def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], list[float]]:
+    """Control steps a second where video may be encoded on another core while this one simulates and draws."""
+    ours: list[float] = []
+    limits: list[float] = []
+    for repeat in range(-1, repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            root = Path(folder) / "demos"
+            seconds = record_seconds(Engine(), job, stream_seeds("certificate", episodes), root)
+            recorded = [read_episode(path) for path in list_episodes(root.with_name("demos.journals"))]
+        frames = sum(len(episode) for episode in recorded)
+        limit = sum(replay_seconds(job, one.seed, one.columns["executed_action"]) for one in recorded)
+        if repeat >= 0:
+            ours.append(frames / seconds)
+            limits.append(frames / limit)
+    return ours, limits
 
 
 def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:

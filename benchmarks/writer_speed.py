@@ -27,7 +27,7 @@ from lerobot.datasets import LeRobotDataset
 
 import datasets
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import new_dataset
+from manip_il.data.lerobot_io import VideoConfig, new_dataset
 from manip_il.mdp import Episode
 
 LENGTH = 100  # frames of an episode
@@ -79,7 +79,7 @@ def rate(write: Write, spec: s.RobotTaskSpec, episodes: list[Episode]) -> float:
 
 
 def ours(root: Path, spec: s.RobotTaskSpec, episodes: list[Episode]) -> None:
-    with new_dataset(root, spec, repo_id=REPO, fingerprint={}) as writer:
+    with new_dataset(root, spec, repo_id=REPO, fingerprint={}, video=VideoConfig("libsvtav1")) as writer:
         for episode in episodes:
             writer.add(episode)
         writer.finish()

@@ -87,7 +87,7 @@ class Builder:
         return self._recording.episodes is not None and self.count >= self._recording.episodes
 
     def add(self, header: Header, episode: Episode) -> None:
-        """Take an episode and what its journal says. Raises `MismatchError` where that is not about what the first is."""
+        """Take an episode and what its journal says; `MismatchError` where that is about something else than before."""
         self._first = self._first or header
         if header.spec != self._first.spec:
             who = f"the journal of seed {header.seed}"

@@ -29,6 +29,7 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 _MIB = 1024 * 1024
+_GROUP_ROWS = 1_000  # frames in a row group
 _EPISODE_ROWS = 100  # rows of meta/episodes held before they are written
 FORMAT = 1  # of meta/manip_il.json
 
@@ -100,7 +101,7 @@ class DatasetWriter:
         file_sizes: tuple[float, float],
     ):
         self._folder, self._root, self._spec, self._ours, self._file_sizes = folder, root, spec, ours, file_sizes
-        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(spec))
+        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(spec), _GROUP_ROWS)
         self._meta = ParquetFiles(folder, layout.EPISODES_PATH, layout.episodes_schema(spec))
         self._cameras = CameraThreads(
             {key: CameraFiles(folder, key, video, spec.fps, file_sizes[1]) for key in spec.image_keys}
@@ -169,8 +170,7 @@ class DatasetWriter:
     def close(self) -> None:
         """Let go of files and threads, finished or not."""
         self._cameras.stop()
-        self._stats.close()
-        for files in (self._data, self._meta):
+        for files in (self._data, self._meta, self._stats):
             with contextlib.suppress(OSError):  # a full disk has been complained of
                 files.close()
 
@@ -185,7 +185,7 @@ class DatasetWriter:
         }
 
     def _write_data(self, columns: Mapping[str, NDArray[Any]], length: int) -> dict[str, Any]:
-        """One row group of data; returns the episode's row of meta/episodes without statistics."""
+        """The episode's rows; returns the episode's row of meta/episodes without statistics."""
         # LeRobot's rule: a new file where this episode, at the file's size a frame so far, would fill it
         size, frames = self._data.size, self._data.rows
         if frames and size + size / frames * length >= self._file_sizes[0] * _MIB:

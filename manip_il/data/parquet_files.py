@@ -1,4 +1,4 @@
-"""Numbered parquet files that are appended to, one row group at a time."""
+"""Numbered parquet files that are appended to, a row group at a time."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ from manip_il.data import lerobot_layout as layout
 
 
 class ParquetFiles:
-    """Numbered parquet files, one open at a time."""
+    """Numbered parquet files, one open at a time.
 
-    def __init__(self, folder: Path, template: str, schema: pa.Schema):
-        self._folder, self._template, self.schema = folder, template, schema
+    group_rows: rows that a row group has at least, but for a file's last. A writer keeps a description of every row
+    group in memory until the file is closed, so many small ones would cost more than the rows.
+    """
+
+    def __init__(self, folder: Path, template: str, schema: pa.Schema, group_rows: int = 1):
+        self._folder, self._template, self.schema, self._group_rows = folder, template, schema, group_rows
         self._number = 0
         self._path = folder
         self._writer: pq.ParquetWriter | None = None
-        self.rows = 0  # in the open file
+        self._waiting: list[pa.Table] = []
+        self.rows = 0  # in the open file, waiting ones too
 
     @property
     def size(self) -> int:
-        """Bytes in the open file."""
-        return self._path.stat().st_size if self._writer else 0
+        """Bytes in the open file; rows that wait count as they are in memory."""
+        written = self._path.stat().st_size if self._writer else 0
+        return written + sum(table.nbytes for table in self._waiting)
 
     @property
     def next_place(self) -> tuple[int, int]:
@@ -35,10 +41,27 @@ class ParquetFiles:
         return layout.numbered(self._template, self._number)[1:]
 
     def write(self, table: pa.Table) -> tuple[int, int]:
-        """Append one row group; return the chunk and file index it went to."""
-        name, chunk, file = layout.numbered(self._template, self._number)
+        """Append rows; return the chunk and file index that they go to."""
+        self._waiting.append(table)
+        self.rows += len(table)
+        if sum(map(len, self._waiting)) >= self._group_rows:
+            self._flush()
+        return self.next_place
+
+    def close(self) -> None:
+        """Close the open file, if any; the next write opens the next one."""
+        if self._waiting:
+            self._flush()
+        if self._writer is not None:
+            writer, self._writer = self._writer, None  # first: a full disk lets no file be closed twice
+            writer.close()
+            self._number += 1
+            self.rows = 0
+
+    def _flush(self) -> None:
+        table, self._waiting = pa.concat_tables(self._waiting).combine_chunks(), []
         if self._writer is None:
-            self._path = self._folder / name
+            self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = pq.ParquetWriter(
                 self._path,
@@ -48,16 +71,6 @@ class ParquetFiles:
                 write_page_checksum=True,  # else a changed bit is read as another number
             )
         self._writer.write_table(table)
-        self.rows += len(table)
-        return chunk, file
-
-    def close(self) -> None:
-        """Close the open file, if any; the next write opens the next one."""
-        if self._writer is not None:
-            writer, self._writer = self._writer, None  # first: a full disk lets no file be closed twice
-            writer.close()
-            self._number += 1
-            self.rows = 0
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
