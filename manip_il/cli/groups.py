@@ -183,9 +183,9 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps)
     check_same_spec(str(root), spec, "this program", env_spec(env))
-    # Tolerance and horizon do not matter to what is learnt, and a dataset does not say them.
+    # Tolerance and horizon do not matter to what is learnt, and a dataset does not say them; nor do pictures, unseen.
     here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
-    theirs = {key: value for key, value in fingerprint.items() if key != "config_sha256"}
+    theirs = {key: value for key, value in fingerprint.items() if key not in ("config_sha256", "cameras_sha256")}
     warn(compare_fingerprints(str(root), theirs, "this machine", here))
 
 

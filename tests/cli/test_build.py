@@ -89,3 +89,9 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
         decoded = np.concatenate([episode.columns[f"observation.images.{camera}"] for episode in episodes])
         assert decoded.shape == (len(frames), 64, 80, 3)
         assert len(np.unique(decoded)) > 50  # something is to be seen
+    [video, _] = (tmp_path / "again").rglob("*.mp4")
+    video.write_bytes(video.read_bytes()[:-1000])
+    assert main(["doctor", str(tmp_path / "again")]) == 1
+    shutil.copytree(journals_of(tmp_path / "one"), journals_of(tmp_path / "again"))
+    assert main(["doctor", str(tmp_path / "again"), "--repair=true"]) == 0
+    assert files(tmp_path / "again") == files(tmp_path / "one")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
+from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.lerobot_io import count_frames, read_episodes, video_rows, write_dataset
 from manip_il.mdp import Episode
 
@@ -43,7 +44,7 @@ def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 def assert_holds(root: Path, episodes: list[Episode]) -> None:
-    """For LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
+    """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     for mine, yours in zip(read_episodes(root), episodes, strict=True):
@@ -53,6 +54,7 @@ def assert_holds(root: Path, episodes: list[Episode]) -> None:
             else:
                 np.testing.assert_array_equal(mine.columns[key], values, err_msg=key)
     assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
+    assert not has_errors(examine_folder(root))
     dataset = LeRobotDataset(REPO, root=root)
     assert dataset.num_episodes == len(episodes)
     frames = [(episode, t) for episode in episodes for t in range(len(episode))]
