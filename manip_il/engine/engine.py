@@ -160,11 +160,11 @@ class Engine:
     def _bury(self, task: Task, unfinished: list[int], deaths: Counter[int], waiting: deque[Task]) -> None:
         """Have every unfinished seed run again, alone, so that the one that kills is known."""
         deaths.update(unfinished)
-        for seed in unfinished:
+        for seed in reversed(unfinished):
             if deaths[seed] >= MAX_DEATHS:
                 self.given_up.append(seed)
             else:
-                waiting.append(replace(task, seeds=(seed,)))
+                waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
 
 
 def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
