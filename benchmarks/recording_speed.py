@@ -55,12 +55,12 @@ def main() -> int:
         report(f"{robot}, one core", *one_core(job, 2 if quick else 40, 2 if quick else 5))
     for robot in ROBOTS:
         job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD, cameras=CAMERAS)
-        report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 10, 2 if quick else 5))
-        report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 10, 2 if quick else 5))
+        report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 8, 2 if quick else 3))
+        report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 8, 2 if quick else 3))
     print("two workers against one       recording              bare physics: the machine's limit")
     for robot in ROBOTS:
         job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD)
-        two_workers(robot, job, 8 if quick else 100, 2 if quick else 5)
+        two_workers(robot, job, 8 if quick else 80, 2 if quick else 3)
     return 0
 
 
