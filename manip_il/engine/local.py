@@ -8,6 +8,7 @@ import os
 import pickle
 import signal
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 
 from manip_il.engine.engine import Event, Task, portable, run_task
@@ -63,7 +64,12 @@ class _Worker:
     def __init__(self) -> None:
         self.connection, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
+        resource_tracker.ensure_running()  # here, as its own start would undo the mask
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child has it: Ctrl-C is not for workers
+        try:
+            self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()  # so that the pipe ends when the worker does
         self._task: Task | None = None
 
@@ -95,7 +101,6 @@ class _Worker:
 
 def _serve(connection: Connection) -> None:
     """A worker's life: tasks in, episodes out, until the other end goes away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
     os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which is imported later; one core each
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
