@@ -1,7 +1,7 @@
 """One crash-safe MCAP file a finished episode: what recording stands on.
 
 A file is written under a temporary name, synced and renamed, so it is whole or it is not there. Every column travels
-bit for bit as an attachment (`<column>.npy`); beside it, messages that Foxglove shows as they stand.
+bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages as they stand.
 """
 
 from __future__ import annotations

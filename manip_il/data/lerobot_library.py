@@ -40,9 +40,7 @@ def write_with_library(
         _save(dataset)
         yield count
     dataset.finalize()
-    shutil.rmtree(
-        root / "images", ignore_errors=True
-    )  # of pictures that are in the data by now; it leaves empty folders
+    shutil.rmtree(root / "images", ignore_errors=True)  # empty folders: the pictures are in the data by now
 
 
 def _save(dataset: LeRobotDataset) -> None:
