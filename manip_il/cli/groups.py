@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -129,7 +130,9 @@ def command_line(name: str, options: Any) -> str:
     words = ["manip-il", name]
     for known in options_of(type(options)):
         value = _value(options, known.name)
-        if (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
+        if known.is_open:
+            words += [f"--{known.name}.{inner}={_yaml(one)}" for inner, one in value.items()]
+        elif (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
             words.append(_word(known.name, value))
     return shlex.join(words)
 
@@ -191,6 +194,10 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
 
 def _value(options: Any, name: str) -> Any:
     return functools.reduce(getattr, name.split("."), options)
+
+
+def _yaml(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _word(name: str, value: Any) -> str:

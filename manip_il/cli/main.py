@@ -90,7 +90,7 @@ def _dispatch(words: list[str]) -> None:
         print(_group_help(words[0]))
     elif "--help" in words or "-h" in words:
         name, _ = _split(words)
-        print(_command_help(name, load(name)) if name in COMMANDS else _group_help(name))
+        print(_command_help(name, load(name), words) if name in COMMANDS else _group_help(name))
     else:
         name, words = _split(words)
         options = parse(load(name), words)
@@ -166,7 +166,8 @@ def _commands(names: Collection[str]) -> str:
     return "\n".join(f"  {name:{width}}{COMMANDS[name].summary}" for name in names)
 
 
-def _command_help(name: str, cls: Any) -> str:
+def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
+    """words: all that was asked, as a command may tell more of a choice (`more_help`)."""
     options = options_of(cls)
     places = "".join(f" {option.label}" for option in options if option.positional)
     rows = [_row(option) for option in options]
@@ -174,9 +175,10 @@ def _command_help(name: str, cls: Any) -> str:
     width = max(len(left) for left, _ in rows) + 2
     lines = "\n".join(f"  {left:{width}}{right}".rstrip() for left, right in rows)
     example = getattr(cls, "example", "")
+    more = cls.more_help(words) if hasattr(cls, "more_help") else ""
     return (
         f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{_description(name, cls)}\n\n"
-        f"options:\n{lines}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
+        f"options:\n{lines}{more}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
     )
 
 
@@ -194,6 +196,8 @@ def _row(option: Option) -> tuple[str, str]:
 def _default_text(option: Option) -> str:
     if option.default is MISSING:
         return "required"
+    if option.is_open:
+        return "none"
     value = to_plain(option.default)
     if isinstance(value, list):
         return ",".join(map(str, value)) or "none"

@@ -1,8 +1,11 @@
 """Dataclasses of options, read from `--a.b=c` words and YAML in LeRobot's style.
 
-Words beat YAML beats defaults. The parser is our own, as draccus cannot be taught to answer with one line: it
-exits through argparse, turns a range error of a nested dataclass into a decoding error, takes `true` for a
-number, and loads YAML with tags that read other files.
+Words beat YAML beats defaults. A group of which only another program knows the options (`--policy.*`) is a field of
+type `Open`: a dict of whatever was given.
+
+The parser is our own, as draccus cannot be taught to answer with one line: it exits through argparse, turns a range
+error of a nested dataclass into a decoding error, takes `true` for a number, and loads YAML with tags that read other
+files.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from manip_il import __version__
 from manip_il.cli.values import choices, decode, expected
 from manip_il.errors import UsageError, nearest
 
+Open = dict[str, Any]  # option -> value as YAML reads it
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
 CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 
@@ -36,7 +40,14 @@ class Option:
     @property
     def label(self) -> str:
         """How the user writes it."""
+        if self.is_open:
+            return f"--{self.name}.NAME"
         return self.name.upper() if self.positional else f"--{self.name}"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it stands for any number of options, of which only another program knows the names."""
+        return self.type == Open
 
 
 @dataclass(frozen=True)
@@ -92,6 +103,8 @@ def to_plain(value: Any) -> Any:
     """Options as dicts, lists, text, numbers, booleans and None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+    if isinstance(value, dict):
+        return {key: to_plain(item) for key, item in value.items()}
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, Path):
@@ -115,7 +128,12 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
             given[option.name] = _Given(word, option.label, True)
             continue
         name, equals, value = word[2:].partition("=")
-        if name != CONFIG_PATH and (name not in known or known[name].positional):
+        if group := _open_group(name, known):
+            if not equals and (not rest or rest[0].startswith("--")):
+                raise UsageError(f"--{name} has no value; expected --{name}=VALUE")
+            given[name] = _Given(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
+            continue
+        if name != CONFIG_PATH and (name not in known or known[name].positional or known[name].is_open):
             raise _unknown("option", name, known, "--")
         if not equals:
             value = _next_value(name, known, rest)
@@ -124,6 +142,22 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
         else:
             given[name] = _Given(value, f"--{name}", True)
     return given, config_paths
+
+
+def _open_group(name: str, known: Mapping[str, Option]) -> str:
+    """The open group that `name` is an option of, or nothing."""
+    if name in known:
+        return ""
+    return next((option.name for option in known.values() if option.is_open and name.startswith(f"{option.name}.")), "")
+
+
+def _as_yaml(word: str, group: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(word)
+    except yaml.YAMLError as error:
+        raise UsageError(f"--{group}: {word!r} is not a YAML value: {' '.join(str(error).split())}") from error
 
 
 def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
@@ -153,7 +187,11 @@ def _read_yaml(path: Path, cls: type, known: Mapping[str, Option]) -> dict[str, 
 def _leaves(tree: dict[Any, Any], known: Mapping[str, Option], path: Path, prefix: str = "") -> Iterator[tuple]:
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        if name in known:
+        if name in known and known[name].is_open:
+            if not isinstance(value, dict | None):
+                raise UsageError(f"{path}: {name}: expected a mapping of options, got {value!r}")
+            yield from ((f"{name}.{inner}", one) for inner, one in (value or {}).items())
+        elif name in known:
             yield name, value
         elif not any(option.startswith(f"{name}.") for option in known):
             raise _unknown(f"key in {path}:", name, known)
@@ -171,6 +209,9 @@ def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefi
         if dataclasses.is_dataclass(field_type):
             nested = None if default is MISSING else default
             arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")
+        elif field_type == Open:
+            before = {} if default is MISSING else default
+            arguments[field.name] = before | _inside(name, given)
         elif name in given:
             arguments[field.name] = _decode_given(field_type, given[name])
         elif default is MISSING:
@@ -179,6 +220,10 @@ def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefi
         else:
             arguments[field.name] = default
     return cls(**arguments)
+
+
+def _inside(group: str, given: Mapping[str, _Given]) -> Open:
+    return {name.removeprefix(f"{group}."): one.value for name, one in given.items() if name.startswith(f"{group}.")}
 
 
 def _decode_given(field_type: Any, given: _Given) -> Any:
@@ -202,11 +247,17 @@ def _default(field: dataclasses.Field[Any], base: Any) -> Any:
 
 
 def _unknown(kind: str, name: str, known: Mapping[str, Option], dashes: str = "") -> UsageError:
+    if name in known and known[name].is_open:
+        return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")
     groups = {".".join(option.split(".")[:-1]) for option in known}
     if name in groups:
         inside = ", ".join(dashes + option for option in known if option.startswith(f"{name}."))
         return UsageError(f"{dashes}{name} is a group of options; known: {inside}")
-    named = ", ".join(dashes + option.name for option in known.values() if not (dashes and option.positional))
+    named = ", ".join(
+        dashes + option.name + (".NAME" if option.is_open else "")
+        for option in known.values()
+        if not (dashes and option.positional)
+    )
     return UsageError(f"unknown {kind} {dashes + name!r}{_did_you_mean(name, known, dashes)}; known: {named}")
 
 

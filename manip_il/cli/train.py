@@ -1,17 +1,27 @@
-"""`manip-il train`: behaviour cloning on one dataset."""
+"""`manip-il train`: behaviour cloning on one dataset, with any policy that LeRobot knows."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import PolicyGroup, check_dataset, check_same_options, option, save_options
+from manip_il.cli.groups import check_dataset, check_same_options, option, save_options
+from manip_il.cli.options import Open
 from manip_il.cli.progress import say
+from manip_il.errors import UsageError
 
+if TYPE_CHECKING:
+    from manip_il.learn.policy_config import PolicyFitConfig
+    from manip_il.learn.train import TrainConfig
+
+MLP = "mlp"  # the one policy with a loop of its own
+MLP_STEPS, MLP_BATCH_SIZE, MLP_LR = 3_000, 512, 2e-3
+STEPS, BATCH_SIZE = 100_000, 8  # LeRobot's defaults
 # What may differ when a fit is resumed: nothing of it changes the weights.
-_FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir")
+_FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir", "num_workers", "tensorboard", "wandb")
 
 
 @dataclass
@@ -19,79 +29,193 @@ class SourceGroup:
     """`--dataset.*` of what is learnt from."""
 
     root: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset"})
-
-
-@dataclass
-class FullPolicyGroup(PolicyGroup):
-    """`--policy.*` with all that one fit may choose."""
-
-    activation: str = option("silu", "between layers")
-    components: int = option(5, "of the mixture")
-    bins: int = option(101, "a dimension, of categorical")
+    eval_split: float = option(0.05, "share of the episodes held out for val_loss")
 
 
 @dataclass
 class TrainOptions:
     """Fit a policy to the labels of a dataset (behaviour cloning).
 
-    The checkpoint is LeRobot's: OUTPUT_DIR/checkpoints/last/pretrained_model.
+    --policy.type is mlp, cnn or any policy of LeRobot's (act, diffusion, vqbet, ...); its options have LeRobot's names:
+    manip-il train --policy.type=act --help lists them. The checkpoint is LeRobot's:
+    OUTPUT_DIR/checkpoints/last/pretrained_model.
     """
 
-    example: ClassVar[str] = "manip-il train --dataset.root=datasets/demos --output_dir=runs/cloned"
+    example: ClassVar[str] = (
+        "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
+    )
     dataset: SourceGroup
-    policy: FullPolicyGroup = field(default_factory=FullPolicyGroup)
-    steps: int = option(3_000, "gradient steps")
-    batch_size: int = option(512, "frames a step")
-    lr: float = option(2e-3, "highest learning rate")
+    policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
+    observation: Literal["state", "images", "both"] | None = option(
+        None, "what the policy sees beside its joints; by default images where the policy is cnn, else state"
+    )
+    steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
+    batch_size: int | None = option(None, f"frames a step (and process); by default {MLP_BATCH_SIZE} for mlp, else 8")
+    lr: float | None = option(None, f"highest learning rate; by default {MLP_LR} for mlp, else the policy's own")
+    optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
+    scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
+    image_augment: bool = option(True, "shift and recolour pictures while training")
+    image_cache_gb: float = option(20.0, "most that decoded pictures may take on disk; beyond, LeRobot's loader reads")
+    num_workers: int = option(4, "processes of LeRobot's loader")
     output_dir: Path = field(default=Path("runs/train"), metadata={"help": "folder of the run"})
     seed: int = option(0, "of weights and batches, 0 to 1000")
     threads: int = option(1, "more help only where cores are free")
-    save_freq: int = option(1_000, "steps between checkpoints")
+    save_freq: int | None = option(None, "steps between checkpoints; by default 1,000 for mlp, else 20,000")
     log_freq: int = option(200, "steps between metrics")
+    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
+    wandb: Open = field(default_factory=dict, metadata={"help": "Weights & Biases: enable, project, mode, ..."})
     resume: bool = option(False, "go on from the last checkpoint")
     overwrite: bool = option(False, "replace a run that is there")
 
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
-        policy = self.policy.config()
-        from manip_il.dagger.loop import LEARNING_COLUMNS
-        from manip_il.data.lerobot_io import read_fingerprint, read_spec, read_table
+        from manip_il.data.lerobot_io import read_fingerprint, read_spec
+
+        config = self._config()
+        spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
+        check_dataset(self.dataset.root, spec, fingerprint)
+        first = _is_first_process()
+        if first:
+            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+            if self.resume:
+                check_same_options(self.output_dir, self, _FREE)
+            save_options(self.output_dir, self)
+        path = self._fit(config, spec, fingerprint)
+        if first:
+            say(f"checkpoint: {path}")
+            say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
+
+    @property
+    def _is_mlp(self) -> bool:
+        return "path" not in self.policy and self.policy.get("type", MLP) == MLP
+
+    def _config(self) -> TrainConfig | PolicyFitConfig:
+        return self._mlp_config() if self._is_mlp else self._policy_config()
+
+    def _mlp_config(self) -> TrainConfig:
+        if self.observation not in (None, "state"):
+            raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={self.observation}; use cnn")
+        for name in ("optimizer", "scheduler", "wandb", "tensorboard"):
+            if getattr(self, name):
+                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop of its own (metrics.jsonl)")
+        from manip_il.learn.choices import policy_config
+        from manip_il.learn.mlp.configuration_mlp import MLPConfig
         from manip_il.learn.train import TrainConfig
         from manip_il.seeding import stream_base
 
-        config = TrainConfig(
-            steps=self.steps,
-            batch_size=self.batch_size,
-            lr=self.lr,
+        policy = policy_config(self.policy, MLP)
+        assert isinstance(policy, MLPConfig)
+        return TrainConfig(
+            steps=MLP_STEPS if self.steps is None else self.steps,
+            batch_size=MLP_BATCH_SIZE if self.batch_size is None else self.batch_size,
+            lr=MLP_LR if self.lr is None else self.lr,
+            val_fraction=self.dataset.eval_split,
             seed=stream_base("training", self.seed),
             threads=self.threads,
-            save_freq=self.save_freq,
+            save_freq=1_000 if self.save_freq is None else self.save_freq,
             log_freq=self.log_freq,
             policy=policy,
         )
-        spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
-        table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
-        check_dataset(self.dataset.root, spec, fingerprint)
-        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        if self.resume:
-            check_same_options(self.output_dir, self, _FREE)
-        save_options(self.output_dir, self)
-        self._fit(table, config, spec, fingerprint)
 
-    def _fit(self, table, config, spec, fingerprint) -> None:
+    def _policy_config(self) -> PolicyFitConfig:
+        from lerobot.configs.default import WandBConfig
+        from lerobot.optim import LRSchedulerConfig, OptimizerConfig
+
+        from manip_il.learn.augment import Augment
+        from manip_il.learn.choices import choice, plain, policy_config
+        from manip_il.learn.policy_config import PolicyFitConfig
+        from manip_il.seeding import stream_base
+
+        policy = policy_config(self.policy)
+        return PolicyFitConfig(
+            policy=policy,
+            steps=STEPS if self.steps is None else self.steps,
+            batch_size=BATCH_SIZE if self.batch_size is None else self.batch_size,
+            seed=stream_base("training", self.seed),
+            observation=self.observation or ("images" if policy.type == "cnn" else "state"),
+            eval_split=self.dataset.eval_split,
+            lr=self.lr,
+            optimizer=choice(OptimizerConfig, self.optimizer, "optimizer") if self.optimizer else None,
+            scheduler=choice(LRSchedulerConfig, self.scheduler, "scheduler") if self.scheduler else None,
+            augment=Augment() if self.image_augment else None,
+            image_cache_gb=self.image_cache_gb,
+            num_workers=self.num_workers,
+            threads=self.threads,
+            log_freq=self.log_freq,
+            save_freq=20_000 if self.save_freq is None else self.save_freq,
+            tensorboard=self.tensorboard,
+            wandb=plain(WandBConfig, self.wandb, "wandb"),
+        )
+
+    def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
         from manip_il.cli.stages import Stages
+        from manip_il.learn.train import TrainConfig
+
+        every = config.save_freq
+        with Stages(kept=f"the last checkpoint in {self.output_dir} (one every {every:,} steps)") as stages:
+            if isinstance(config, TrainConfig):
+                return self._fit_mlp(config, spec, fingerprint, stages)
+            return self._fit_policy(config, spec, fingerprint, stages)
+
+    def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
+        from manip_il.dagger.loop import LEARNING_COLUMNS
+        from manip_il.data.lerobot_io import read_table
         from manip_il.learn.train import fit
 
-        with Stages(kept=f"the last checkpoint in {self.output_dir} (one every {self.save_freq:,} steps)") as stages:
-            stages.start(f"train on {len(table['action']):,} frames", self.steps)
-            path = fit(
-                table,
-                config,
-                self.output_dir,
-                spec=spec,
-                fingerprint=fingerprint,
-                on_log=stages.log,
-                resume=self.resume,
-            )
-        say(f"checkpoint: {path}")
-        say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
+        table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
+        stages.start(f"train on {len(table['action']):,} frames", config.steps)
+        return fit(
+            table,
+            config,
+            self.output_dir,
+            spec=spec,
+            fingerprint=fingerprint,
+            on_log=stages.log,
+            resume=self.resume,
+        )
+
+    def _fit_policy(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
+        from manip_il.data.lerobot_io import dataset_info, read_provenance
+        from manip_il.learn.checkpoint import CheckpointMeta
+        from manip_il.learn.fit_policy import fit_policy
+        from manip_il.learn.observation import recorded_look
+
+        root = self.dataset.root
+        look = recorded_look(read_provenance(root), fingerprint)
+        options = config.what_changes_the_weights()
+        stages.start(f"train {config.policy.type} on {dataset_info(root).frames:,} frames", config.steps)
+
+        def seen(record: dict[str, Any]) -> None:
+            if record:
+                stages.log(record)
+            else:
+                stages.check()
+
+        return fit_policy(
+            root,
+            config,
+            self.output_dir,
+            meta=CheckpointMeta.of(spec, fingerprint, options, config.observation, look),
+            on_step=seen,
+            resume=self.resume,
+        )
+
+    @classmethod
+    def more_help(cls, words: Sequence[str]) -> str:
+        """The options of the policy that `--policy.type` names."""
+        kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+        if not kind:
+            return ""
+        from manip_il.learn.choices import option_lines, policy_class
+
+        rows = option_lines(policy_class(kind), "policy")
+        width = max(len(left) for left, _ in rows) + 2
+        lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
+        return f"\n\noptions of {kind}:\n{lines}"
+
+
+def _is_first_process() -> bool:
+    """Whether this is the one of several processes (`accelerate launch`, `torchrun`) that writes."""
+    import os
+
+    return os.environ.get("RANK", "0") == "0"

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
+import numpy as np
 from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import IMAGENET_STATS
+
+from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
+from manip_il.errors import ManipError
 
 Frame = dict[str, Any]  # column -> array of the feature's dtype and shape, or text; and `task`
 
@@ -52,3 +58,56 @@ def _save(dataset: LeRobotDataset) -> None:
     finally:
         if shown:
             enable_progress_bar()
+
+
+def read_metadata(root: Path) -> LeRobotDatasetMetadata:
+    """LeRobot's own description of a dataset, from which its factories build policies.
+
+    The cameras' statistics are ImageNet's, as `lerobot-train` takes them by default. Raises `ManipError` for a folder
+    that is no dataset.
+    """
+    if not (root / INFO).is_file():  # LeRobot would ask the Hub for it
+        raise ManipError(f"{root} is not a LeRobot dataset: it has no {INFO}")
+    meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    if meta.stats is None:
+        raise ManipError(f"{root} has no statistics (meta/stats.json); `manip-il doctor` tells what is left")
+    for key in meta.camera_keys:
+        meta.stats[key] |= {name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()}
+    return meta
+
+
+def lerobot_windows(
+    root: Path,
+    repo_id: str,
+    delta_timestamps: Mapping[str, Sequence[float]] | None,
+    episodes: Sequence[int] | None = None,
+) -> LeRobotDataset:
+    """LeRobot's own reading of a dataset, for a `DataLoader`: decodes as it goes, and never asks the Hub.
+
+    A picture is uint8 (3, height, width), the same bytes as in the frame cache, and (K, 3, height, width) where
+    `delta_timestamps` [s] asks for a window; episodes: the ones to read, all by default. Raises `ManipError` for a
+    folder that is no dataset or that lacks files.
+    """
+    for pattern in (INFO, TASKS, EPISODES_FILES):  # what LeRobot would ask the Hub for
+        if not any(root.glob(pattern)):
+            raise ManipError(f"{root} is not a whole LeRobot dataset: no file matches {pattern}")
+    return _LocalDataset(
+        repo_id,
+        root=root,
+        episodes=None if episodes is None else list(episodes),
+        delta_timestamps=None if delta_timestamps is None else {key: list(v) for key, v in delta_timestamps.items()},
+        revision="local",  # no version, so that LeRobot does not look for one on the Hub
+        image_transforms=_to_bytes,
+        return_uint8=True,
+    )
+
+
+class _LocalDataset(LeRobotDataset):
+    @override
+    def _download(self, download_videos: bool = True, *, token: str | bool | None = None) -> None:
+        raise ManipError(f"{self.root} lacks data or video files of its episodes; `manip-il doctor` tells which")
+
+
+def _to_bytes(pictures: Any) -> Any:
+    """A tensor of levels as bytes: videos come so, images that are stored one by one in [0, 1]."""
+    return pictures.mul(255).round().byte() if pictures.is_floating_point() else pictures

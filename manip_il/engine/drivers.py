@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -17,10 +17,25 @@ F64 = NDArray[np.float64]
 
 
 class Policy(Protocol):
-    """A learner: (B, n) joint states and (B, k) environment states to (B, n) absolute actions."""
+    """A learner: (B, n) joint states, (B, k) environment states and pictures to (B, n) absolute actions."""
 
-    def act(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> F64:
-        """One action a row."""
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Whose pictures it looks at."""
+        ...
+
+    def act(
+        self,
+        states: NDArray[np.float32],
+        environment_states: NDArray[np.float32],
+        images: Mapping[str, NDArray[np.uint8]],
+        episodes: Sequence[int],
+    ) -> F64:
+        """One action a row. images: camera -> (B, H, W, 3); episodes: whose row each is."""
+        ...
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """Forget the past of episodes that begin."""
         ...
 
 
@@ -33,16 +48,22 @@ class ExpertDriver:
 
 
 class LearnerDriver:
-    """Executes the learner's action, one batched call a step."""
+    """Executes the learner's action, one call a step for all episodes."""
 
     def __init__(self, policy: Policy):
         self._policy = policy
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
         """The policy's action in every episode."""
-        states = np.stack([turn.observation.state for turn in turns])
-        environment_states = np.stack([turn.observation.environment_state for turn in turns])
-        actions = self._policy.act(states, environment_states)
+        if started := [turn.seed for turn in turns if turn.step == 0]:
+            self._policy.reset(started)
+        seen = [turn.observation for turn in turns]
+        actions = self._policy.act(
+            np.stack([one.state for one in seen]),
+            np.stack([one.environment_state for one in seen]),
+            {camera: np.stack([one.images[camera] for one in seen]) for camera in self._policy.cameras},
+            [turn.seed for turn in turns],
+        )
         return [(action, Actor.LEARNER) for action in actions]
 
 

@@ -11,6 +11,7 @@ from manip_il.data import schema
 from manip_il.engine.describe import env_fingerprint
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.sight import drawn_cameras
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.mdp import Episode, Phase
 from manip_il.sim.disturb import Disturbance
@@ -41,7 +42,7 @@ def evaluate(
         policy=name,
         robot=job.env.robot,
         task=job.env.task,
-        fingerprint=env_fingerprint(job.env),
+        fingerprint=env_fingerprint(job.env, drawn_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
         settings=EvalSettings(job.env.horizon, job.env.tolerance, describe_disturbance(job.disturbance)),
     )

@@ -32,7 +32,7 @@ META_FILE = "manip_il.json"
 PRETRAINED_MODEL = "pretrained_model"
 TRAINING_STATE = "training_state"
 _LAST = "last"
-_STEP_FILE = "training_step.json"
+STEP_FILE = "training_step.json"
 _MUST_AGREE = {
     "robot": "robot",
     "fps": "control rate [1/s]",
@@ -44,7 +44,11 @@ _MUST_AGREE = {
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """What a policy was trained for and how; `manip_il.json`."""
+    """What a policy was trained for and how; `manip_il.json`.
+
+    observation: what it sees, one of `learn.observation.OBSERVATIONS`. cameras, image_size: of the pictures that it was
+    trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
+    """
 
     robot: str
     task: str
@@ -54,12 +58,22 @@ class CheckpointMeta:
     action_meaning: str
     fingerprint: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
+    observation: str = "state"
+    cameras: tuple[str, ...] = ()
+    image_size: tuple[int, int] = (0, 0)  # height, width [pixels]
+    look: dict[str, Any] | None = None
 
     @classmethod
     def of(
-        cls, spec: RobotTaskSpec, fingerprint: Mapping[str, Any] | None = None, options: Mapping[str, Any] | None = None
+        cls,
+        spec: RobotTaskSpec,
+        fingerprint: Mapping[str, Any] | None = None,
+        options: Mapping[str, Any] | None = None,
+        observation: str = "state",
+        look: Mapping[str, Any] | None = None,
     ) -> CheckpointMeta:
-        """The meta of a policy trained on data of `spec`."""
+        """The meta of a policy trained on data of `spec`; look: `learn.observation.recorded_look` of the dataset."""
+        pictured = observation != "state"
         return cls(
             robot=spec.robot,
             task=spec.task,
@@ -69,6 +83,10 @@ class CheckpointMeta:
             action_meaning=spec.action_meaning,
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
+            observation=observation,
+            cameras=tuple(spec.cameras) if pictured else (),
+            image_size=spec.image_size if pictured else (0, 0),
+            look=dict(look) if pictured and look is not None else None,
         )
 
 
@@ -82,8 +100,9 @@ def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
         return None
     try:
         values = json.loads(path.read_text())
-        for name in ("joint_names", "environment_state_names"):
-            values[name] = tuple(values[name])
+        for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
+            if name in values:  # a checkpoint from before there were pictures has no cameras
+                values[name] = tuple(values[name])
         return CheckpointMeta(**values)
     except (ValueError, KeyError, TypeError) as error:
         raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
@@ -92,6 +111,8 @@ def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
 def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
     """Raise `MismatchError` naming both sides unless the policy's numbers mean what `spec`'s do."""
     for name, what in _MUST_AGREE.items():
+        if name == "environment_state_names" and meta.observation == "images":
+            continue  # it does not look at it
         ours, theirs = getattr(meta, name), getattr(spec, name)
         if ours != theirs:
             raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
@@ -121,9 +142,9 @@ def save_checkpoint(
     state = temporary / TRAINING_STATE
     state.mkdir()
     save_optimizer_state(optimizer, state)
-    _write_json(state / _STEP_FILE, {"step": step, **resume_key})
+    write_json(state / STEP_FILE, {"step": step, **resume_key})
     temporary.rename(final)
-    _point_last_at(final)
+    point_last_at(final)
     for other in checkpoints.iterdir():
         if not other.is_symlink() and other.name != final.name:
             shutil.rmtree(other, ignore_errors=True)
@@ -138,7 +159,7 @@ def last_checkpoint(output_dir: Path) -> Path | None:
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
     """The step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
-    path = checkpoint / TRAINING_STATE / _STEP_FILE
+    path = checkpoint / TRAINING_STATE / STEP_FILE
     if not path.is_file():
         raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
     return json.loads(path.read_text())
@@ -158,15 +179,17 @@ def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMe
     policy.save_pretrained(folder)
     for processor in make_pre_post_processors(policy.config):
         processor.save_pretrained(folder)
-    _write_json(folder / META_FILE, asdict(meta))
+    write_json(folder / META_FILE, asdict(meta))
 
 
-def _point_last_at(final: Path) -> None:
+def point_last_at(final: Path) -> None:
+    """Make a checkpoint's folder the one that `last` leads to, in one rename."""
     temporary = final.parent / ".last.tmp"
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(final.name)
     os.replace(temporary, final.parent / _LAST)
 
 
-def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values as a file of JSON that people can read."""
     path.write_text(json.dumps(values, indent=2) + "\n")

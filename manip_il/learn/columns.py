@@ -97,7 +97,7 @@ def read_columns(root: Path) -> dict[str, NDArray[Any]]:
     """
     folder = Path(root) / "data"
     if not folder.is_dir():
-        raise ManipError(f"no folder {folder}: the mlp policy reads its statistics there; download the dataset first")
+        raise ManipError(f"no folder {folder}: mlp and cnn read their statistics there; download the dataset first")
     source = pyarrow.dataset.dataset(folder, format="parquet")
     wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, INDEX)
     table = source.to_table(columns=[name for name in wanted if name in source.schema.names])

@@ -57,9 +57,9 @@ class MLPNetwork(nn.Module):
             self.register_buffer(name, tensor)
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Take the units of the data; they are saved with the weights."""
+        """Take the units of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
         for name, tensor in statistics.items():
-            getattr(self, name).copy_(tensor)
+            getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def encode(self, inputs: Tensor) -> Tensor:
         """The perceptron's inputs from raw ones, (B, n + k)."""

@@ -2,70 +2,84 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, read_meta
 from manip_il.learn.network import MLPNetwork, Shape
+from manip_il.learn.observation import observation_of
+from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
 from manip_il.learn.threads import threads
 
-_PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_IMAGES = "observation.images."
 Batch = dict[str, torch.Tensor]
 
 
-class LearnedPolicy:
-    """Actions from a LeRobot checkpoint, for many environments at once.
+class Chooser(Protocol):
+    """What turns a batch into actions, and remembers what must be remembered."""
 
-    meta: what the policy was trained for, None for a checkpoint of lerobot-train. widths: numbers
-    in each observation that the policy looks at. cameras: whose pictures it looks at.
+    def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
+        """One action (n,) a row; `episodes` says whose row each is. Other episodes have ended."""
+        ...
+
+    def forget(self, episodes: Iterable[int]) -> None:
+        """Drop what is remembered of these episodes."""
+        ...
+
+
+class LearnedPolicy:
+    """Actions from a LeRobot checkpoint, for many episodes at once.
+
+    meta: what the policy was trained for, None for a checkpoint of lerobot-train. interface: what it sees and gives.
     """
 
-    def __init__(
-        self,
-        select: Callable[[Batch], torch.Tensor],
-        forget: Callable[[], None],
-        widths: dict[str, int],
-        meta: CheckpointMeta | None,
-        cameras: Sequence[str] = (),
-    ):
-        self.widths, self.meta, self.cameras = widths, meta, tuple(cameras)
-        self._select, self._forget = select, forget
-        self._rows: int | None = None
+    def __init__(self, chooser: Chooser, interface: Interface, meta: CheckpointMeta | None = None):
+        self.interface, self.meta = interface, meta
+        self._chooser = chooser
 
     @classmethod
-    def load(cls, path: Path, device: str = "cpu") -> LearnedPolicy:
-        """Any LeRobot `pretrained_model` folder, without a network. Reads JSON and safetensors alone.
+    def load(cls, path: Path, device: str = "cpu", task: str = "") -> LearnedPolicy:
+        """Any LeRobot `pretrained_model` folder. Reads JSON and safetensors alone.
 
-        The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own
-        factory. Raises `ManipError` for a folder that is not whole, whose files do not belong
-        together, or whose processors name code to import.
+        The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task: what
+        a policy that reads language is told to do. Raises `ManipError` for a folder that is not whole, that holds a
+        pickle, whose files do not belong together, or whose processors name code to import; `UnknownName` for a type
+        of policy that is not known.
         """
         path = Path(path)
-        config = _read_config(path)
-        features = config["input_features"].items()
-        widths = {key: ft["shape"][0] for key, ft in features if ft["type"] != "VISUAL"}
-        cameras = [key.removeprefix(_IMAGES) for key, ft in features if ft["type"] == "VISUAL"]
-        try:
-            if config["type"] == "mlp":
-                select, forget = _load_mlp(path, config, widths, device)
-            else:
-                select, forget = _load_by_lerobot(path, device)
-        except (RuntimeError, KeyError) as error:
-            raise ManipError(f"{path}: weights and config.json do not belong together: {error}") from error
-        return cls(select, forget, widths, read_meta(path), cameras)
+        if device.startswith("cuda") and not torch.cuda.is_available():
+            raise UsageError(f"device is {device!r}, but torch sees no graphics card here; expected 'cpu'")
+        config = read_config(path)
+        interface, meta = interface_of(config, path), read_meta(path)
+        if config["type"] == "mlp":
+            return cls(_Perceptron(path, config, interface, device), interface, meta)
+        from manip_il.learn.lerobot_policy import load_policy
+
+        return cls(load_policy(path, config, device, task), interface, meta)
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Numbers in each observation that it looks at."""
+        return self.interface.numbers
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Whose pictures it looks at."""
+        return tuple(self.interface.pictures)
+
+    @property
+    def observation(self) -> str:
+        """What it sees: `state`, `images` or `both`."""
+        return observation_of(self.interface.columns)
 
     @torch.inference_mode()
     def act(
@@ -73,105 +87,91 @@ class LearnedPolicy:
         states: NDArray[np.float32],
         environment_states: NDArray[np.float32],
         images: Mapping[str, NDArray[np.uint8]] | None = None,
+        episodes: Sequence[int] | None = None,
     ) -> NDArray[np.float64]:
         """Absolute actions, (B, n): joint targets [rad], gripper command [m].
 
-        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). For the mlp, a
-        row's action is the same bits whatever the other rows. Raises `NotFiniteError` naming the
-        row, `MismatchError` for widths or cameras that are not the policy's.
+        states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row,
+        its seed: what the policy remembers of an episode, and what it draws in it, belong to that number; by default
+        the row's place. An episode that is left out has ended. An action is the same bits whatever the other rows.
+        Raises `NotFiniteError` naming the row, `MismatchError` for numbers or pictures that are not the policy's.
         """
-        batch = self._batch(states, environment_states) | self._pictures(images or {})
-        if self._rows not in (None, len(states)):
-            self._forget()  # a queue of chunks holds one row for each environment
-        self._rows = len(states)
+        rows = len(states)
+        episodes = range(rows) if episodes is None else episodes
+        if len(episodes) != rows:
+            raise MismatchError("rows", "the states", rows, "the episodes", len(episodes))
+        batch = self._numbers(states, environment_states) | self._pictures(rows, images or {})
+        if not rows:
+            return np.empty((0, self.interface.action))
         with threads(1):
-            actions = self._select(batch).cpu().numpy().astype(np.float64)
+            actions = self._chooser.select(batch, episodes).cpu().numpy().astype(np.float64)
+        if actions.shape != (rows, self.interface.action):
+            expected = (rows, self.interface.action)
+            raise MismatchError("shape of the actions", CONFIG, expected, "the policy", actions.shape)
         _require_finite_rows("the policy's action", actions)
         return actions
 
-    def reset(self, slots: Sequence[int] | None = None) -> None:
-        """Forget the past of environments that start anew (rows of the next `act`).
+    def reset(self, episodes: Iterable[int]) -> None:
+        """Forget the past of episodes that begin."""
+        self._chooser.forget(episodes)
 
-        The mlp has none. LeRobot's chunk policies keep one queue for all rows: they plan anew for all.
-        """
-        self._forget()
-
-    def _batch(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> Batch:
+    def _numbers(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> Batch:
         batch = {}
         for key, values in ((STATE, states), (ENVIRONMENT_STATE, environment_states)):
-            if key not in self.widths:
+            if key not in self.interface.numbers:
                 continue
             values = np.ascontiguousarray(values, dtype=np.float32)
-            expected = (len(states), self.widths[key])
+            expected = (len(states), self.interface.numbers[key])
             if values.shape != expected:
                 raise MismatchError(f"shape of {key}", "the policy", expected, "the caller", values.shape)
             _require_finite_rows(key, values)
             batch[key] = torch.from_numpy(values)
         return batch
 
-    def _pictures(self, images: Mapping[str, NDArray[np.uint8]]) -> Batch:
-        missing = set(self.cameras) - set(images)
-        if missing:
-            raise MismatchError("cameras", "the policy", sorted(self.cameras), "the caller", sorted(images))
-        # As LeRobot feeds them: (B, 3, H, W), from 0 to 1
-        pictures = {camera: torch.from_numpy(np.ascontiguousarray(images[camera])) for camera in self.cameras}
-        return {_IMAGES + camera: picture.permute(0, 3, 1, 2) / 255.0 for camera, picture in pictures.items()}
+    def _pictures(self, rows: int, images: Mapping[str, NDArray[np.uint8]]) -> Batch:
+        """As LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
+        if missing := set(self.cameras) - set(images):
+            raise MismatchError(
+                f"cameras ({', '.join(sorted(missing))})",
+                "the policy",
+                sorted(self.cameras),
+                "the caller",
+                sorted(images),
+            )
+        batch = {}
+        for camera, size in self.interface.pictures.items():
+            expected = (rows, *size, 3)
+            if images[camera].shape != expected:
+                raise MismatchError(
+                    f"shape of the pictures of {camera}", "the policy", expected, "the caller", images[camera].shape
+                )
+            picture = torch.from_numpy(np.ascontiguousarray(images[camera])).permute(0, 3, 1, 2)
+            batch[IMAGES + camera] = picture.contiguous().to(torch.float32) / 255
+        return batch
 
 
-def _load_mlp(
-    path: Path, config: dict[str, Any], widths: dict[str, int], device: str
-) -> tuple[Callable[[Batch], torch.Tensor], Callable[[], None]]:
-    shape = Shape(**{field.name: config[field.name] for field in fields(Shape)})
-    network = MLPNetwork(sum(widths.values()), config["output_features"][ACTION]["shape"][0], shape)
-    weights = load_file(path / "model.safetensors")
-    network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
-    network.to(device).eval()
-    keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in widths]
+class _Perceptron:
+    """The mlp: no memory, and one call for all rows, which do not feel each other."""
 
-    def select(batch: Batch) -> torch.Tensor:
-        # The mlp's processors are the identity (see MLPConfig), so there is nothing else to do.
-        return network.act(torch.cat([batch[key] for key in keys], dim=1).to(device))
+    def __init__(self, path: Path, config: dict[str, Any], interface: Interface, device: str):
+        self._device = device
+        self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in interface.numbers]
+        try:
+            shape = Shape(**{field.name: config[field.name] for field in fields(Shape)})
+            self._network = MLPNetwork(sum(interface.numbers.values()), interface.action, shape)
+            weights = load_file(path / WEIGHTS)
+            self._network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
+        except (RuntimeError, KeyError, SafetensorError) as error:
+            line = " ".join(str(error).split())
+            raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {line}") from error
+        self._network.to(device).eval()
 
-    return select, lambda: None
+    def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
+        """One action a row. The mlp's processors are the identity (see MLPConfig), so there is nothing else to do."""
+        return self._network.act(torch.cat([batch[key] for key in self._keys], dim=1).to(self._device))
 
-
-def _load_by_lerobot(path: Path, device: str) -> tuple[Callable[[Batch], torch.Tensor], Callable[[], None]]:
-    from lerobot.configs import PreTrainedConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-
-    for name in _PROCESSORS:
-        _check_steps(path / name)
-    # LeRobot prints to standard output, which belongs to the caller.
-    with contextlib.redirect_stdout(io.StringIO()):
-        config = PreTrainedConfig.from_pretrained(path, local_files_only=True, cli_overrides=[f"--device={device}"])
-        # Its weights come from the checkpoint; torchvision would download them first.
-        if hasattr(config, "pretrained_backbone_weights"):
-            config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
-        policy = get_policy_class(config.type).from_pretrained(path, config=config, strict=True)
-        overrides = {"device_processor": {"device": device}}
-        before, after = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
-    return lambda batch: after(policy.select_action(before(batch))), policy.reset
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    for name in ("config.json", "model.safetensors"):
-        if not (path / name).is_file():
-            raise ManipError(f"no {name} in {path}; expected LeRobot's pretrained_model folder")
-    try:
-        config = json.loads((path / "config.json").read_text())
-        _ = config["type"], config["input_features"].items()
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ManipError(f"{path / 'config.json'} is not a LeRobot policy's: {error}") from error
-    return config
-
-
-def _check_steps(path: Path) -> None:
-    """Refuse a step by import path: LeRobot would import and call whatever a downloaded file names."""
-    if not path.is_file():
-        raise ManipError(f"no {path}; LeRobot's migrate_policy_normalization adds it to an old checkpoint")
-    for step in json.loads(path.read_text()).get("steps", []):
-        if "registry_name" not in step:
-            raise ManipError(f"{path} wants to run {step.get('class')!r}; only registered steps are loaded")
+    def forget(self, episodes: Iterable[int]) -> None:
+        """Do nothing: there is nothing to forget."""
 
 
 def _require_finite_rows(what: str, values: NDArray[Any]) -> None:

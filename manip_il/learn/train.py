@@ -8,7 +8,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,13 +30,14 @@ from manip_il.learn.checkpoint import (
     save_checkpoint,
 )
 from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode
+from manip_il.learn.metrics import METRICS_FILE, json_lines
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.normalise import fit_statistics
+from manip_il.learn.order import ShuffledRows
 from manip_il.learn.threads import threads
 from manip_il.learn.warm_start import warm_start
 
-METRICS_FILE = "metrics.jsonl"
 # Do not change the weights that come out at the end (threads: only in the last bits).
 _FREE_ON_RESUME = ("threads", "log_freq", "save_freq", "init_from")
 
@@ -117,7 +117,7 @@ def fit(
             _check_same_run(checkpoint, key)
         trainer = Trainer(rows, config, spec, checkpoint)
         output_dir.mkdir(parents=True, exist_ok=True)
-        with _metrics_file(output_dir / METRICS_FILE, trainer.step) as write:
+        with json_lines(output_dir / METRICS_FILE, trainer.step) as write:
             for record in trainer.run():
                 if record:
                     write(record)
@@ -213,35 +213,6 @@ class Trainer:
         return value
 
 
-class ShuffledRows:
-    """Row numbers in batches, every row once an epoch, in an order of its own each epoch.
-
-    A batch is a function of the seed and the step alone, so there is no state to save.
-    """
-
-    def __init__(self, rows: int, batch_size: int, seed: int) -> None:
-        self.rows, self.batch_size, self.seed = rows, batch_size, seed
-        self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
-
-    def batch(self, step: int) -> torch.Tensor:
-        """Row numbers of the batch of `step`, (batch_size,)."""
-        start, end = step * self.batch_size, (step + 1) * self.batch_size
-        pieces = []
-        while start < end:
-            epoch, place = divmod(start, self.rows)
-            piece = self._permutation(epoch)[place : place + end - start]
-            pieces.append(piece)
-            start += len(piece)
-        return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
-
-    def _permutation(self, epoch: int) -> torch.Tensor:
-        if epoch != self._epoch:
-            seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0] >> 1)
-            generator = torch.Generator().manual_seed(seed)
-            self._epoch, self._order = epoch, torch.randperm(self.rows, generator=generator)
-        return self._order
-
-
 def _new_policy(config: TrainConfig, spec: RobotTaskSpec) -> MLPPolicy:
     n, k = len(spec.joint_names), len(spec.environment_state_names)
     policy_config = copy.deepcopy(config.policy)
@@ -270,29 +241,3 @@ def _digest(rows: Rows) -> str:
     for column in (rows.inputs, rows.targets, rows.episodes):
         digest.update(np.ascontiguousarray(column).tobytes())
     return digest.hexdigest()
-
-
-@contextmanager
-def _metrics_file(path: Path, step: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """A function that adds a line; lines after `step`, of a run that was killed, go first."""
-    kept = []
-    if path.is_file() and step > 0:
-        for line in path.read_text().splitlines():
-            with_step = _parse(line)
-            if with_step is not None and with_step <= step:
-                kept.append(line + "\n")
-    with path.open("w") as file:
-        file.writelines(kept)
-
-        def write(record: Mapping[str, Any]) -> None:
-            file.write(json.dumps(dict(record)) + "\n")
-            file.flush()
-
-        yield write
-
-
-def _parse(line: str) -> int | None:
-    try:
-        return int(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
-        return None  # cut short by a kill

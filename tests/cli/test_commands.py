@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import MISSING
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from manip_il.cli import groups
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
-from manip_il.cli.options import from_yaml
+from manip_il.cli.options import from_yaml, options_of, parse
 from manip_il.data.lerobot_io import dataset_info, read_provenance, read_table
 from manip_il.evaluation.results import EvalResult
 from manip_il.sim.env import EnvConfig
@@ -84,8 +85,9 @@ def test_a_config_loads_by_the_command_in_its_first_line(path):
     command = path.read_text().splitlines()[0].removeprefix("# ").split()
     assert command[0] == "manip-il"
     assert command[2] == f"--config_path=configs/{path.name}"
-    options = from_yaml(path, load(command[1]))
-    assert options != load(command[1])()
+    kind = load(command[1])
+    needed = [f"{option.label}=x" for option in options_of(kind) if option.default is MISSING]
+    assert from_yaml(path, kind) != parse(kind, needed)
 
 
 def test_record_writes_successes_and_their_provenance(demos):
@@ -167,7 +169,11 @@ def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
         (["record", "--dataset.repo_id=name"], "expected USER/NAME"),
         (["train"], "--dataset.root is missing"),
         (["train", "--dataset.root=x", "--policy.type=mpl"], "did you mean 'mlp'?"),
-        (["train", "--dataset.root=x", "--policy.type=act"], "lerobot-train"),
+        (["train", "--dataset.root=x", "--policy.type=atc"], "did you mean 'act'"),
+        (["train", "--dataset.root=x", "--policy.lr=1"], "unknown option of --policy.type=mlp: 'lr'"),
+        (["train", "--dataset.root=x", "--policy.type=act", "--observation=eyes"], "one of state, images, both"),
+        (["train", "--dataset.root=x", "--policy=act"], "--policy.NAME=VALUE"),
+        (["train", "--dataset.root=x", "--wandb.projekt=a", "--policy.type=act"], "did you mean 'project'"),
         (["train", "--dataset.root=x", "--policy.loss=mes"], "did you mean 'mse'?"),
         (["dagger", "--beta=lineal:5"], "did you mean 'linear'?"),
         (["dagger", "--rounds=-1"], "expected at least 0"),

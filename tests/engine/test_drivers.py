@@ -21,9 +21,30 @@ RULES = Rules(horizon=15)
 class Wave:
     """A policy without weights: every joint waves with the hand's place."""
 
-    def act(self, states: np.ndarray, environment_states: np.ndarray) -> np.ndarray:
+    cameras = ()
+
+    def act(self, states: np.ndarray, environment_states: np.ndarray, images=None, episodes=None) -> np.ndarray:
         place = environment_states[:, :1].astype(np.float64) + environment_states[:, 1:2]
         return states.astype(np.float64) + 0.05 * np.sin(20 * place + np.arange(states.shape[1]))
+
+    def reset(self, episodes) -> None:
+        """It has no memory."""
+
+
+class Diary(Wave):
+    """Notes which episodes begin, whose rows are asked, and how bright the front camera's pictures are."""
+
+    cameras = ("front",)
+
+    def __init__(self) -> None:
+        self.notes: list = []
+
+    def act(self, states, environment_states, images=None, episodes=None):
+        self.notes.append((list(episodes), {name: picture[:, 0, 0, 0].tolist() for name, picture in images.items()}))
+        return super().act(states, environment_states)
+
+    def reset(self, episodes) -> None:
+        self.notes.append(("reset", list(episodes)))
 
 
 def run(driver, envs: int = 1, seeds=SEEDS, robot: str = "fetch") -> dict[int, Episode]:
@@ -104,6 +125,28 @@ def test_a_random_driver_stays_within_its_reach():
         assert np.abs(step[:, :-1]).max() <= 0.1 + 1e-6
         assert episode.columns["executed_action"][:, -1].min() >= 0
         assert episode.columns["executed_action"][:, -1].max() <= 0.06
+
+
+@pytest.mark.parametrize("make", [LearnerDriver, lambda policy: MixtureDriver(policy, 0.5)])
+def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras(make):
+    diary = Diary()
+    driver = make(diary)
+    label = Label(np.ones(8), Phase.CARRY, True, 0.0)
+
+    def turn(seed: int, step: int) -> Turn:
+        images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
+        return Turn(seed, step, Observation(np.zeros(8, np.float32), np.zeros(3, np.float32), images), label)
+
+    driver.act([turn(10, 0), turn(20, 4)])
+    driver.act([turn(10, 1), turn(20, 0)])
+    driver.act([turn(10, 2)])
+    assert diary.notes == [
+        ("reset", [10]),
+        ([10, 20], {"front": [10, 24]}),
+        ("reset", [20]),
+        ([10, 20], {"front": [11, 20]}),
+        ([10], {"front": [12]}),
+    ]
 
 
 @pytest.mark.parametrize("driver", [ExpertDriver(), MixtureDriver(Wave(), 1.0)])

@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
@@ -18,6 +19,7 @@ from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.pretrained import Interface
 from manip_il.learn.threads import threads
 from manip_il.learn.train import TrainConfig, fit
 
@@ -126,15 +128,6 @@ def test_a_folder_that_is_no_checkpoint_is_named(tmp_path):
         LearnedPolicy.load(tmp_path)
 
 
-def test_a_downloaded_processor_cannot_name_code_to_run(checkpoint):
-    config = json.loads((checkpoint / "config.json").read_text())
-    (checkpoint / "config.json").write_text(json.dumps(config | {"type": "act"}))
-    path = checkpoint / "policy_preprocessor.json"
-    path.write_text(json.dumps({"name": "x", "steps": [{"class": "subprocess.Popen", "config": {"args": "true"}}]}))
-    with pytest.raises(ManipError, match=r"subprocess\.Popen"):
-        LearnedPolicy.load(checkpoint)
-
-
 def test_weights_that_do_not_fit_the_config_are_refused(checkpoint):
     config = json.loads((checkpoint / "config.json").read_text())
     (checkpoint / "config.json").write_text(json.dumps(config | {"width": 32}))
@@ -142,47 +135,24 @@ def test_weights_that_do_not_fit_the_config_are_refused(checkpoint):
         LearnedPolicy.load(checkpoint)
 
 
-def test_another_of_lerobots_policies_acts_too(tmp_path):
-    from lerobot.configs import FeatureType, PolicyFeature
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    state, environment = PolicyFeature(FeatureType.STATE, (4,)), PolicyFeature(FeatureType.ENV, (6,))
-    config = ACTConfig(
-        input_features={"observation.state": state, "observation.environment_state": environment},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
-        device="cpu", chunk_size=4, n_action_steps=4, dim_model=16, n_heads=2, dim_feedforward=16,
-        n_encoder_layers=1, n_vae_encoder_layers=1,
-    )  # fmt: skip
-    vector = {"mean": torch.zeros(4), "std": torch.ones(4)}
-    stats = {
-        "observation.state": vector,
-        "action": {"mean": torch.full((4,), 3.0), "std": torch.full((4,), 1e-3)},
-        "observation.environment_state": {"mean": torch.zeros(6), "std": torch.ones(6)},
-    }
-    ACTPolicy(config).save_pretrained(tmp_path)
-    for processor in make_pre_post_processors(config, dataset_stats=stats):
-        processor.save_pretrained(tmp_path)
-    policy = LearnedPolicy.load(tmp_path)
-    assert policy.meta is None
-    np.testing.assert_allclose(policy.act(*observations(3)), 3.0, atol=0.02)  # unnormalised
-    assert policy.act(*observations(2)).shape == (2, 4)
-    policy.reset([0])
-    assert policy.act(*observations(2)).shape == (2, 4)
-
-
 def test_pictures_go_in_as_lerobot_feeds_them():
-    seen = {}
+    class Seen:
+        def select(self, batch, episodes):
+            self.batch, self.episodes = batch, list(episodes)
+            return torch.zeros(2, 4)
 
-    def select(batch):
-        seen.update(batch)
-        return torch.zeros(2, 4)
-
-    policy = LearnedPolicy(select, lambda: None, {"observation.state": 4}, None, cameras=["front"])
+    chooser = Seen()
+    interface = Interface("act", {"observation.state": 4}, {"front": (5, 6)}, 4)
+    policy = LearnedPolicy(chooser, interface)
     picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
-    policy.act(*observations(2), {"front": picture, "wrist": picture})
-    assert sorted(seen) == ["observation.images.front", "observation.state"]
-    assert seen["observation.images.front"].shape == (2, 3, 5, 6)
-    assert seen["observation.images.front"][1, 2, 4, 3].item() == pytest.approx(picture[1, 4, 3, 2] / 255)
+    states, environments = observations(2)
+    policy.act(states, environments, {"front": picture, "wrist": picture}, [40, 30])
+    theirs = preprocess_observation({"pixels": {"front": picture}, "agent_pos": states})
+    assert chooser.batch.keys() == theirs.keys()
+    assert all(torch.equal(chooser.batch[key], theirs[key]) for key in theirs)
+    assert chooser.batch["observation.images.front"].is_contiguous()
+    assert chooser.episodes == [40, 30]
     with pytest.raises(MismatchError, match=r"\['front'\].*\['wrist'\]"):
-        policy.act(*observations(2), {"wrist": picture})
+        policy.act(states, environments, {"wrist": picture})
+    with pytest.raises(MismatchError, match="the states has 2, the episodes has 1"):
+        policy.act(states, environments, {"front": picture}, [40])

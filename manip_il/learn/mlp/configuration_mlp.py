@@ -72,7 +72,7 @@ class MLPConfig(PreTrainedConfig):
         state, action = self.robot_state_feature, self.action_feature
         if state is None or action is None:
             have = ", ".join([*(self.input_features or {}), *(self.output_features or {})])
-            raise UsageError(f"the mlp policy needs observation.state and action; the features are {have}")
+            raise UsageError(f"the {self.type} policy needs observation.state and action; the features are {have}")
         if len(state.shape) != 1 or state.shape != action.shape:
             raise MismatchError("shape", "observation.state", state.shape, "action", action.shape)
 

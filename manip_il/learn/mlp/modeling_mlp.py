@@ -9,7 +9,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-from manip_il.learn.columns import INDEX, learning_rows, read_columns, valid_frames
+from manip_il.learn.columns import INDEX, Table, learning_rows, read_columns, valid_frames
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.normalise import fit_statistics
@@ -31,21 +31,16 @@ class MLPPolicy(PreTrainedPolicy):
     def __init__(self, config: MLPConfig, dataset_meta: Any = None, **_: Any) -> None:
         super().__init__(config)
         config.validate_features()
-        features = config.input_features or {}
-        self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in features]
-        config.input_features = {key: features[key] for key in self.inputs}
-        width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
+        self.inputs = [key for key in (STATE, ENVIRONMENT_STATE) if key in (config.input_features or {})]
+        self._build(config)
         self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
-            self._learn_dataset(dataset_meta, config.loss)
+            self._learn_columns(read_columns(dataset_meta.root), config.loss)
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
         """Mean loss over the rows with a valid label; with `reduction="none"` each row's, 0 without one."""
-        state, action = batch[STATE], batch[ACTION]
-        relative = torch.cat([action[:, :-1] - state[:, :-1], action[:, -1:]], dim=-1)
-        losses = self.model.row_losses(self.model.encode(self._inputs(batch)), self.model.encode_targets(relative))
+        losses = self._row_losses(self._inputs(batch), batch)
         valid = self._valid(batch)
         # `where`, as 0 * inf is NaN
         losses = losses if valid is None else torch.where(valid, losses, torch.zeros_like(losses))
@@ -72,6 +67,18 @@ class MLPPolicy(PreTrainedPolicy):
     def get_optim_params(self) -> Any:
         return self.parameters()
 
+    def _build(self, config: MLPConfig) -> None:
+        """Make the network, and leave out the features that it does not look at."""
+        features = config.input_features or {}
+        config.input_features = {key: features[key] for key in self.inputs}
+        width = sum(features[key].shape[0] for key in self.inputs)
+        self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
+
+    def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
+        state, action = batch[STATE], batch[ACTION]
+        relative = torch.cat([action[:, :-1] - state[:, :-1], action[:, -1:]], dim=-1)
+        return self.model.row_losses(self.model.encode(inputs), self.model.encode_targets(relative))
+
     def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
         return torch.cat([batch[key] for key in self.inputs], dim=-1)
 
@@ -84,9 +91,9 @@ class MLPPolicy(PreTrainedPolicy):
             return self._valid_by_index.to(index.device)[index]
         return None
 
-    def _learn_dataset(self, dataset_meta: Any, loss: str) -> None:
-        columns = read_columns(dataset_meta.root)
-        rows = learning_rows(columns)
+    def _learn_columns(self, columns: Table, loss: str) -> None:
+        """Take statistics and valid labels from a dataset's columns."""
+        rows = learning_rows({key: columns[key] for key in (*self.inputs, ACTION, LABEL_VALID) if key in columns})
         self.model.set_statistics(fit_statistics(rows.inputs, rows.targets, loss))
         valid = torch.zeros(int(columns[INDEX].max()) + 1, dtype=torch.bool)
         valid[torch.from_numpy(columns[INDEX])] = torch.from_numpy(valid_frames(columns))

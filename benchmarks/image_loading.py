@@ -1,0 +1,163 @@
+"""Samples a second into image training: decoded once and mapped into memory, against LeRobot's video DataLoader.
+
+python benchmarks/image_loading.py [DATASET] [--quick]
+
+DATASET is the root of a dataset with cameras; without it one of two 128 x 128 cameras is recorded. Batches of 64 in
+shuffled order, every column of the dataset, pictures as float32 in [0, 1]; ours on one thread, LeRobot's in this
+process and in two of its own, of which the faster one counts. Each is warm: all frames are decoded once, every process
+has had an epoch. LeRobot's pictures are as they are in both rows: augmentation is extra work of ours. Then what
+decoding once costs, in LeRobot's epochs. All by turns in the same run; the median ratio of the repeats counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from _machine import describe_machine
+from lerobot.datasets import LeRobotDataset
+
+import datasets
+from manip_il.data.image_cache import open_frame_cache
+from manip_il.data.lerobot_io import camera_keys, read_table
+from manip_il.data.lerobot_library import read_metadata
+from manip_il.learn.augment import Augment
+from manip_il.learn.sources import MemorySource, pictures_to_float
+from manip_il.learn.threads import threads
+from manip_il.learn.windows import Windows
+
+BATCH = 64
+SECONDS = 2.0  # of ours, each time
+PLENTY = 10**12  # bytes
+ROWS = {"plain": None, "augmented": Augment()}
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """Samples/s of LeRobot's two ways and of ours by row; seconds of decoding all frames."""
+
+    peers: tuple[float, float]
+    ours: dict[str, float]
+    build: float
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path, nargs="?")
+    parser.add_argument("--quick", action="store_true", help="few episodes, one repeat: shows that it runs")
+    options = parser.parse_args()
+    print(describe_machine())
+    datasets.disable_progress_bars()
+    with tempfile.TemporaryDirectory() as folder:
+        root = options.dataset or record(Path(folder) / "dataset", 4 if options.quick else 20)
+        with threads(1):
+            repeats = measure(root, Path(folder), 1 if options.quick else 5)
+        report(root, repeats)
+    return 0
+
+
+def record(root: Path, episodes: int) -> Path:
+    words = ["record", "--cameras=front,wrist", f"--dataset.num_episodes={episodes}", f"--dataset.root={root}"]
+    command = "import sys; from manip_il.cli.main import main; sys.exit(main())"
+    subprocess.run([sys.executable, "-c", command, *words], check=True, capture_output=True)
+    return root
+
+
+def measure(root: Path, folder: Path, repeats: int) -> list[Repeat]:
+    # its processes first: a fork of one that has decoded already would share its open files
+    peers = [epochs(root, workers) for workers in (2, 0)]
+    for peer in peers:
+        next(peer)
+    source = our_source(root, folder)
+    rows = {name: partial(our_epoch, source, augment, iter(range(10**9))) for name, augment in ROWS.items()}
+    for epoch in rows.values():
+        epoch()
+    results: list[Repeat] = []
+    for number in range(repeats):
+        pace = (next(peers[0]), next(peers[1]))
+        ours = {name: samples_per_s(epoch) for name, epoch in rows.items()}
+        results.append(Repeat(pace, ours, build_time(root, folder / f"{number}")))
+    return results
+
+
+def epochs(root: Path, workers: int) -> Iterator[float]:
+    """Samples/s of epoch after epoch of LeRobot's loader, which its first one started."""
+    dataset = LeRobotDataset("manip/benchmark", root=root)
+    loader = torch.utils.data.DataLoader(
+        dataset, BATCH, shuffle=True, num_workers=workers, persistent_workers=workers > 0
+    )
+    while True:
+        started = time.perf_counter()
+        samples = sum(len(batch["index"]) for batch in loader)
+        yield samples / (time.perf_counter() - started)
+
+
+def our_source(root: Path, folder: Path) -> MemorySource:
+    frames = open_frame_cache(root, camera_keys(root), max_bytes=PLENTY, folder=folder / "cache")
+    assert frames is not None
+    table = {key: values for key, values in read_table(root).items() if values.dtype != object}
+    columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
+    texts = read_metadata(root).tasks
+    assert texts is not None
+    tasks = tuple(map(str, texts.index))
+    return MemorySource(Windows(table["episode_index"], {}), columns, frames, tasks)
+
+
+def our_epoch(source: MemorySource, augment: Augment | None, number: Iterator[int]) -> int:
+    """One pass in an order of its own; the number of samples."""
+    count, seed = len(source.windows.episodes), next(number)
+    order = np.random.default_rng(seed).permutation(count)
+    generator = torch.Generator().manual_seed(seed)
+    for batch in source.batches(np.split(order, range(BATCH, count, BATCH))):
+        if augment is None:
+            pictures_to_float(batch, source.frames)
+        else:
+            for key in source.frames:
+                batch[key] = augment(batch[key], generator)
+    return count
+
+
+def samples_per_s(epoch: Callable[[], int]) -> float:
+    count, started = 0, time.perf_counter()
+    while time.perf_counter() - started < SECONDS:
+        count += epoch()
+    return count / (time.perf_counter() - started)
+
+
+def build_time(root: Path, folder: Path) -> float:
+    """Seconds that decoding all frames takes."""
+    started = time.perf_counter()
+    open_frame_cache(root, camera_keys(root), max_bytes=PLENTY, folder=folder)
+    return time.perf_counter() - started
+
+
+def report(root: Path, repeats: list[Repeat]) -> None:
+    keys, frames = camera_keys(root), len(read_table(root, ["index"])["index"])
+    print(f"{frames} frames of {len(keys)} cameras, batches of {BATCH}; samples/s, medians; ratios' medians and ranges")
+    print("pictures    LeRobot, 0 processes   2 processes       ours   ours / LeRobot's best")
+    two, none = (statistics.median(repeat.peers[way] for repeat in repeats) for way in (0, 1))
+    for name in ROWS:
+        ours = statistics.median(repeat.ours[name] for repeat in repeats)
+        ratios = summary([repeat.ours[name] / max(repeat.peers) for repeat in repeats])
+        print(f"{name:10}  {none:20,.0f}  {two:12,.0f}  {ours:9,.0f}   {ratios}")
+    build = statistics.median(repeat.build for repeat in repeats)
+    share = summary([repeat.build * max(repeat.peers) / frames for repeat in repeats])
+    print(f"decoding once: {len(keys) * frames / build:,.0f} pictures/s; in epochs of LeRobot's best: {share}")
+
+
+def summary(ratios: list[float]) -> str:
+    return f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""Where a camera's pictures are in a LeRobot v3.0 dataset, and what tells whether they are still the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import PIL
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from PIL import Image
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data.doctor.info import Feature, Info, read_info
+from manip_il.data.doctor.shards import UNREADABLE, find_shards, floats, integers
+from manip_il.data.video_read import VideoReader
+from manip_il.errors import ManipError, MismatchError, UnknownName
+
+Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
+Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` of the first
+
+_VERSION = 1  # of what is stored: another one makes all caches stale
+_PART_BYTES = 32 * 1024 * 1024  # of pictures that are decoded at once
+_LEAST = 32  # frames that are, however large: decoding starts at the last key frame before them
+_PLACES = ("length", "dataset_from_index")
+_SEE_DOCTOR = "`manip-il doctor` tells what is wrong"
+
+
+@dataclass(frozen=True)
+class VideoPart:
+    """Frames `first` to `first + count - 1` of a video file, which are the dataset's from `row` on."""
+
+    path: str
+    first: int
+    count: int
+    row: int
+
+    def read(self, root: Path, key: str, fps: int) -> Iterator[Rows]:
+        """Decode them, all at once. Raises `ManipError` where one is not there."""
+        reader = VideoReader()
+        try:
+            yield self.row, reader.read(root / self.path, self.first, self.count, fps)
+        finally:
+            reader.close()
+
+
+@dataclass(frozen=True)
+class ParquetPart:
+    """The pictures that one row group of a data file holds."""
+
+    path: str
+    group: int
+
+    def read(self, root: Path, key: str, fps: int) -> Iterator[Rows]:
+        """Decode them, one by one. Raises `ManipError` where one cannot be."""
+        try:
+            with pq.ParquetFile(root / self.path) as file:
+                for batch in file.iter_batches(64, [self.group], [key, layout.INDEX], use_threads=False):
+                    rows, stored = (batch.column(name).to_pylist() for name in (layout.INDEX, key))
+                    for row, picture in zip(rows, stored, strict=True):
+                        yield row, _decode(picture["bytes"])[None]
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read the pictures {key} in {root / self.path}: {error}; {_SEE_DOCTOR}") from error
+
+
+Part = VideoPart | ParquetPart
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """One camera of a dataset. size: height and width; parts: they hold every frame once."""
+
+    root: Path
+    key: str
+    fps: int
+    frames: int
+    size: tuple[int, int]
+    parts: tuple[Part, ...]
+    fingerprint: str
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of all its pictures, channels before pixels: (N, 3, height, width)."""
+        return (self.frames, 3, *self.size)
+
+    @property
+    def nbytes(self) -> int:
+        """Of all its pictures, as uint8."""
+        return self.frames * 3 * self.size[0] * self.size[1]
+
+    def read(self, part: Part) -> Iterator[Rows]:
+        """A part's pictures. Raises `ManipError` where one is missing, `MismatchError` where one has another size."""
+        for row, pictures in part.read(self.root, self.key, self.fps):
+            if pictures.shape[1:] != (*self.size, 3):
+                there = f"{layout.INFO} of {self.root}"
+                raise MismatchError(f"shape of {self.key}", f"frame {row}", pictures.shape[1:], there, (*self.size, 3))
+            yield row, pictures
+
+
+def find_frames(root: Path, key: str) -> FrameSource:
+    """Find a camera's pictures without decoding any.
+
+    Raises `ManipError` for a folder that is no dataset, one without frames, one whose files do not hold each frame
+    once, and for depth maps; `UnknownName` for a column that is no camera.
+    """
+    info, findings = read_info(root)
+    if info is None:
+        raise ManipError(f"{root}: {findings[0].place} {findings[0].text}")
+    cameras = {feature.key: feature for feature in info.of_dtype("video", "image")}
+    if key not in cameras:
+        raise UnknownName(f"camera in {root}", key, cameras)
+    camera = cameras[key]
+    if camera.channels != 3 or camera.details.get("is_depth_map"):
+        raise ManipError(f"{key} of {root} holds depth or has {camera.channels} channels; expected RGB pictures")
+    if not info.frames:
+        raise ManipError(f"{root} has no frames")
+    parts = _video_runs(root, info, key) if camera.dtype == "video" else _row_groups(root, info)
+    source = FrameSource(root, key, int(info.fps), info.frames, camera.picture_size, tuple(parts), "")
+    return replace(source, fingerprint=_fingerprint(source, camera), parts=tuple(_pieces(source)))
+
+
+def _fingerprint(source: FrameSource, camera: Feature) -> str:
+    """A digest of everything that the pictures depend on.
+
+    Files count by size and time of change, not by content: reading all of them at every start would take about as
+    long as what the cache saves, and a wrong guess (a copy with new times) costs a build, no wrong picture. Where the
+    dataset stands is left out: it may be moved.
+    """
+    try:
+        files = {path: (source.root / path).stat() for path in sorted({part.path for part in source.parts})}
+    except OSError as error:
+        raise ManipError(f"cannot read {error.filename}: {error.strerror}; {_SEE_DOCTOR}") from error
+    content: dict[str, Any] = {
+        "version": _VERSION,
+        "decoder": ["av", av.__version__] if camera.dtype == "video" else ["pillow", PIL.__version__],
+        "camera": [source.key, camera.dtype, source.fps, source.shape],
+        "parts": [list(vars(part).values()) for part in source.parts],
+        "files": [[path, stat.st_size, stat.st_mtime_ns] for path, stat in files.items()],
+    }
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def _video_runs(root: Path, info: Info, key: str) -> Iterator[VideoPart]:
+    """Consecutive frames of a file that are consecutive frames of the dataset: mostly the whole file."""
+    last: VideoPart | None = None
+    expected = 0
+    for part in _episodes(root, info, key):
+        if part.row != expected:
+            raise ManipError(f"{root}: its episodes hold no frame {expected}, or hold it twice; {_SEE_DOCTOR}")
+        expected += part.count
+        if last is not None and (part.path, part.first) == (last.path, last.first + last.count):
+            last = replace(last, count=last.count + part.count)
+            continue
+        if last is not None:
+            yield last
+        last = part
+    if last is None or expected != info.frames:
+        raise ManipError(f"{root}: {layout.INFO} counts {info.frames} frames, its episodes {expected}; {_SEE_DOCTOR}")
+    yield last
+
+
+def _episodes(root: Path, info: Info, key: str) -> list[VideoPart]:
+    """Every episode's frames, in order of the dataset."""
+    names = [*_PLACES, *(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))]
+    parts: list[VideoPart] = []
+    for shard in find_shards(root, layout.EPISODES_FILES):
+        try:
+            for table in shard.tables(names):
+                length, row, chunk, file = (integers(table, name) for name in names[:4])
+                first = np.round(floats(table, names[4]) * info.fps).astype(np.int64)
+                for count, start, *place, number in zip(length, row, chunk, file, first, strict=True):
+                    path = info.video_path.format(video_key=key, chunk_index=int(place[0]), file_index=int(place[1]))
+                    parts.append(VideoPart(path, int(number), int(count), int(start)))
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read {shard.path}: {error}; {_SEE_DOCTOR}") from error
+    return sorted((part for part in parts if part.count), key=lambda part: part.row)
+
+
+def _row_groups(root: Path, info: Info) -> Iterator[ParquetPart]:
+    rows: list[NDArray[np.int64]] = []
+    for shard in find_shards(root, layout.DATA_FILES):
+        try:
+            rows += [integers(table, layout.INDEX) for table in shard.tables([layout.INDEX])]
+            groups = pq.read_metadata(shard.path).num_row_groups
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read {shard.path}: {error}; {_SEE_DOCTOR}") from error
+        yield from (ParquetPart(shard.name, group) for group in range(groups))
+    if not rows or not np.array_equal(np.sort(np.concatenate(rows)), np.arange(info.frames)):
+        raise ManipError(f"{root}: its data files do not hold each of {info.frames} frames once; {_SEE_DOCTOR}")
+
+
+def _pieces(source: FrameSource) -> Iterator[Part]:
+    """Parts that fit in memory. Row groups are read bit by bit as they are."""
+    limit = max(_LEAST, _PART_BYTES * source.frames // source.nbytes)
+    for part in source.parts:
+        if isinstance(part, ParquetPart):
+            yield part
+            continue
+        for start in range(0, part.count, limit):
+            count = min(limit, part.count - start)
+            yield VideoPart(part.path, part.first + start, count, part.row + start)
+
+
+def _decode(content: bytes | None) -> Pictures:
+    if content is None:
+        raise ValueError("a picture is not in the file")
+    with Image.open(BytesIO(content)) as picture:
+        if picture.mode != "RGB":
+            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
+        return np.asarray(picture)

@@ -1,0 +1,71 @@
+"""The model card beside a checkpoint: what the policy is for, what it learnt from, how to run it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import ModelCard, ModelCardData
+from lerobot.configs.train import TrainPipelineConfig
+
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.observation import observation_of
+
+CARD_FILE = "README.md"
+
+
+def write_card(
+    folder: Path, pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, metrics: Mapping[str, Any]
+) -> None:
+    """Write `README.md`, valid for the Hub, into a `pretrained_model` folder.
+
+    dataset: LeRobot's metadata of what was learnt from; metrics: the last record of the fit, may be empty.
+    """
+    policy = pipeline.policy
+    assert policy is not None
+    data = ModelCardData(
+        license=policy.license or "apache-2.0",
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=sorted({*(policy.tags or []), "robotics", "lerobot", "manip_il", policy.type, meta.robot, meta.task}),
+        model_name=f"{policy.type}_{meta.robot}_{meta.task}",
+        datasets=dataset.repo_id,
+    )
+    text = f"---\n{data.to_yaml()}\n---\n\n{_body(pipeline, meta, dataset, metrics)}"
+    ModelCard(text).save(folder / CARD_FILE)
+
+
+def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, metrics: Mapping[str, Any]) -> str:
+    policy = pipeline.policy
+    assert policy is not None
+    optimizer = pipeline.optimizer
+    sees = observation_of(policy.input_features or {})
+    rows = [
+        ("policy", f"`{policy.type}`, sees `{sees}`: {', '.join(f'`{key}`' for key in policy.input_features or {})}"),
+        ("robot, task", f"`{meta.robot}`, `{meta.task}`, {meta.fps} actions/s"),
+        ("action", f"{meta.action_meaning}: {', '.join(meta.joint_names)}"),
+        ("learnt from", f"{dataset.total_episodes:,} episodes, {dataset.total_frames:,} frames of `{dataset.repo_id}`"),
+        ("fit", f"{pipeline.steps:,} steps of {pipeline.batch_size} samples, seed {pipeline.seed}"),
+        ("optimiser", f"{optimizer.type if optimizer else 'none'}, lr {optimizer.lr if optimizer else 0:g}"),
+        *((name, f"{metrics[name]:.5g}") for name in ("loss", "val_loss") if name in metrics),
+        ("made by", f"manip_il {version('manip_il')}"),
+    ]
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows)
+    return (
+        f"# {policy.type} for {meta.robot} {meta.task}\n\n"
+        "Cloned from an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
+        f"| | |\n|---|---|\n{table}\n\n"
+        "Success on unseen seeds, with its interval:\n\n"
+        "```sh\nmanip-il eval --policy.path=FOLDER_OF_THIS_FILE --eval.n_episodes=500 --output_dir=eval\n```\n\n"
+        "The same by LeRobot:\n\n"
+        "```sh\nlerobot-eval --policy.path=FOLDER_OF_THIS_FILE \\\n"
+        "  --env.discover_packages_path=manip_il.lerobot_plugin \\\n"
+        f"  --env.type=manip_il --env.task={_task_id(meta)} --eval.n_episodes=50\n```\n"
+    )
+
+
+def _task_id(meta: CheckpointMeta) -> str:
+    """As the gymnasium ids have it: `PandaPickPlace-v0`."""
+    return "".join(word.capitalize() for word in f"{meta.robot}_{meta.task}".split("_")) + "-v0"

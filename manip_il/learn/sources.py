@@ -1,0 +1,100 @@
+"""Where batches come from: columns in memory and frames in a memory-mapped cache, or LeRobot's own loader."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, override
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from manip_il.learn.augment import to_float
+from manip_il.learn.windows import Windows
+
+I64 = NDArray[np.int64]
+Batch = dict[str, Any]  # as LeRobot's DataLoader gives it: tensors, and `task` as a list of text
+TASK, TASK_INDEX = "task", "task_index"
+
+
+class Source(Protocol):
+    """Batches for given samples."""
+
+    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
+        """One batch for every array of sample numbers, (B,), in that order. Pictures are uint8 or float32."""
+        ...
+
+
+@dataclass(frozen=True)
+class MemorySource:
+    """A batch is one gather a column.
+
+    columns: numbers, (N, d) or (N,), by LeRobot's names. frames: camera column -> uint8 (N, 3, H, W), memory-mapped.
+    tasks: LeRobot's text of every `task_index`.
+    """
+
+    windows: Windows
+    columns: Mapping[str, torch.Tensor]
+    frames: Mapping[str, NDArray[np.uint8]]
+    tasks: tuple[str, ...]
+
+    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
+        """See `Source`."""
+        return (self.batch(one) for one in samples)
+
+    def batch(self, samples: I64) -> Batch:
+        """The batch of these samples, (B,)."""
+        batch: Batch = {}
+        for key, column in self.columns.items():
+            batch |= self._gather(key, samples, lambda rows, column=column: column[torch.from_numpy(rows)])
+        for key, frames in self.frames.items():
+            batch |= self._gather(key, samples, lambda rows, frames=frames: _read(frames, rows))
+        batch[TASK] = [self.tasks[int(i)] for i in batch[TASK_INDEX]]
+        return batch
+
+    def _gather(self, key: str, samples: I64, read) -> Batch:
+        if key not in self.windows.deltas:
+            return {key: read(samples)}
+        rows, padded = self.windows.rows(samples, key)
+        return {key: read(rows), f"{key}_is_pad": torch.from_numpy(padded)}
+
+
+@dataclass(frozen=True)
+class LibrarySource:
+    """LeRobot's dataset behind a `DataLoader`: slow, but it needs no memory.
+
+    dataset: gives the windows already. workers: processes that decode.
+    """
+
+    dataset: torch.utils.data.Dataset[Batch]
+    workers: int
+
+    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
+        """See `Source`."""
+        loader = torch.utils.data.DataLoader(
+            self.dataset,
+            batch_sampler=_Batches(samples),
+            num_workers=self.workers,
+            multiprocessing_context="spawn" if self.workers else None,  # decoders do not survive a fork
+            generator=torch.Generator(),  # else it draws from the global one, and a resumed run would differ
+        )
+        return iter(loader)
+
+
+class _Batches(torch.utils.data.Sampler[list[int]]):
+    def __init__(self, samples: Iterable[I64]):
+        self._samples = samples
+
+    @override
+    def __iter__(self) -> Iterator[list[int]]:
+        return (one.tolist() for one in self._samples)
+
+
+def pictures_to_float(batch: Batch, cameras: Iterable[str]) -> Batch:
+    """The batch with its uint8 pictures as float32 in [0, 1]."""
+    return batch | {key: to_float(batch[key]) for key in cameras if batch[key].dtype == torch.uint8}
+
+
+def _read(frames: NDArray[np.uint8], rows: I64) -> torch.Tensor:
+    return torch.from_numpy(frames[rows])

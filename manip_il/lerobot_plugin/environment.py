@@ -1,0 +1,151 @@
+"""The options of `--env.type=manip_il`, in LeRobot's form."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, override
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.errors import UnknownName
+from manip_il.learn.observation import OBSERVATIONS
+from manip_il.sim import env as sim
+from manip_il.sim.look import CameraConfig
+from manip_il.sim.observe import environment_state_names
+from manip_il.sim.register import ENV_IDS, register_envs
+from manip_il.sim.robot import get_robot
+from manip_il.sim.task import get_task
+
+PACKAGE = "manip_il"
+TASKS = {env_id.removeprefix(f"{PACKAGE}/"): names for env_id, names in ENV_IDS.items()}
+RENDER_MODES = ("rgb_array", "none")
+_COMMANDS = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train")
+_RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE, ACTION: ACTION}
+
+
+@EnvConfig.register_subclass("manip_il")
+@dataclass
+class ManipILEnv(EnvConfig):
+    """One robot at one task, for lerobot-eval and lerobot-train.
+
+    observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
+    with commas between. observation_height, observation_width: of their pictures [pixels]. fps: control steps a
+    second. episode_length: control steps. tolerance: of object (or hand) to goal [m]. success_steps: in a row within
+    it. render_mode: `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+
+    Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
+    """
+
+    task: str | None = "PandaPickPlace-v0"
+    fps: int = sim.EnvConfig.control_hz
+    observation: str = "state"
+    cameras: str = "front,wrist"
+    observation_height: int = 128
+    observation_width: int = 128
+    episode_length: int = sim.EnvConfig.horizon
+    tolerance: float = sim.EnvConfig.tolerance
+    success_steps: int = sim.EnvConfig.success_steps
+    render_mode: str = "rgb_array"
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, name, known in (
+            ("--env.task", self.task or "", TASKS),
+            ("--env.observation", self.observation, OBSERVATIONS),
+            ("--env.render_mode", self.render_mode, RENDER_MODES),
+        ):
+            if name not in known:
+                raise UnknownName(kind, name, known)
+        self.features = self._features()
+        self.features_map = {key: _RENAMED.get(key, key) for key in self.features}
+
+    @property
+    @override
+    def package_name(self) -> str:
+        """What stands before the task's name in gymnasium's table."""
+        return PACKAGE
+
+    @property
+    @override
+    def gym_kwargs(self) -> dict[str, Any]:
+        """What `gymnasium.make` takes beside the id."""
+        kwargs: dict[str, Any] = {"config": self._simulation(), "render_mode": "rgb_array"}
+        pictured = self._pictured()
+        return kwargs | ({"cameras": pictured.names, "image_size": pictured.size} if pictured else {})
+
+    @override
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """As LeRobot's own, with `render_mode`: {type: {0: n_envs environments}}."""
+        make: Callable[[], gymnasium.Env[Any, Any]] = partial(
+            make_env, self.gym_id, self.gym_kwargs, film=self.render_mode != "none"
+        )
+        mode = AutoresetMode.SAME_STEP  # LeRobot reads an episode's last `info` in the step that ends it
+        if use_async_envs and n_envs > 1:
+            _preload()
+            envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
+        else:
+            envs = SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
+        return {self.type: {0: envs}}
+
+    def _simulation(self) -> sim.EnvConfig:
+        robot, task = TASKS[self.task or ""]
+        return sim.EnvConfig(robot, task, self.fps, self.tolerance, self.success_steps, self.episode_length)
+
+    def _pictured(self) -> CameraConfig | None:
+        if self.observation == "state":
+            return None
+        names = tuple(name.strip() for name in self.cameras.split(","))
+        return CameraConfig(names, self.observation_height, self.observation_width)
+
+    def _features(self) -> dict[str, PolicyFeature]:
+        """By the names under which the environment gives them; a camera by its column, as LeRobot's recorder wants."""
+        simulation, pictured = self._simulation(), self._pictured()
+        joints = (len(get_robot(simulation.robot).joint_names),)
+        features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, joints),
+            "agent_pos": PolicyFeature(FeatureType.STATE, joints),
+        }
+        if self.observation != "images":
+            size = len(environment_state_names(get_task(simulation.task)))
+            features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
+        if pictured is not None:
+            picture = PolicyFeature(FeatureType.VISUAL, (*pictured.size, 3))
+            features |= {IMAGES + name: picture for name in pictured.names}
+        return features
+
+
+def _preload() -> None:
+    """Have children forked from a process that has imported what they need: each would take seconds for it.
+
+    Python 3.12 means to preload the running command by itself, but does not (its fork server drops the path).
+    """
+    commands = [name for name in _COMMANDS if name in sys.modules]
+    multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
+
+
+class Unfilmed(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Small black pictures where lerobot-eval films, which it cannot be told not to."""
+
+    @override
+    def render(self) -> Any:
+        return np.zeros((16, 16, 3), dtype=np.uint8)
+
+
+def make_env(env_id: str, kwargs: dict[str, Any], *, film: bool) -> gymnasium.Env[Any, Any]:
+    """One environment; in a child process too, where nothing is registered yet."""
+    register_envs()
+    env = gymnasium.make(env_id, disable_env_checker=True, **kwargs)
+    return env if film else Unfilmed(env)
+
+
+register_envs()

@@ -1,0 +1,139 @@
+"""Any LeRobot checkpoint is measured by one command, and a bad one is refused in one line before the first step."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.errors import RenderError
+from manip_il.evaluation.results import EvalResult
+from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.look import CameraConfig, Look
+
+from ..learn.tiny_policies import edit_config, write_checkpoint
+
+ENV = EnvConfig("panda", "reach", horizon=8)
+DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
+
+
+def evaluate(policy: Path, folder: Path, *words: str) -> int:
+    sizes = ["--eval.n_episodes=2", "--env.horizon=8", "--workers=1"]
+    return main(["eval", f"--policy.path={policy}", *sizes, f"--output_dir={folder}", *words])
+
+
+@pytest.fixture
+def act(tmp_path) -> Path:
+    spec = env_spec(ENV)
+    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
+    return write_checkpoint(tmp_path / "policy", "act", spec, meta=meta)
+
+
+@pytest.fixture
+def seeing(tmp_path) -> Path:
+    """A policy of the front camera in dim light."""
+    spec = env_spec(ENV, DIM)
+    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, DIM), observation="images", look=asdict(DIM.look))
+    return write_checkpoint(tmp_path / "policy", "act", spec, "images", meta=meta)
+
+
+def change_meta(policy: Path, **changes: object) -> None:
+    path = policy / META_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def error(capsys) -> str:
+    """What went wrong: one line."""
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):
+    assert evaluate(act, tmp_path / "e") == 0
+    out, err = capsys.readouterr()
+    assert "warning" not in err
+    assert "looks at" not in out
+    result = EvalResult.read(tmp_path / "e")
+    assert (result.robot, result.task, [episode.steps for episode in result.episodes]) == ("panda", "reach", [8, 8])
+
+
+@pytest.mark.gl
+def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
+    assert evaluate(seeing, tmp_path / "e") == 0
+    out, err = capsys.readouterr()
+    assert "warning" not in err
+    [line] = [line for line in out.splitlines() if "looks at" in line]
+    assert "'images'" in line
+    assert "front, 32 x 32 pixels, shadows False, brightness 0.5" in line
+    assert EvalResult.read(tmp_path / "e").fingerprint == env_fingerprint(ENV, DIM)
+
+
+@pytest.mark.gl
+def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tmp_path, capsys):
+    change_meta(seeing, look=None)
+    assert evaluate(seeing, tmp_path / "e") == 0
+    [line] = [line for line in capsys.readouterr().err.splitlines() if "size and look" in line]
+    for fingerprint in (env_fingerprint(ENV, DIM), env_fingerprint(ENV, replace(DIM, look=Look()))):
+        assert fingerprint["cameras_sha256"][:12] in line
+    (seeing / META_FILE).unlink()
+    assert evaluate(seeing, tmp_path / "e", "--robot.type=panda", "--task.type=reach", "--overwrite=true") == 0
+    assert "in what light" in capsys.readouterr().err
+
+
+def test_a_policy_of_pictures_does_not_mind_another_tasks_poses(seeing, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("manip_il.sim.env.pictures", lambda *_: (_ for _ in ()).throw(RenderError("no OpenGL here")))
+    assert evaluate(seeing, tmp_path / "e", "--task.type=lift") == 1
+    assert "no OpenGL here" in error(capsys)  # the poses are compared before
+
+
+def test_without_opengl_the_word_comes_before_the_first_episode(seeing, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("manip_il.sim.env.pictures", lambda *_: (_ for _ in ()).throw(RenderError("no OpenGL here")))
+    monkeypatch.setattr(ManipEnv, "advance", None)
+    assert evaluate(seeing, tmp_path / "e") == 1
+    assert "no OpenGL here" in error(capsys)
+    assert not (tmp_path / "e").exists()
+
+
+def spoil(policy: Path, how: str) -> None:
+    state, action = {"type": "STATE", "shape": [8]}, {"type": "ACTION", "shape": [8]}
+    if how == "no weights":
+        (policy / "model.safetensors").unlink()
+    elif how == "a pickle":
+        (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N.")
+    elif how == "unknown type":
+        edit_config(policy, type="akt")
+    elif how == "a camera that is not there":
+        picture = {"type": "VISUAL", "shape": [3, 32, 32]}
+        edit_config(policy, input_features={"observation.state": state, "observation.images.top": picture})
+    elif how == "an input that is not there":
+        edit_config(policy, input_features={"observation.state": state, "observation.effort": state})
+    elif how == "another action":
+        edit_config(policy, output_features={"action": action | {"shape": [7]}})
+    elif how == "another state":
+        edit_config(policy, input_features={"observation.state": state | {"shape": [6]}})
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "words"),
+    [
+        ("no weights", 1, "no model.safetensors in"),
+        ("a pickle", 1, "pytorch_model.bin is a pickle"),
+        ("unknown type", 2, "did you mean 'act'?"),
+        ("a camera that is not there", 1, "top, the environment has front, wrist"),
+        ("an input that is not there", 1, "observation.effort, panda/reach has observation.state"),
+        ("another action", 1, "the policy has 7, panda/reach has 8"),
+        ("another state", 1, "the policy has 6, panda/reach has 8"),
+    ],
+)
+def test_a_bad_checkpoint_is_one_line_before_the_first_step(how, code, words, act, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(ManipEnv, "advance", None)
+    spoil(act, how)
+    assert evaluate(act, tmp_path / "e") == code
+    assert words in error(capsys)
+    assert not (tmp_path / "e").exists()

@@ -1,0 +1,368 @@
+"""The frame cache: every row is the dataset's picture of that frame, whole or not at all, and never too many bytes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from manip_il.data import frame_source
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.atomic import PARTIAL
+from manip_il.data.image_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
+from manip_il.data.lerobot_io import new_dataset, read_frames, write_dataset
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.mdp import Episode
+
+from .pictures import numbered_episodes, numbers_of, picture, with_cameras
+from .test_video import largest_file
+
+MakeEpisode = Callable[..., Episode]
+FRONT, WRIST = KEYS = ["observation.images.front", "observation.images.wrist"]
+BYTES = 21 * 3 * 72 * 96  # one camera's, of three episodes
+PLENTY = 10 * BYTES
+
+
+@pytest.fixture(scope="module")
+def two(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
+    return with_cameras(spec, "front", "wrist")
+
+
+@pytest.fixture(scope="module")
+def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
+    return numbered_episodes(make_episode, two)
+
+
+@pytest.fixture
+def root(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
+    return write(tmp_path / "lift", filmed, two)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
+
+
+def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    write_dataset(episodes, root, spec, repo_id="someone/lift", fingerprint={})
+    return root
+
+
+def opened(root: Path, folder: Path, *keys: str, max_bytes: int = PLENTY, **options: Any) -> dict[str, Any]:
+    frames = open_frame_cache(root, keys or KEYS, max_bytes=max_bytes, folder=folder, **options)
+    assert frames is not None
+    return frames
+
+
+def shown(frames: np.ndarray) -> list[int]:
+    return numbers_of(frames.transpose(0, 2, 3, 1))
+
+
+def entries(folder: Path) -> set[str]:
+    return {path.parent.name for path in folder.glob(f"[!.]*/{FRAMES}")}
+
+
+def test_a_row_is_the_frame_of_its_index(root: Path, folder: Path) -> None:
+    frames = opened(root, folder)
+    assert list(frames) == KEYS
+    assert shown(frames[FRONT]) == list(range(21))
+    assert shown(frames[WRIST]) == list(range(21, 42))
+    for values in frames.values():
+        assert (values.shape, values.dtype) == ((21, 3, 72, 96), np.uint8)
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0
+
+
+def test_a_row_is_bit_equal_to_the_decoded_frame(root: Path, folder: Path) -> None:
+    for key, values in opened(root, folder).items():
+        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
+        np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
+
+
+def test_pieces_files_and_processes_change_nothing(
+    tmp_path: Path,
+    folder: Path,
+    make_episode: MakeEpisode,
+    two: s.RobotTaskSpec,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    episodes = numbered_episodes(make_episode, two, 9)
+    root = tmp_path / "small"
+    with new_dataset(root, two, repo_id="a/b", fingerprint={}, video_files_size_in_mb=0.001) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        writer.finish()
+    assert len(list((root / "videos" / FRONT).rglob("*.mp4"))) > 2
+    whole = opened(root, folder, FRONT)
+    monkeypatch.setattr(frame_source, "_PART_BYTES", 1)
+    monkeypatch.setattr(frame_source, "_LEAST", 4)
+    told: list[int] = []
+    in_pieces = opened(root, tmp_path / "other", FRONT, workers=2, on_frames=told.append)
+    assert len(told) > 9
+    assert sum(told) == 63
+    assert shown(whole[FRONT]) == list(range(63))
+    np.testing.assert_array_equal(whole[FRONT], in_pieces[FRONT])
+
+
+def test_pictures_in_the_data_files_are_the_stored_bytes(
+    tmp_path: Path, folder: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
+) -> None:
+    root = write(tmp_path / "lift", [make_episode(1, 7), make_episode(2, 5)], spec)
+    path = store_pictures(root, [picture(number) for number in range(12)])
+    frames = opened(root, folder, FRONT)[FRONT]
+    np.testing.assert_array_equal(frames, np.stack([picture(number).transpose(2, 0, 1) for number in range(12)]))
+    rows = pq.read_table(path)
+    pq.write_table(rows.take(list(reversed(range(12)))), path, row_group_size=5)  # the column `index` tells
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(12))
+    assert len(entries(folder)) == 2
+    pq.write_table(rows.slice(1), path)
+    with pytest.raises(ManipError, match="do not hold each of 12 frames once"):
+        opened(root, folder, FRONT)
+
+
+def store_pictures(root: Path, pictures: list[np.ndarray]) -> Path:
+    """Give the dataset a camera of LeRobot's dtype `image`."""
+    path = root / layout.DATA_PATH.format(chunk_index=0, file_index=0)
+    files = root.parent / "pictures"
+    files.mkdir()
+    for number, levels in enumerate(pictures):
+        Image.fromarray(levels).save(files / f"{number}.png")
+    stored = [{"bytes": (files / f"{number}.png").read_bytes(), "path": None} for number in range(len(pictures))]
+    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    pq.write_table(pq.read_table(path).append_column(FRONT, pa.array(stored, kind)), path, row_group_size=5)
+    info = json.loads((root / layout.INFO).read_text())
+    names = ["height", "width", "channels"]
+    info["features"][FRONT] = {"dtype": "image", "shape": pictures[0].shape, "names": names}
+    (root / layout.INFO).write_text(json.dumps(info))
+    return path
+
+
+def test_what_is_there_is_not_decoded_again(root: Path, folder: Path) -> None:
+    told: list[int] = []
+    opened(root, folder, FRONT, on_frames=told.append)
+    assert sum(told) == 21
+    opened(root, folder, FRONT, on_frames=told.append)
+    assert sum(told) == 21
+    opened(root, folder, on_frames=told.append)  # the other camera alone is missing
+    assert sum(told) == 42
+    moved = root.rename(root.with_name("moved"))
+    opened(moved, folder, on_frames=told.append)
+    assert sum(told) == 42
+
+
+def test_a_changed_dataset_is_decoded_again(
+    root: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
+) -> None:
+    video = next((root / "videos" / FRONT).rglob("*.mp4"))
+    before = opened(root, folder, FRONT)
+    other = numbered_episodes(make_episode, two, 4)[1:]  # one more number in the wrist's; the front's start at 7
+    root.rename(root.with_name("old"))
+    write(root, other, two)
+    assert video.exists()
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(7, 28))
+    assert shown(before[FRONT]) == list(range(21))
+    os.utime(video, ns=(0, 0))  # perhaps other pictures of the same size
+    told: list[int] = []
+    opened(root, folder, FRONT, on_frames=told.append)
+    assert sum(told) == 21
+
+
+def test_what_does_not_fit_is_left_to_the_plain_path(root: Path, folder: Path) -> None:
+    assert open_frame_cache(root, KEYS, max_bytes=2 * BYTES - 1, folder=folder) is None
+    assert not folder.exists()
+    assert opened(root, folder, max_bytes=2 * BYTES)
+
+
+def test_the_one_not_opened_for_longest_makes_room(
+    tmp_path: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
+) -> None:
+    roots = [write(tmp_path / f"{i}", numbered_episodes(make_episode, two, 3 + i)[i:], two) for i in range(3)]
+    names: list[str] = []
+    for root in roots[:2]:
+        opened(root, folder, FRONT)
+        names += entries(folder) - set(names)
+        time.sleep(0.01)
+    opened(roots[0], folder, FRONT)  # now the second was not opened for longest
+    opened(roots[2], folder, FRONT, max_bytes=int(2.5 * BYTES))
+    assert names[0] in entries(folder)
+    assert names[1] not in entries(folder)
+    assert len(entries(folder)) == 2
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 2.5 * BYTES
+
+
+def test_what_is_in_use_stays(
+    tmp_path: Path, folder: Path, make_episode: MakeEpisode, filmed: list[Episode], two: s.RobotTaskSpec
+) -> None:
+    first = write(tmp_path / "first", filmed, two)
+    second = write(tmp_path / "second", numbered_episodes(make_episode, two, 4)[1:], two)
+    held = opened(first, folder, FRONT)[FRONT][3:5]  # any part of it counts
+    (name,) = entries(folder)
+    limit = int(1.5 * BYTES)
+    assert open_frame_cache(second, [FRONT], max_bytes=limit, folder=folder) is None
+    assert entries(folder) == {name}
+    assert shown(held) == [3, 4]
+    del held
+    assert shown(opened(second, folder, FRONT, max_bytes=limit)[FRONT])[0] == 7
+    assert name not in entries(folder)
+
+
+def test_of_two_at_once_one_decodes(root: Path, folder: Path) -> None:
+    told: list[int] = []
+    results: list[dict[str, Any]] = []
+
+    def slowly(count: int) -> None:
+        told.append(count)
+        time.sleep(0.2)
+
+    threads = [
+        threading.Thread(target=lambda: results.append(opened(root, folder, on_frames=slowly))) for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sum(told) == 42
+    assert len(results) == 3
+    assert all(shown(frames[WRIST]) == list(range(21, 42)) for frames in results)
+
+
+KILLED = """
+import multiprocessing, os, signal, sys
+from pathlib import Path
+from manip_il.data import frame_source
+from manip_il.data.image_cache import open_frame_cache
+
+def die(count):
+    print(*[child.pid for child in multiprocessing.active_children()], flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+frame_source._PART_BYTES, frame_source._LEAST = 1, 4
+root, folder, workers = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+open_frame_cache(root, ["observation.images.front"], max_bytes=10**9, folder=folder, workers=workers, on_frames=die)
+"""
+
+
+def kill_while_decoding(root: Path, folder: Path, workers: int) -> list[int]:
+    """The process ids of what it had started."""
+    words = [sys.executable, "-c", KILLED, str(root), str(folder), str(workers)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    return [int(word) for word in done.stdout.split()]
+
+
+def test_what_a_kill_leaves_is_neither_used_nor_kept(root: Path, folder: Path) -> None:
+    kill_while_decoding(root, folder, 1)
+    assert entries(folder) == set()
+    assert len(list(folder.glob(f".*{PARTIAL}/{FRAMES}"))) == 1
+    opened(root, folder, WRIST)  # another entry: the leftover goes all the same
+    assert list(folder.glob(f".*{PARTIAL}")) == []
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
+
+
+@pytest.mark.slow  # starting them
+def test_processes_that_decode_end_with_the_one_that_started_them(root: Path, folder: Path) -> None:
+    started = kill_while_decoding(root, folder, 2)
+    assert started
+    patience = time.monotonic() + 20
+    while any(is_running(process) for process in started):
+        assert time.monotonic() < patience
+        time.sleep(0.05)
+
+
+def is_running(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_an_entry_cut_short_is_decoded_again(root: Path, folder: Path) -> None:
+    opened(root, folder, FRONT)
+    (path,) = folder.glob(f"*/{FRAMES}")
+    os.truncate(path, BYTES // 2)
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
+
+
+def test_an_entry_tells_of_itself_and_numpy_reads_it(root: Path, folder: Path) -> None:
+    frames = opened(root, folder, FRONT)[FRONT]
+    (path,) = folder.glob(f"*/{FRAMES}")
+    np.testing.assert_array_equal(np.load(path), frames)
+    about = json.loads(path.with_name(ABOUT).read_text())
+    assert about == {"dataset": str(root), "camera": FRONT, "shape": [21, 3, 72, 96]}
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root: Path, folder: Path) -> None:
+    told: list[int] = []
+    with largest_file(BYTES // 2), pytest.raises(ManipError, match=r"cannot keep decoded .*File too large; make room"):
+        opened(root, folder, FRONT, on_frames=told.append)
+    assert told == []
+    assert [path.name for path in folder.iterdir()] == [".lock"]
+
+
+def test_a_folder_that_cannot_be_is_one_clear_error(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ManipError, match="cannot keep decoded pictures in"):
+        opened(root, tmp_path / "file" / "cache")
+    with pytest.raises(UsageError, match="is in the dataset"):
+        opened(root, root / "cache")
+    assert not (root / "cache").exists()
+
+
+def test_a_damaged_dataset_is_named_and_leaves_nothing(root: Path, folder: Path) -> None:
+    video = next((root / "videos" / FRONT).rglob("*.mp4"))
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    for workers in (1, 2):
+        with pytest.raises(ManipError, match=r"file-000\.mp4"):
+            opened(root, folder, FRONT, workers=workers)
+    assert entries(folder) == set()
+    video.unlink()
+    with pytest.raises(ManipError, match=r"cannot read .*file-000\.mp4: No such file"):
+        opened(root, folder, FRONT)
+
+
+def test_what_is_no_picture_is_refused(root: Path, folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
+        opened(root, folder, "observation.images.fron")
+    with pytest.raises(UnknownName, match="unknown camera"):
+        opened(root, folder, s.STATE)
+    with pytest.raises(ManipError, match="not a LeRobot dataset"):
+        opened(tmp_path / "nothing", folder)
+    path = root / layout.INFO
+    info = json.loads(path.read_text())
+    info["features"][FRONT]["shape"] = [72, 90, 3]
+    path.write_text(json.dumps(info))
+    with pytest.raises(MismatchError, match=r"shape of observation\.images\.front differs"):
+        opened(root, folder, FRONT)
+    info["features"][FRONT]["shape"] = [72, 96, 1]
+    path.write_text(json.dumps(info))
+    with pytest.raises(ManipError, match="expected RGB pictures"):
+        opened(root, folder, FRONT)
+    info["features"][FRONT]["shape"] = [72, 96, 3]
+    path.write_text(json.dumps({**info, "total_frames": 22}))
+    with pytest.raises(ManipError, match="counts 22 frames, its episodes 21"):
+        opened(root, folder, FRONT)
+
+
+def test_the_folder_is_in_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_folder() == tmp_path / "xdg" / "manip_il" / "frames"
+    for value in ("", "relative"):  # both are to be ignored, says the standard
+        monkeypatch.setenv("XDG_CACHE_HOME", value)
+        assert cache_folder() == tmp_path / ".cache" / "manip_il" / "frames"

@@ -1,0 +1,164 @@
+"""Crops and colour jitter: what they keep, what bounds them, and that draws are the generator's alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.augment import Augment, to_float
+
+NONE = Augment(0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture
+def pictures() -> Tensor:
+    return torch.randint(0, 256, (6, 3, 20, 24), dtype=torch.uint8, generator=generator(9))
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def grey(pictures: Tensor) -> Tensor:
+    return (pictures * torch.tensor([0.299, 0.587, 0.114]).view(3, 1, 1)).sum(-3)
+
+
+def spread(pictures: Tensor) -> Tensor:
+    return grey(pictures).flatten(1).std(1)
+
+
+def test_floats_are_lerobots(pictures: Tensor) -> None:
+    assert torch.equal(to_float(pictures), (pictures / 255.0).type(torch.float32))  # as it decodes video
+    assert to_float(pictures).dtype == torch.float32
+
+
+def test_nothing_asked_is_the_plain_conversion(pictures: Tensor) -> None:
+    before = generator().get_state()
+    drawn = generator()
+    assert torch.equal(NONE(pictures, drawn), to_float(pictures))
+    assert torch.equal(drawn.get_state(), before)
+
+
+def test_the_same_draws_give_the_same_bytes(pictures: Tensor) -> None:
+    augment = Augment()
+    first, again, other = (augment(pictures, generator(seed)) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    torch.manual_seed(3)  # the global generator has no say
+    assert torch.equal(augment(pictures, generator(1)), first)
+
+
+def test_a_crop_is_the_picture_moved_with_its_border_repeated(pictures: Tensor) -> None:
+    shift = 3
+    crops = Augment(shift, 0, 0, 0)(pictures, generator())
+    found = [moves_of(crop, to_float(picture), shift) for crop, picture in zip(crops, pictures, strict=True)]
+    assert all(len(moves) == 1 for moves in found)
+    assert len({moves[0] for moves in found}) > 1  # a draw a picture
+
+
+def moves_of(crop: Tensor, picture: Tensor, shift: int) -> list[tuple[int, int]]:
+    padded = torch.nn.functional.pad(picture[None], (shift,) * 4, mode="replicate")[0]
+    height, width = picture.shape[1:]
+    places = [(y, x) for y in range(2 * shift + 1) for x in range(2 * shift + 1)]
+    return [(y, x) for y, x in places if torch.equal(padded[:, y : y + height, x : x + width], crop)]
+
+
+def test_crops_move_as_far_as_they_may_and_no_further() -> None:
+    shift, size = 2, 8
+    picture = torch.arange(size * size, dtype=torch.uint8).view(1, 1, size, size).expand(500, 3, -1, -1)
+    centre = (Augment(shift, 0, 0, 0)(picture, generator())[:, 0, 4, 4] * 255).round().long()
+    moves = torch.stack([centre // size - 4, centre % size - 4], dim=1)
+    assert moves.unique(dim=0).tolist() == [[y, x] for y in range(-shift, shift + 1) for x in range(-shift, shift + 1)]
+
+
+def test_brightness_scales_a_picture(pictures: Tensor) -> None:
+    dark = pictures // 2  # nothing is clamped
+    bright = Augment(0, 0.5, 0, 0)(dark, generator())
+    ratios = (bright.sum((1, 2, 3)) / to_float(dark).sum((1, 2, 3))).view(-1, 1, 1, 1)
+    torch.testing.assert_close(bright, to_float(dark) * ratios)
+    assert ratios.min() >= 0.5
+    assert ratios.max() <= 1.5
+    assert ratios.unique().numel() == len(pictures)
+
+
+def test_contrast_keeps_the_mean_and_changes_the_spread(pictures: Tensor) -> None:
+    middle = pictures // 2 + 64
+    changed, before = Augment(0, 0, 0.4, 0)(middle, generator()), to_float(middle)
+    torch.testing.assert_close(grey(changed).mean((1, 2)), grey(before).mean((1, 2)))
+    ratios = spread(changed) / spread(before)
+    assert 0.6 <= ratios.min() < 0.95 < 1.05 < ratios.max() <= 1.4
+
+
+def test_saturation_keeps_what_is_grey(pictures: Tensor) -> None:
+    middle = pictures // 2 + 64
+    changed, before = Augment(0, 0, 0, 0.4)(middle, generator()), to_float(middle)
+    torch.testing.assert_close(grey(changed), grey(before))
+    assert not torch.allclose(changed, before)
+    colourless = middle[:, :1].expand(-1, 3, -1, -1)
+    torch.testing.assert_close(Augment(0, 0, 0, 0.4)(colourless, generator()), to_float(colourless))
+
+
+@pytest.mark.slow  # importing torchvision
+def test_jitter_is_torchvisions_in_that_order(pictures: Tensor) -> None:
+    from torchvision.transforms.v2 import functional
+
+    middle = pictures // 2 + 64
+    ours = Augment(0, 0.1, 0.1, 0.1)(middle, generator())
+    drawn = generator()
+    torch.randint(0, 1, (len(middle), 2), generator=drawn)  # where crops start
+    factors = 1 + 0.1 * (2 * torch.rand(len(middle), 3, generator=drawn) - 1)
+    for picture, mine, (saturation, contrast, brightness) in zip(to_float(middle), ours, factors.tolist(), strict=True):
+        theirs = functional.adjust_contrast(functional.adjust_saturation(picture, saturation), contrast)
+        theirs = functional.adjust_brightness(theirs, brightness)
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=2e-3)  # its grey has other third decimals
+
+
+def test_values_stay_within_bounds(pictures: Tensor) -> None:
+    changed = Augment(4, 1.0, 1.0, 1.0)(pictures, generator())
+    assert (changed.min(), changed.max()) == (0.0, 1.0)
+
+
+def test_the_pictures_of_a_sample_change_together(pictures: Tensor) -> None:
+    windows = pictures.view(3, 2, 3, 20, 24)
+    still = windows[:, :1].expand(-1, 2, -1, -1, -1)
+    changed = Augment()(still, generator())
+    assert changed.shape == still.shape
+    assert torch.equal(changed[:, 0], changed[:, 1])
+    assert torch.equal(changed[:, 0], Augment()(still[:, 0], generator()))
+    assert torch.equal(NONE(windows, generator()), to_float(windows))
+
+
+def test_the_batch_is_left_as_it_was(pictures: Tensor) -> None:
+    before = pictures.clone()
+    Augment()(pictures, generator())
+    assert torch.equal(pictures, before)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_gives_the_same_pictures(pictures: Tensor) -> None:
+    there = Augment()(pictures.cuda(), generator())
+    assert there.is_cuda
+    torch.testing.assert_close(there.cpu(), Augment()(pictures, generator()))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"shift": -1}, "augmentation shift=-1; expected 0 pixels or more"),
+        ({"shift": 1.5}, "shift=1.5; expected 0 pixels"),
+        ({"brightness": 1.2}, "augmentation brightness=1.2; expected a number from 0 to 1"),
+        ({"contrast": -0.1}, "contrast=-0.1"),
+        ({"saturation": float("nan")}, "saturation=nan"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Augment(**settings)
+
+
+def test_batches_that_are_no_pictures_are_refused(pictures: Tensor) -> None:
+    for batch in (pictures.float(), pictures[0], pictures.permute(0, 2, 3, 1)):
+        with pytest.raises(MismatchError, match=r"type of pictures differs.*uint8 \(B, \[T,\] 3, H, W\)"):
+            Augment()(batch, generator())

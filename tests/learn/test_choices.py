@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.learn.choices import choice, option_lines, policy_class, policy_config, policy_types
+
+
+def test_every_policy_of_lerobot_and_ours_is_known() -> None:
+    assert {"act", "diffusion", "vqbet", "smolvla", "pi0", "mlp", "cnn"} <= set(policy_types())
+
+
+def test_options_have_lerobots_names_and_types() -> None:
+    config = policy_config({"type": "diffusion", "down_dims": [32, 64], "horizon": "16", "device": "cpu"})
+    assert isinstance(config, DiffusionConfig)
+    assert (config.down_dims, config.horizon) == ((32, 64), 16)
+
+
+def test_nothing_is_uploaded_unasked() -> None:
+    assert policy_config({"type": "act", "device": "cpu"}).push_to_hub is False
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"type": "atc"}, UnknownName, ["'atc'", "did you mean 'act'"]),
+        ({"type": "act", "chunksize": 4}, UnknownName, ["'chunksize'", "did you mean 'chunk_size'"]),
+        ({"type": "act", "chunk_size": "many"}, UsageError, ["chunk_size", "many"]),
+        ({"type": "act", "chunk_size": 4, "n_action_steps": 8}, UsageError, ["8", "4", "n_action_steps"]),
+        ({"type": "diffusion", "horizon": 15}, UsageError, ["horizon", "15"]),
+        ({"type": "mlp", "loss": "mes"}, UnknownName, ["'mes'", "mse"]),
+        ({"type": "act", "path": "runs/x"}, UsageError, ["--policy.path", "--policy.type"]),
+        ({"path": "runs/nothing"}, ManipError, ["runs/nothing", "config.json"]),
+        ({"type": "act", "push_to_hub": True}, UnknownName, ["push_to_hub"]),
+    ],
+)
+def test_a_wrong_option_is_one_clear_line(settings, error, words) -> None:
+    with pytest.raises(error) as raised:
+        policy_config(settings)
+    text = str(raised.value)
+    assert "\n" not in text
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a graphics card")
+def test_a_card_that_is_not_there_is_named() -> None:
+    with pytest.raises(UsageError, match=r"--policy\.device=cuda"):
+        policy_config({"type": "act", "device": "cuda"})
+
+
+def test_optimisers_and_schedules_by_their_type() -> None:
+    adamw = choice(OptimizerConfig, {"type": "adamw", "lr": "5e-4"}, "optimizer")
+    assert isinstance(adamw, AdamWConfig)
+    assert adamw.lr == 5e-4
+    with pytest.raises(UnknownName, match=r"scheduler\.type"):
+        choice(LRSchedulerConfig, {"type": "cosine"}, "scheduler")
+
+
+def test_a_checkpoint_gives_its_options_and_they_can_be_changed(tmp_path) -> None:
+    policy_config({"type": "act", "chunk_size": 7, "n_action_steps": 5, "device": "cpu"})._save_pretrained(tmp_path)
+    config = policy_config({"path": str(tmp_path), "n_action_steps": 2})
+    assert isinstance(config, ACTConfig)
+    assert (config.chunk_size, config.n_action_steps) == (7, 2)
+    assert config.pretrained_path == tmp_path
+
+
+def test_the_help_lists_a_policys_options() -> None:
+    rows = dict(option_lines(policy_class("act"), "policy"))
+    assert rows["--policy.chunk_size"] == "100"
+    assert "--policy.push_to_hub" not in rows

@@ -1,0 +1,255 @@
+"""The cnn policy: keypoints that point, LeRobot's way in and out, and labels and truth that only training sees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from lerobot.configs import NormalizationMode
+from lerobot.optim.optimizers import save_optimizer_state
+from lerobot.policies.factory import get_policy_class, make_policy, make_policy_config, make_pre_post_processors
+
+from manip_il.data.schema import features
+from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.learn.cnn import CNNConfig
+from manip_il.learn.cnn.encoder import KeypointEncoder
+from manip_il.learn.cnn.modeling_cnn import CNNPolicy
+from manip_il.learn.losses import LOSSES
+from manip_il.learn.observation import policy_features
+
+SIDE = 32
+SMALL = {"channels": (4, 4), "keypoints": 3, "width": 16, "depth": 1, "device": "cpu"}
+LEARNING = ("observation.state", "observation.environment_state", "action", "label_valid")
+
+
+@pytest.fixture
+def meta(table, spec, tmp_path):
+    """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
+    table["label_valid"][::10] = 0
+    columns = {key: pa.array(list(table[key])) for key in LEARNING}
+    columns |= {"label_valid": pa.array(table["label_valid"][:, 0]), "index": pa.array(np.arange(len(table["action"])))}
+    (tmp_path / "dataset/data").mkdir(parents=True)
+    pq.write_table(pa.table(columns), tmp_path / "dataset/data/file-000.parquet")
+    seen = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
+    return SimpleNamespace(features=features(seen), root=tmp_path / "dataset", stats={})
+
+
+def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
+    """As LeRobot makes it from a dataset."""
+    config = make_policy_config("cnn", **SMALL | options)
+    config.input_features, config.output_features = policy_features(meta.features, observation)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        policy = make_policy(config, ds_meta=meta)
+    assert isinstance(policy, CNNPolicy)
+    policy.train()
+    return policy
+
+
+def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
+    """The first rows, as LeRobot's preprocessor passes them on, with pictures of noise."""
+    generator = torch.Generator().manual_seed(seed)
+    batch = {key: torch.from_numpy(table[key][:rows]) for key in LEARNING[:3]}
+    for camera in ("front", "wrist"):
+        batch[f"observation.images.{camera}"] = torch.rand(rows, 3, SIDE, SIDE, generator=generator)
+    return batch | {"index": torch.arange(rows)}
+
+
+def test_a_spot_is_found_between_the_pixels_with_its_size():
+    encoder = KeypointEncoder((1, 1), keypoints=1)
+    with torch.no_grad():
+        for parameter in encoder.parameters():
+            parameter.zero_()
+        for layer in (encoder.layers[0], encoder.layers[2]):
+            assert isinstance(layer, torch.nn.Conv2d)
+            layer.weight[0, 0] = 1.0  # sums of the light about a place
+        encoder.heat.weight.fill_(0.01)
+
+    def spots(columns: list[float], width: float) -> torch.Tensor:
+        down, across = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+        distance = (across - torch.tensor(columns)[:, None, None]).square() + (down - 30.0).square()
+        return (0.5 + 0.5 * torch.exp(-distance / width**2)).unsqueeze(1).expand(-1, 3, -1, -1)
+
+    columns = [20.0, 20.5, 21.0, 44.0]
+    x, y, spread, strength = encoder(spots(columns, 8.0)).T
+    # feature maps are 16 wide, from -1 at pixel 0 to 1 at pixel 60
+    torch.testing.assert_close(x, torch.tensor(columns) / 30.0 - 1.0, rtol=0.0, atol=0.006)
+    torch.testing.assert_close(y, torch.zeros(4), rtol=0.0, atol=0.006)
+    assert encoder(spots([20.0], 11.0))[0, 2] > 1.1 * spread[0]
+    nothing = encoder(torch.full((1, 3, 64, 64), 0.5))
+    assert nothing[0, 3] < 0.1 * strength.min()
+
+
+def test_some_keypoints_begin_on_a_small_thing_of_its_own_colour():
+    generator = torch.Generator().manual_seed(0)
+    places = torch.randint(8, 120, (24, 2), generator=generator)
+    table = torch.tensor([0.8, 0.7, 0.6])[:, None, None] * torch.linspace(0.5, 1.0, 128)
+    pictures = table.repeat(24, 1, 128, 1)
+    pictures[:, :, :, :30] = 0.1  # something dark beside it
+    for picture, (row, column) in zip(pictures, places.tolist(), strict=True):
+        picture[:, row - 2 : row + 3, column - 2 : column + 3] = torch.tensor([0.2, 0.8, 0.4])[:, None, None]
+    following = []
+    with torch.random.fork_rng(devices=[]):
+        for seed in range(5):
+            torch.manual_seed(seed)
+            x = KeypointEncoder(CNNConfig.channels, CNNConfig.keypoints)(pictures).detach()[:, : CNNConfig.keypoints]
+            known = torch.corrcoef(torch.cat([x.T, places[:, 1:].T.float()]))[-1, :-1]
+            following.append(int((known > 0.9).sum()))
+    assert min(following) >= 1, following
+
+
+def test_lerobot_makes_it_from_a_dataset_without_a_look_at_the_truth(meta):
+    policy = new_policy(meta)
+    assert list(policy.config.input_features or {}) == [
+        "observation.state", "observation.images.front", "observation.images.wrist"
+    ]  # fmt: skip
+    assert policy.model.input_mean.shape == (4 + 2 * 3 * 4,)
+    assert set(CNNConfig(**SMALL).normalization_mapping.values()) == {NormalizationMode.IDENTITY}
+
+
+def test_statistics_are_those_of_the_valid_relative_targets(meta, table):
+    policy = new_policy(meta)
+    valid = table["label_valid"][:, 0] != 0
+    relative = (table["action"][:, :-1] - table["observation.state"][:, :-1])[valid]
+    np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
+    np.testing.assert_allclose(policy.model.input_mean[:4], table["observation.state"][valid].mean(0), rtol=1e-5)
+    assert torch.equal(policy.model.input_scale[4:], torch.ones(24))  # keypoints have no units
+
+
+def test_frames_without_a_valid_label_are_left_out(meta, table):
+    policy = new_policy(meta)
+    batch = make_batch(table)
+    each, _ = policy.forward(batch, reduction="none")
+    assert [i for i in range(20) if each[i] == 0] == [0, 10]
+    batch["action"][10] += 100.0
+    mean, _ = policy.forward(batch)
+    torch.testing.assert_close(mean, each.sum() / 18)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_one_batch_is_learnt_by_heart(loss, meta, table):
+    policy = new_policy(meta, loss=loss, width=64, aux_weight=0.0)
+    batch = make_batch(table)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    for _ in range(100):
+        value, _ = policy.forward(batch)
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+    valid = torch.from_numpy(table["label_valid"][:20, 0] != 0)
+    action = policy.select_action(batch)
+    error = (action - batch["action"])[valid, :-1].abs().mean()
+    spread = (batch["action"] - batch["observation.state"])[valid, :-1].std(0).mean()
+    assert error < 0.35 * spread
+    assert policy.predict_action_chunk(batch).shape == (20, 1, 4)
+    assert torch.equal(policy.predict_action_chunk(batch)[:, 0], action)
+
+
+def test_saved_and_loaded_by_lerobot_it_acts_bit_equal(meta, table, tmp_path):
+    policy, batch = new_policy(meta), make_batch(table)
+    optimizer = torch.optim.AdamW(policy.parameters())
+    policy.forward(batch)[0].backward()
+    optimizer.step()
+    save_optimizer_state(optimizer, tmp_path)  # safetensors takes contiguous tensors only
+    policy.save_pretrained(tmp_path / "policy")
+    for processor in make_pre_post_processors(policy.config, dataset_stats=meta.stats):
+        processor.save_pretrained(tmp_path / "policy")
+    again = get_policy_class("cnn").from_pretrained(tmp_path / "policy", strict=True)
+    before, after = make_pre_post_processors(again.config, pretrained_path=str(tmp_path / "policy"))
+    expected = policy.eval().select_action(batch)
+    seen = {key: batch[key] for key in again.config.input_features or {}}
+    for row in range(3):  # unbatched, as a robot gives them
+        action = after(again.select_action(before({key: value[row] for key, value in seen.items()})))
+        assert torch.equal(action, expected[row : row + 1])
+
+
+def test_a_row_does_not_depend_on_the_others_nor_on_half_precision(meta, table):
+    policy, batch = new_policy(meta).eval(), make_batch(table)
+    together = policy.select_action(batch)
+    for rows in ([0], [19, 3], list(range(5, 20))):
+        assert torch.equal(policy.select_action({key: value[rows] for key, value in batch.items()}), together[rows])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(policy.select_action(batch), together)
+    assert policy.select_action({key: value[:0] for key, value in batch.items()}).shape == (0, 4)
+
+
+def test_learning_in_half_precision_is_near_the_same(meta, table):
+    policy, batch = new_policy(meta), make_batch(table)
+    exact, _ = policy.forward(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        half, _ = policy.forward(batch)
+    assert half.dtype == torch.float32
+    assert half != exact
+    torch.testing.assert_close(half, exact, rtol=2e-2, atol=0.0)
+
+
+def test_the_truth_is_read_off_the_keypoints_while_training_only(meta, table):
+    policy, batch = new_policy(meta, aux_weight=0.5), make_batch(table)
+    assert isinstance(policy.privileged, torch.nn.Linear)
+    assert policy.privileged.out_features == 6
+    plain = new_policy(meta, aux_weight=0.0)
+    assert plain.privileged is None
+    plain.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("privileged")})
+    valid = torch.from_numpy(table["label_valid"][:20, 0] != 0)
+    truth = table["observation.environment_state"]
+    used = truth[table["label_valid"][:, 0] != -1]
+    scaled = (truth[:20] - used.mean(0)) / np.where(used.std(0) < 1e-4, np.inf, used.std(0))
+    with torch.no_grad():
+        keypoints = policy._inputs(batch)[:, 4:]
+        error = (policy.privileged(keypoints) - torch.from_numpy(scaled)).abs().mean(-1) * valid
+    more = policy.forward(batch, "none")[0] - plain.forward(batch, "none")[0]
+    torch.testing.assert_close(more, (0.5 * error).float(), rtol=1e-3, atol=1e-4)
+    held_out = policy.eval().forward(batch, "none")[0]
+    assert torch.equal(held_out, plain.eval().forward(batch, "none")[0])
+
+
+def test_truth_that_is_an_input_is_not_learnt(meta, table):
+    policy = new_policy(meta, observation="both")
+    assert policy.privileged is None
+    assert policy.model.input_mean.shape == (4 + 6 + 24,)
+    assert policy.select_action(make_batch(table)).shape == (20, 4)
+
+
+def test_off_the_data_an_arm_target_stays_as_near_as_in_the_data(meta, table):
+    policy, batch = new_policy(meta), make_batch(table)
+    relative = torch.from_numpy(table["action"] - table["observation.state"])[:, :-1].abs().max()
+    batch = {key: value * 1e3 for key, value in batch.items()}
+    reach = (policy.select_action(batch) - batch["observation.state"])[:, :-1].abs().max()
+    assert reach <= relative + 1e-6 * batch["observation.state"].abs().max()
+
+
+def test_features_that_do_not_fit_are_refused_in_one_line(meta):
+    with pytest.raises(UsageError, match=r"needs pictures \(observation\.images\.\*\); the inputs are observation"):
+        new_policy(meta, observation="state")
+    config = CNNConfig(**SMALL)
+    config.input_features, config.output_features = policy_features(meta.features, "images")
+    del config.input_features["observation.state"]
+    with pytest.raises(UsageError, match=r"cnn policy needs observation\.state and action"):
+        CNNPolicy(config)
+    narrow = meta.features | {"action": meta.features["action"] | {"shape": (3,)}}
+    with pytest.raises(MismatchError, match=r"\(4,\).*\(3,\)"):
+        new_policy(SimpleNamespace(features=narrow, root=meta.root, stats={}))
+    grey = meta.features["observation.images.front"] | {"shape": (SIDE, SIDE, 1)}
+    with pytest.raises(MismatchError, match=r"images\.front has \(1, 32, 32\)"):
+        new_policy(
+            SimpleNamespace(features=meta.features | {"observation.images.front": grey}, root=meta.root, stats={})
+        )
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"channels": (8,)}, UsageError, r"policy\.channels is \[8\]"),
+        ({"keypoints": 0}, UsageError, r"policy\.keypoints is 0"),
+        ({"aux_weight": -1.0}, UsageError, r"policy\.aux_weight is -1"),
+        ({"loss": "mes"}, UnknownName, "did you mean 'mse'"),
+    ],
+)
+def test_options_out_of_range_are_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        CNNConfig(**options)

@@ -1,0 +1,379 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from urllib.error import URLError
+
+import numpy as np
+import pytest
+import torch
+from accelerate.state import AcceleratorState
+from huggingface_hub import ModelCard
+from lerobot.configs.default import WandBConfig
+
+from manip_il.cli.main import main
+from manip_il.data.lerobot_io import read_spec, read_table
+from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.errors import FolderExistsError, ManipError, MismatchError, UsageError
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.choices import policy_config
+from manip_il.learn.fit_policy import PolicyTrainer, fit_policy
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.policy_config import PolicyFitConfig
+from manip_il.learn.setup import load_samples, set_features, usable_statistics
+from manip_il.learn.sources import LibrarySource, MemorySource
+
+ACT = {
+    "type": "act",
+    "device": "cpu",
+    "chunk_size": 4,
+    "n_action_steps": 2,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 16,
+    "n_encoder_layers": 1,
+    "n_vae_encoder_layers": 1,
+}
+DIFFUSION = {
+    "type": "diffusion",
+    "device": "cpu",
+    "horizon": 8,
+    "n_action_steps": 4,
+    "down_dims": [8, 16],
+    "n_groups": 4,
+    "diffusion_step_embed_dim": 8,
+    "num_train_timesteps": 10,
+}
+SEEN = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("demos") / "d"
+    assert main(["record", f"--dataset.root={root}", "--dataset.num_episodes=5", "--workers=1"]) == 0
+    return root
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> Path:
+    """Demonstrations with pictures."""
+    root = tmp_path_factory.mktemp("seen") / "d"
+    words = ["--cameras=front,wrist", "--image.height=64", "--image.width=64", "--task.type=reach"]
+    assert main(["record", f"--dataset.root={root}", "--dataset.num_episodes=2", "--workers=1", *words]) == 0
+    return root
+
+
+def config(settings=ACT, **changes) -> PolicyFitConfig:
+    values = {"steps": 4, "batch_size": 8, "save_freq": 2, "log_freq": 1, "eval_split": 0.2}
+    return PolicyFitConfig(policy_config(settings), **(values | changes))
+
+
+def fit(root: Path, folder: Path, settings=ACT, stop_after: int | None = None, resume=False, **changes) -> Path:
+    done = 0
+
+    def step(_record) -> None:
+        nonlocal done
+        done += 1
+        if done == stop_after:
+            raise KeyboardInterrupt
+
+    meta = CheckpointMeta.of(read_spec(root))
+    return fit_policy(root, config(settings, **changes), folder, meta=meta, on_step=step, resume=resume)
+
+
+def saved(folder: Path) -> dict[str, bytes]:
+    last = folder / "checkpoints" / "last"
+    return {p.name: p.read_bytes() for p in sorted(last.rglob("*.safetensors"))}
+
+
+@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
+def test_a_resumed_fit_ends_with_the_same_bits(demos, tmp_path, settings) -> None:
+    fit(demos, tmp_path / "straight", settings)
+    with pytest.raises(KeyboardInterrupt):
+        fit(demos, tmp_path / "stopped", settings, stop_after=3)
+    assert (tmp_path / "stopped/checkpoints/last").resolve().name == "000003"
+    fit(demos, tmp_path / "stopped", settings, resume=True)
+    straight, stopped = saved(tmp_path / "straight"), saved(tmp_path / "stopped")
+    assert "model.safetensors" in straight
+    assert "optimizer_state.safetensors" in straight
+    assert straight == stopped
+    steps = [json.loads(line) for line in (tmp_path / "stopped/metrics.jsonl").read_text().splitlines()]
+    expected = [json.loads(line) for line in (tmp_path / "straight/metrics.jsonl").read_text().splitlines()]
+    assert [(r["step"], r["loss"], r["val_loss"]) for r in steps] == [
+        (r["step"], r["loss"], r["val_loss"]) for r in expected
+    ]
+
+
+def test_metrics_and_checkpoints_do_not_change_the_weights(demos, tmp_path) -> None:
+    fit(demos, tmp_path / "often", DIFFUSION, log_freq=1, save_freq=1)
+    fit(demos, tmp_path / "seldom", DIFFUSION, log_freq=4, save_freq=4)
+    assert saved(tmp_path / "often")["model.safetensors"] == saved(tmp_path / "seldom")["model.safetensors"]
+
+
+def test_a_fit_lowers_the_loss(demos, tmp_path) -> None:
+    fit(demos, tmp_path / "r", {**ACT, "use_vae": False}, steps=60, log_freq=20, save_freq=60, lr=3e-3)
+    records = [json.loads(line) for line in (tmp_path / "r/metrics.jsonl").read_text().splitlines()]
+    assert [record["step"] for record in records] == [20, 40, 60]
+    assert records[-1]["loss"] < 0.7 * records[0]["loss"]
+    assert records[-1]["val_loss"] < records[0]["val_loss"]
+    assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss"} <= records[0].keys()
+
+
+ACTS = """
+import sys
+import numpy as np
+from manip_il.learn.policy import LearnedPolicy
+rng = np.random.default_rng(0)
+policy = LearnedPolicy.load(sys.argv[1])
+states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
+actions = [
+    policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
+    for joints, scene in zip(states, environment)
+]
+print(np.stack(actions).tobytes().hex())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
+def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(demos, tmp_path, settings) -> None:
+    path = fit(demos, tmp_path / "r", settings)
+    script = [sys.executable, "-c", ACTS, str(path)]
+    one, two = (subprocess.run(script, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    assert one == two
+    trainer = PolicyTrainer(
+        demos, config(settings), tmp_path / "r", CheckpointMeta.of(read_spec(demos)), tmp_path / "r/checkpoints/last"
+    )
+    rng = np.random.default_rng(0)
+    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
+    actions = np.frombuffer(bytes.fromhex(one.strip().splitlines()[-1])).reshape(6, 3, 8)
+    if settings is ACT:  # diffusion draws: its generator is seeded by the episode in a rollout alone
+        policy = trainer.policy.eval()
+        with torch.inference_mode():
+            batch = {
+                "observation.state": torch.from_numpy(states[0, :1].astype(np.float32)),
+                "observation.environment_state": torch.from_numpy(environment[0, :1].astype(np.float32)),
+            }
+            ours = trainer.postprocessor(policy.select_action(trainer.preprocessor(batch)))
+        assert ours.numpy().astype(np.float64).tobytes() == actions[0, :1].tobytes()
+
+
+def test_held_out_episodes_are_never_learnt_from(demos) -> None:
+    one = config(eval_split=0.4)
+    meta = read_metadata(demos)
+    set_features(one.policy, meta, "state")
+    samples = load_samples(demos, one, meta)
+    episodes = read_table(demos, ["episode_index"])["episode_index"]
+    assert len(np.unique(episodes[samples.held_out])) == 2
+    assert not set(episodes[samples.held_out]) & set(episodes[samples.train])
+    assert len(np.unique(episodes[samples.train])) == 3
+
+
+@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
+def test_a_batch_from_memory_is_lerobots_batch(demos, settings) -> None:
+    _same_batches(demos, settings, "state")
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.parametrize("observation", ["images", "both"])
+def test_a_batch_from_the_cache_is_lerobots_batch(seen, observation, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _same_batches(seen, SEEN, observation)
+
+
+def _same_batches(root: Path, settings, observation: str) -> None:
+    one = config(settings)
+    meta = read_metadata(root)
+    set_features(one.policy, meta, observation)
+    source = load_samples(root, one, meta).source
+    assert isinstance(source, MemorySource)
+    ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in source.windows.deltas.items()}
+    library = LibrarySource(lerobot_windows(root, meta.repo_id, ahead), workers=0)
+    rows = [np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])]
+    for ours, theirs in zip(source.batches(rows), library.batches(rows), strict=True):
+        for key, value in ours.items():
+            if key == "task":
+                assert list(value) == list(theirs[key])
+                continue
+            other = theirs[key]
+            if value.dtype == torch.uint8:
+                value = value.to(torch.float32) / 255.0
+                other = other.to(torch.float32) / (255.0 if other.dtype == torch.uint8 else 1.0)
+            assert torch.equal(value.to(torch.float64), other.to(torch.float64).reshape(value.shape)), key
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(seen, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    one = {"observation": "images", "batch_size": 4, "steps": 2, "augment": None}
+    fit(seen, tmp_path / "cached", SEEN, **one)
+    assert list((tmp_path / "cache").rglob("*"))
+    fit(seen, tmp_path / "loaded", SEEN, **one, image_cache_gb=0.0, num_workers=0)
+    ours, theirs = (
+        [json.loads(line)["loss"] for line in (tmp_path / name / "metrics.jsonl").read_text().splitlines()]
+        for name in ("cached", "loaded")
+    )
+    assert ours == pytest.approx(theirs, rel=1e-5)
+
+
+def test_a_run_that_is_there_is_not_trained_over(demos, tmp_path) -> None:
+    fit(demos, tmp_path / "r")
+    with pytest.raises(FolderExistsError):
+        fit(demos, tmp_path / "r")
+    with pytest.raises(MismatchError, match="batch_size"):
+        fit(demos, tmp_path / "r", resume=True, batch_size=4)
+    with pytest.raises(MismatchError, match="policy"):
+        fit(demos, tmp_path / "r", {**ACT, "dropout": 0.0}, resume=True)
+
+
+def test_a_run_is_not_gone_on_with_on_other_data(demos, tmp_path) -> None:
+    fit(demos, tmp_path / "r")
+    other = tmp_path / "other"
+    assert main(["record", f"--dataset.root={other}", "--dataset.num_episodes=4", "--workers=1"]) == 0
+    with pytest.raises(MismatchError, match="training data"):
+        fit(other, tmp_path / "r", resume=True)
+
+
+def test_a_backbone_that_cannot_be_downloaded_is_one_line_with_two_ways_out(demos, tmp_path, monkeypatch) -> None:
+    def no_network(*_args, **_kwargs):
+        raise URLError("no network")
+
+    monkeypatch.setattr("manip_il.learn.setup.make_policy", no_network)
+    with pytest.raises(ManipError) as raised:
+        fit(demos, tmp_path / "r")
+    text = str(raised.value)
+    assert "--policy.pretrained_backbone_weights=null" in text
+    assert "checkpoints" in text
+    assert "ResNet18_Weights" in text
+
+
+def test_what_a_policy_cannot_see_is_named(demos, tmp_path) -> None:
+    with pytest.raises(ManipError, match="--cameras"):
+        fit(demos, tmp_path / "r", observation="images")
+
+
+def test_a_column_that_hardly_moves_is_not_blown_up() -> None:
+    flat = {"mean": np.zeros(2), "std": np.array([1e-7, 0.5]), "min": np.zeros(2), "max": np.array([1e-6, 2.0])}
+    usable = usable_statistics({"observation.state": flat, "observation.images.front": flat})
+    assert usable["observation.state"]["std"].tolist() == [1e-3, 0.5]
+    assert usable["observation.state"]["max"].tolist() == [1e-2, 2.0]
+    assert usable["observation.images.front"]["std"].tolist() == [1e-7, 0.5]
+
+
+def test_a_checkpoint_has_lerobots_layout_and_a_card(demos, tmp_path) -> None:
+    path = fit(demos, tmp_path / "r")
+    assert {
+        "config.json",
+        "model.safetensors",
+        "train_config.json",
+        "policy_preprocessor.json",
+        "policy_postprocessor.json",
+        "manip_il.json",
+        "README.md",
+    } <= {p.name for p in path.iterdir()}
+    assert json.loads((path / "config.json").read_text())["pretrained_backbone_weights"] is None
+    card = ModelCard.load(path / "README.md")
+    assert card.data.to_dict()["library_name"] == "lerobot"
+    assert card.data.to_dict()["pipeline_tag"] == "robotics"
+    assert "5 episodes" in card.text
+    assert "val_loss" in card.text
+    assert str(tmp_path) not in card.text
+    assert LearnedPolicy.load(path).meta == CheckpointMeta.of(read_spec(demos))
+
+
+def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("WANDB_DIR", str(tmp_path))
+    fit(demos, tmp_path / "r", tensorboard=True, wandb=WandBConfig(enable=True, mode="offline", disable_artifact=True))
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "r" / "tensorboard"))
+    events.Reload()
+    assert [point.step for point in events.Scalars("loss")] == [1, 2, 3, 4]
+    assert list((tmp_path / "r" / "wandb").glob("offline-run-*"))
+
+
+def test_tensorboard_that_is_not_installed_is_named(demos, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(UsageError, match=r"manip_il\[tensorboard\]"):
+        fit(demos, tmp_path / "r", tensorboard=True)
+
+
+@pytest.fixture
+def new_accelerator():
+    """Accelerate keeps one precision for all of a process."""
+    AcceleratorState._reset_state(True)
+    yield
+    AcceleratorState._reset_state(True)
+
+
+@pytest.mark.usefixtures("new_accelerator")
+def test_half_precision_trains_in_bfloat16_on_a_cpu(demos, tmp_path) -> None:
+    path = fit(demos, tmp_path / "half", {**ACT, "use_amp": True})
+    AcceleratorState._reset_state(True)
+    fit(demos, tmp_path / "full", ACT)
+    assert saved(tmp_path / "half")["model.safetensors"] != saved(tmp_path / "full")["model.safetensors"]
+    assert json.loads((path / "config.json").read_text())["use_amp"] is True
+
+
+def test_a_policy_starts_from_a_checkpoints_weights(demos, tmp_path) -> None:
+    first = fit(demos, tmp_path / "first")
+    settings = {"path": str(first)}
+    second = fit(demos, tmp_path / "second", settings, steps=1, lr=1e-12)
+    from safetensors.torch import load_file
+
+    before, after = load_file(first / "model.safetensors"), load_file(second / "model.safetensors")
+    assert all(torch.allclose(before[name], after[name], atol=1e-6) for name in before)
+
+
+@pytest.mark.slow
+def test_two_processes_learn_what_one_learns_from_both_shares(demos, tmp_path) -> None:
+    """Every process takes its share of the batch; the gradients are averaged."""
+    words = [
+        "train",
+        f"--dataset.root={demos}",
+        "--steps=3",
+        "--save_freq=3",
+        "--optimizer.type=sgd",
+        "--optimizer.lr=0.001",
+    ]
+    words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
+    # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.
+    words += ["--policy.use_vae=false", "--policy.dropout=0.0", "--policy.chunk_size=1", "--policy.n_action_steps=1"]
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+    launch += ["-m", "manip_il.cli.main", *words]
+    two = tmp_path / "two"
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "HF_HOME": str(tmp_path / "hf")}
+    done = subprocess.run(
+        [*launch, "--batch_size=4", f"--output_dir={two}"], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.count("checkpoint:") == 1
+    assert main([*words, "--batch_size=8", f"--output_dir={tmp_path / 'one'}"]) == 0
+    from safetensors.torch import load
+
+    one, both = (load(saved(folder)["model.safetensors"]) for folder in (tmp_path / "one", two))
+    assert all(torch.allclose(one[name], both[name], atol=1e-5) for name in one)
+
+
+@pytest.mark.slow
+def test_lerobot_train_goes_on_with_our_run(demos, tmp_path) -> None:
+    path = fit(demos, tmp_path / "r")
+    script = Path(sys.executable).parent / "lerobot-train"
+    words = [f"--config_path={path / 'train_config.json'}", "--resume=true", "--steps=6", "--num_workers=0"]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "HF_HOME": str(tmp_path / "hf")}
+    done = subprocess.run([script, *words], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / "r/checkpoints/last").resolve().name == "000006"
+    assert LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model").widths["observation.state"] == 8
+
+
+def test_the_options_of_a_fit_are_checked() -> None:
+    for changes in ({"steps": 0}, {"eval_split": 1.0}, {"lr": 0.0}, {"num_workers": -1}):
+        with pytest.raises(UsageError):
+            replace(config(), **changes)

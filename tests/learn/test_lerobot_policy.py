@@ -1,0 +1,234 @@
+"""LeRobot's policies in many episodes at once act in each as LeRobot has them act in one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.lerobot_policy import EpisodePolicy
+from manip_il.learn.policy import LearnedPolicy
+
+from .tiny_policies import edit_config, write_checkpoint
+
+STEPS = 11
+POLICIES = {
+    "act": ("act", {}),
+    "act, ensembled": ("act", {"temporal_ensemble_coeff": 0.01, "n_action_steps": 1}),
+    "diffusion": ("diffusion", {}),
+}
+
+
+@pytest.fixture(params=POLICIES)
+def checkpoint(request, spec, tmp_path) -> Path:
+    kind, options = POLICIES[request.param]
+    return write_checkpoint(tmp_path / "policy", kind, spec, **options)
+
+
+@pytest.fixture
+def act(spec, tmp_path) -> Path:
+    return write_checkpoint(tmp_path / "policy", "act", spec)
+
+
+def observations(episode: int) -> tuple[np.ndarray, np.ndarray]:
+    """What an episode sees, (STEPS, n) and (STEPS, k)."""
+    rng = np.random.default_rng(episode)
+    return rng.normal(size=(STEPS, 4)).astype(np.float32), rng.normal(size=(STEPS, 6)).astype(np.float32)
+
+
+def actions(policy: LearnedPolicy, starts: dict[int, int]) -> dict[int, np.ndarray]:
+    """What a policy does in episodes that begin at their `starts`, (STEPS, n) each."""
+    done: dict[int, list[np.ndarray]] = {episode: [] for episode in starts}
+    for step in range(STEPS + max(starts.values())):
+        running = [episode for episode, start in starts.items() if start <= step < start + STEPS]
+        rows = [[column[step - starts[episode]] for column in observations(episode)] for episode in running]
+        states, environments = (np.array(column) for column in zip(*rows, strict=True))
+        for episode, action in zip(running, policy.act(states, environments, None, running), strict=True):
+            done[episode].append(action)
+    return {episode: np.array(rows) for episode, rows in done.items()}
+
+
+def lerobots_own(checkpoint: Path, episode: int) -> np.ndarray:
+    """LeRobot's loop over one episode, its noise drawn anew from episode and step."""
+    policy = get_policy_class(json.loads((checkpoint / "config.json").read_text())["type"]).from_pretrained(checkpoint)
+    before, after = make_pre_post_processors(policy.config, str(checkpoint))
+    policy.reset()
+    done = []
+    for step, (state, environment) in enumerate(zip(*observations(episode), strict=True)):
+        batch = {"observation.state": torch.from_numpy(state[None]), "task": ["reach"]}
+        batch["observation.environment_state"] = torch.from_numpy(environment[None])
+        with torch.random.fork_rng(devices=[]), torch.inference_mode():
+            torch.manual_seed(int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0]))
+            done.append(after(policy.select_action(before(batch))).numpy()[0])
+    return np.array(done, np.float64)
+
+
+def test_an_episode_is_lerobots_own_loop_to_the_bit(checkpoint):
+    assert np.array_equal(actions(LearnedPolicy.load(checkpoint), {7: 0})[7], lerobots_own(checkpoint, 7))
+
+
+def test_an_episode_does_not_feel_its_neighbours_nor_when_it_begins(checkpoint):
+    alone = actions(LearnedPolicy.load(checkpoint), {7: 0})[7]
+    beside = actions(LearnedPolicy.load(checkpoint), {5: 0, 6: 1, 7: 2, 8: 4})
+    assert np.array_equal(beside[7], alone)
+    assert not np.array_equal(beside[8], alone)
+
+
+@pytest.mark.slow
+def test_a_fresh_process_acts_bit_equal(spec, tmp_path):
+    checkpoint = write_checkpoint(tmp_path / "policy", "diffusion", spec)
+    states, environments = observations(3)
+    np.savez(tmp_path / "in.npz", states=states, environments=environments)
+    code = (
+        "import sys, numpy as np; from manip_il.learn.policy import LearnedPolicy;"
+        "z = np.load(sys.argv[2]); p = LearnedPolicy.load(sys.argv[1]);"
+        "a = [p.act(s[None], e[None], None, [3])[0] for s, e in zip(z['states'], z['environments'])];"
+        "np.save(sys.argv[3], a)"
+    )
+    arguments = [str(checkpoint), str(tmp_path / "in.npz"), str(tmp_path / "out.npy")]
+    run = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
+    assert run.stdout == ""
+    assert np.array_equal(np.load(tmp_path / "out.npy"), actions(LearnedPolicy.load(checkpoint), {3: 0})[3])
+
+
+def test_an_episode_that_is_left_out_or_reset_begins_anew(act):
+    policy = LearnedPolicy.load(act)
+    states, environments = observations(0)
+    one, two = (states[:1], environments[:1]), (states[1:2], environments[1:2])
+    first = policy.act(*one, None, [0])
+    assert not np.array_equal(policy.act(*one, None, [0]), first)  # the second action of the chunk
+    policy.act(*two, None, [1])  # without 0, which has ended
+    assert np.array_equal(policy.act(*one, None, [0]), first)
+    policy.reset([0])
+    assert np.array_equal(policy.act(*one, None, [0]), first)
+
+
+def test_draws_belong_to_the_episode_and_leave_the_global_generator_alone(spec, tmp_path):
+    policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "diffusion", spec))
+    state, environment = (np.repeat(column[:1], 2, axis=0) for column in observations(0))
+    generator = torch.get_rng_state()
+    left, right = policy.act(state, environment, None, [1, 2])
+    assert torch.equal(torch.get_rng_state(), generator)
+    assert not np.array_equal(left, right)
+    torch.manual_seed(5)
+    policy.reset([1])
+    assert np.array_equal(policy.act(state[:1], environment[:1], None, [1])[0], left)
+
+
+def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
+    policy = LearnedPolicy.load(checkpoint)
+    states, environments = observations(0)
+    policy.act(states[:2], environments[:2], None, [4, 5])
+    chooser = policy._chooser
+    assert isinstance(chooser, EpisodePolicy)
+    one, two = (memory.policy for memory in chooser._memories.values())
+    assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
+    name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_queues"
+    name = name if hasattr(one, name) else "_action_queue"
+    assert getattr(one, name) is not getattr(two, name)
+
+
+def test_no_rows_give_no_actions(act):
+    assert LearnedPolicy.load(act).act(np.empty((0, 4)), np.empty((0, 6))).shape == (0, 4)
+
+
+def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
+    seen = []
+    monkeypatch.setattr("lerobot.policies.act.modeling_act.ACTPolicy.select_action", lambda _, batch: _act(seen, batch))
+    LearnedPolicy.load(act, task="put it there").act(*observations(0))
+    assert seen == [["put it there"]] * STEPS
+
+
+def _act(seen: list, batch: dict) -> torch.Tensor:
+    seen.append(batch["task"])
+    return torch.zeros(1, 4)
+
+
+def test_a_policy_of_mixed_precision_acts_in_it(act):
+    states, environments = observations(0)
+    full = LearnedPolicy.load(act).act(states, environments)
+    edit_config(act, use_amp=True)
+    mixed = LearnedPolicy.load(act).act(states, environments)
+    assert not np.array_equal(mixed, full)
+    np.testing.assert_allclose(mixed, full, atol=0.05)
+
+
+def test_loading_leaves_no_files_behind_and_prints_nothing(act, tmp_path, monkeypatch, capfd):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    LearnedPolicy.load(act)
+    assert list((tmp_path / "temporary").iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_type_that_is_not_known_is_named_with_the_nearest(act):
+    edit_config(act, type="akt")
+    with pytest.raises(
+        UnknownName, match=r"config\.json: 'akt' \(did you mean 'act'\?\); known: act, .*diffusion, .*mlp"
+    ):
+        LearnedPolicy.load(act)
+
+
+def test_missing_packages_are_named_with_their_extra(act, monkeypatch):
+    monkeypatch.setattr("lerobot.utils.import_utils._require_package_cache", {"diffusers": False})
+    edit_config(act, type="diffusion", **{"horizon": 8})
+    settings = json.loads((act / "config.json").read_text())
+    wanted = {"type", "input_features", "output_features", "horizon", "n_obs_steps"}
+    (act / "config.json").write_text(json.dumps({key: settings[key] for key in wanted}))
+    with pytest.raises(
+        ManipError, match=r"type 'diffusion', which needs more packages.*pip install 'lerobot\[diffusion\]'"
+    ):
+        LearnedPolicy.load(act)
+
+
+def test_weights_of_another_size_and_weights_that_are_none_are_one_line(act):
+    edit_config(act, dim_model=16)
+    with pytest.raises(ManipError, match="do not belong together") as caught:
+        LearnedPolicy.load(act)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+    edit_config(act, dim_model=32)
+    (act / "model.safetensors").write_bytes(b"PK not a tensor in here")
+    with pytest.raises(ManipError, match="cannot load it: SafetensorError"):
+        LearnedPolicy.load(act)
+
+
+def test_an_option_that_lerobot_does_not_know_is_one_line(act):
+    edit_config(act, no_such_option=3)
+    with pytest.raises(ManipError, match=r"LeRobot cannot load it.*no_such_option"):
+        LearnedPolicy.load(act)
+
+
+def test_a_graphics_card_that_is_not_there_is_refused(act):
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    with pytest.raises(UsageError, match="'cuda'"):
+        LearnedPolicy.load(act, device="cuda")
+
+
+def test_pictures_must_be_those_of_the_checkpoint(spec, tmp_path):
+    from dataclasses import replace
+
+    pictured = replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
+    meta = CheckpointMeta.of(pictured, observation="images", look={})
+    policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "act", pictured, "images", meta=meta))
+    assert (policy.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
+    states, environments = (column[:2] for column in observations(0))
+    picture = np.zeros((2, 32, 48, 3), np.uint8)
+    dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])
+    policy.reset([0, 1])
+    assert not np.array_equal(
+        policy.act(states, environments, {"front": picture + 255, "wrist": picture}, [0, 1]), dark
+    )
+    with pytest.raises(MismatchError, match=r"pictures of wrist.*\(2, 32, 48, 3\).*\(2, 48, 32, 3\)"):
+        policy.act(states, environments, {"front": picture, "wrist": picture.transpose(0, 2, 1, 3)})
+    with pytest.raises(MismatchError, match=r"cameras.*wrist"):
+        policy.act(states, environments, {"front": picture})

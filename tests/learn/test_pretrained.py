@@ -1,0 +1,126 @@
+"""A folder that cannot be used is refused in one line before anything of it is loaded."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.pretrained import Interface, check_interface, read_interface
+
+from .tiny_policies import edit_config, write_checkpoint
+
+
+@pytest.fixture
+def act(spec, tmp_path) -> Path:
+    return write_checkpoint(tmp_path / "policy", "act", spec)
+
+
+@pytest.fixture
+def pictured(spec):
+    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
+
+
+class Bomb:
+    """Says that it was unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return Path.touch, (self.mark,)
+
+
+def test_what_a_policy_sees_and_gives_is_read_from_its_config_alone(pictured, tmp_path):
+    folder = write_checkpoint(tmp_path / "policy", "act", pictured, "both")
+    (folder / "policy_preprocessor.json").unlink()
+    interface = read_interface(folder)
+    assert interface == Interface(
+        "act",
+        {"observation.state": 4, "observation.environment_state": 6},
+        {"front": (32, 48), "wrist": (32, 48)},
+        4,
+    )
+    check_interface(interface, pictured)
+
+
+@pytest.mark.parametrize("name", ["pytorch_model.bin", "sub/weights.PT", "x.pth", "rng.pkl", "last.ckpt"])
+def test_a_folder_with_a_pickle_is_refused_and_the_pickle_not_opened(name, act, tmp_path):
+    mark = tmp_path / "opened"
+    (act / name).parent.mkdir(exist_ok=True)
+    (act / name).write_bytes(pickle.dumps(Bomb(mark)))
+    with pytest.raises(ManipError, match=rf"{name} is a pickle.*convert it to safetensors"):
+        LearnedPolicy.load(act)
+    assert not mark.exists()
+    (act / "model.safetensors").unlink()
+    with pytest.raises(ManipError, match=rf"{name} is a pickle"):
+        LearnedPolicy.load(act)
+
+
+def test_a_folder_without_weights_says_what_is_missing(act):
+    (act / "model.safetensors").rename(act / "adapter_model.safetensors")
+    with pytest.raises(ManipError, match=r"no model\.safetensors in .*adapter"):
+        LearnedPolicy.load(act)
+    (act / "adapter_model.safetensors").unlink()
+    with pytest.raises(ManipError, match=r"no model\.safetensors in .*weights are missing"):
+        LearnedPolicy.load(act)
+    (act / "config.json").unlink()
+    with pytest.raises(ManipError, match=r"no config\.json in"):
+        LearnedPolicy.load(act)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"type": "act"}', '{"type": "act", "input_features": null}'])
+def test_a_config_that_is_no_policys_is_refused(text, act):
+    (act / "config.json").write_text(text)
+    with pytest.raises(ManipError, match=r"config\.json is not a LeRobot policy's"):
+        read_interface(act)
+
+
+def test_features_that_cannot_be_read_are_refused(act):
+    edit_config(act, input_features={"observation.images.front": {"type": "VISUAL", "shape": [3, 32]}})
+    with pytest.raises(ManipError, match="features that cannot be read"):
+        read_interface(act)
+    edit_config(act, output_features={"move": {"type": "ACTION", "shape": [4]}})
+    with pytest.raises(ManipError, match="features that cannot be read"):
+        read_interface(act)
+
+
+def test_a_downloaded_processor_cannot_name_code_to_run(act):
+    path = act / "policy_preprocessor.json"
+    path.write_text(json.dumps({"name": "x", "steps": [{"class": "subprocess.Popen", "config": {"args": "true"}}]}))
+    with pytest.raises(ManipError, match=r"subprocess\.Popen"):
+        LearnedPolicy.load(act)
+    path.write_text("[")
+    with pytest.raises(ManipError, match=r"policy_preprocessor\.json cannot be read"):
+        LearnedPolicy.load(act)
+    path.unlink()
+    with pytest.raises(ManipError, match=r"no .*policy_preprocessor\.json"):
+        LearnedPolicy.load(act)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"numbers": {"observation.state": 5}}, r"width of observation\.state .*the policy has 5, arm/reach has 4"),
+        ({"numbers": {"observation.effort": 4}}, r"inputs .*the policy has observation\.effort, .*arm/reach has obs"),
+        ({"action": 7}, r"width of the action differs: the policy has 7, arm/reach has 4"),
+        ({"pictures": {"top": (32, 48)}}, r"the policy has .*images\.top, .*images\.front, observation\.images\.wrist"),
+        ({"pictures": {"wrist": (48, 32)}}, r"pictures of wrist .*\(48, 32\).*\(32, 48\)"),
+    ],
+)
+def test_an_environment_that_lacks_an_input_is_refused_by_both_names(change, words, pictured):
+    fits = Interface("act", {"observation.state": 4}, {"front": (32, 48)}, 4)
+    check_interface(fits, pictured)
+    with pytest.raises(MismatchError, match=words):
+        check_interface(replace(fits, **change), pictured)
+
+
+def test_pictures_that_a_policy_fills_in_itself_are_not_asked_for(act):
+    empty = {"type": "VISUAL", "shape": [3, 480, 640]}
+    edit_config(act, input_features={"observation.images.empty_camera_0": empty})
+    assert read_interface(act).pictures == {}

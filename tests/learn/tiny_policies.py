@@ -1,0 +1,81 @@
+"""Checkpoints of LeRobot's policies, small and untrained, as LeRobot itself writes them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType
+from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+
+from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.choices import policy_types
+from manip_il.learn.observation import policy_features
+
+TINY: dict[str, dict[str, Any]] = {
+    "act": {
+        "dim_model": 32,
+        "n_heads": 2,
+        "dim_feedforward": 32,
+        "n_encoder_layers": 1,
+        "use_vae": False,
+        "chunk_size": 5,
+        "n_action_steps": 3,
+        "pretrained_backbone_weights": None,
+    },
+    "diffusion": {
+        "n_obs_steps": 2,
+        "horizon": 8,
+        "n_action_steps": 4,
+        "drop_n_last_frames": 0,
+        "down_dims": (16, 32),
+        "n_groups": 4,
+        "diffusion_step_embed_dim": 16,
+        "num_inference_steps": 2,
+        "pretrained_backbone_weights": None,
+    },
+}
+
+
+def write_checkpoint(
+    folder: Path,
+    kind: str,
+    spec: RobotTaskSpec,
+    observation: str = "state",
+    *,
+    meta: CheckpointMeta | None = None,
+    **options: Any,
+) -> Path:
+    """A `pretrained_model` folder for data of `spec`; without `meta` as lerobot-train leaves it."""
+    policy_types()  # registers all of them
+    config = make_policy_config(kind, device="cpu", push_to_hub=False, **(TINY.get(kind, {}) | options))
+    config.input_features, config.output_features = policy_features(features(spec), observation)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        policy = get_policy_class(kind)(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config, dataset_stats=_statistics(config)):
+        processor.save_pretrained(folder)
+    if meta is not None:
+        (folder / META_FILE).write_text(json.dumps(asdict(meta)))
+    return folder
+
+
+def edit_config(folder: Path, **changes: Any) -> None:
+    """Change entries of `config.json`."""
+    path = folder / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def _statistics(config: Any) -> dict[str, dict[str, torch.Tensor]]:
+    stats: dict[str, dict[str, torch.Tensor]] = {}
+    for key, feature in (config.input_features | config.output_features).items():
+        shape = (3, 1, 1) if feature.type is FeatureType.VISUAL else feature.shape
+        one = torch.ones(shape)
+        stats[key] = {"mean": 0.1 * one, "std": 0.3 * one, "min": -one, "max": one}
+    return stats

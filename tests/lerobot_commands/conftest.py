@@ -1,0 +1,134 @@
+"""LeRobot's commands as processes of their own: each takes seconds to start, so tests make much of every run."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.evaluation.results import EpisodeResult
+from manip_il.evaluation.runner import evaluate
+from manip_il.mdp import Episode
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig
+
+BIN = Path(sys.executable).parent
+PLUGIN = "manip_il.lerobot_plugin"
+
+
+@pytest.fixture(scope="session")
+def command(tmp_path_factory) -> Callable[..., str]:
+    """Runs a command as a user would, without network and with a home of its own; returns what it said."""
+    home = tmp_path_factory.mktemp("home")
+    folders = {"HOME": home, "HF_HOME": home / "hf", "HF_LEROBOT_HOME": home / "hf/lerobot"}
+    settings = {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {name: str(path) for name, path in folders.items()} | settings
+
+    def run(name: str, *words: object, code: int = 0) -> str:
+        line = [str(word) for word in (BIN / name, *words)]
+        done = subprocess.run(line, capture_output=True, text=True, env=environment, cwd=home, check=False)
+        said = done.stdout + done.stderr
+        assert done.returncode == code, said[-4000:]
+        return said
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def record(tmp_path_factory) -> Callable[..., Path]:
+    """Records a few demonstrations of panda's reach, by this project's own command."""
+
+    def run(name: str, episodes: int, *words: str) -> Path:
+        root = tmp_path_factory.mktemp(name) / name
+        where = [f"--dataset.root={root}", f"--dataset.repo_id=someone/{name}", f"--dataset.num_episodes={episodes}"]
+        assert main(["record", "--task.type=reach", "--workers=1", *where, *words]) == 0
+        return root
+
+    return run
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One evaluation, in LeRobot's words and in ours: the first `count` seeds of the test stream."""
+
+    env: EnvConfig
+    count: int
+    cameras: CameraConfig | None = None
+
+    @property
+    def seeds(self) -> range:
+        return stream_seeds("test", self.count)
+
+    @property
+    def env_words(self) -> list[str]:
+        words = {
+            "discover_packages_path": PLUGIN,
+            "type": "manip_il",
+            "task": "PandaReach-v0",
+            "episode_length": self.env.horizon,
+            "tolerance": self.env.tolerance,
+        }
+        if self.cameras is not None:
+            words |= {"observation": "images", "cameras": ",".join(self.cameras.names)}
+            words |= {"observation_height": self.cameras.height, "observation_width": self.cameras.width}
+        return [f"--env.{name}={value}" for name, value in words.items()]
+
+    def words(self, batch_size: int, asynchronous: bool) -> list[object]:
+        """For lerobot-eval and lerobot-train alike; the latter's seed is its evaluation's first too."""
+        flags = [f"--eval.n_episodes={self.count}", f"--eval.batch_size={batch_size}", f"--seed={self.seeds[0]}"]
+        return [*self.env_words, *flags, f"--eval.use_async_envs={str(asynchronous).lower()}"]
+
+    def ours(self, policy: Path, on_episode: Callable[[Episode], None] | None = None) -> tuple[EpisodeResult, ...]:
+        """By this project's own evaluation."""
+        with Engine(workers=1) as engine:
+            job = RolloutJob(self.env, "policy", policy, cameras=self.cameras)
+            return evaluate(engine, job, self.seeds, "it", on_episode).episodes
+
+
+@pytest.fixture(scope="session")
+def trial() -> type[Trial]:
+    return Trial
+
+
+@pytest.fixture(scope="session")
+def lerobots() -> Callable[[Path], dict[str, Any]]:
+    """Lists with one value an episode, from the folder of a lerobot-eval."""
+
+    def read(folder: Path) -> dict[str, Any]:
+        return json.loads((folder / "eval_info.json").read_text())["per_task"][0]["metrics"]
+
+    return read
+
+
+@pytest.fixture(scope="session")
+def act_words() -> Callable[..., Sequence[str]]:
+    """Options of lerobot-train for a tiny ACT without downloads."""
+
+    def words(root: Path, output_dir: Path, steps: int) -> list[str]:
+        sizes = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_decoder_layers": 1}
+        chunk = {"chunk_size": 5, "n_action_steps": 5, "use_vae": "false", "optimizer_lr": 1e-3}
+        offline = {"pretrained_backbone_weights": "null", "push_to_hub": "false", "device": "cpu"}
+        policy = {"type": "act"} | sizes | chunk | offline
+        return [
+            *(f"--policy.{name}={value}" for name, value in policy.items()),
+            f"--dataset.repo_id=someone/{root.name}",
+            f"--dataset.root={root}",
+            f"--output_dir={output_dir}",
+            f"--steps={steps}",
+            f"--save_freq={steps}",
+            f"--env_eval_freq={steps}",
+            "--num_workers=0",
+        ]
+
+    return words

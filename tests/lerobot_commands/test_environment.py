@@ -1,0 +1,130 @@
+"""The environment as LeRobot's code sees it."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import draccus
+import numpy as np
+import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.lerobot_plugin import ManipILEnv
+from manip_il.lerobot_plugin.environment import TASKS
+
+STATE, PICTURE = "observation.state", "observation.images.wrist"
+POSES = "observation.environment_state"
+
+
+def shapes(config: ManipILEnv) -> dict[str, tuple[int, ...]]:
+    return {key: feature.shape for key, feature in env_to_policy_features(config).items()}
+
+
+def vector_env(config: ManipILEnv, count: int, asynchronous: bool = False) -> Any:
+    return config.create_envs(count, use_async_envs=asynchronous)["manip_il"][0]
+
+
+@pytest.mark.parametrize(
+    ("observation", "inputs"),
+    [
+        ("state", {STATE: (8,), POSES: (24,)}),
+        ("images", {STATE: (8,), PICTURE: (3, 32, 48)}),
+        ("both", {STATE: (8,), POSES: (24,), PICTURE: (3, 32, 48)}),
+    ],
+)
+def test_a_policys_inputs_are_those_of_the_chosen_observation(observation: str, inputs: dict[str, tuple[int, ...]]):
+    config = ManipILEnv(observation=observation, cameras="wrist", observation_height=32, observation_width=48)
+    assert shapes(config) == inputs | {"action": (8,)}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_gives_what_its_features_say(task: str):
+    config = ManipILEnv(task=task)
+    envs = vector_env(config, 2)
+    observation, _ = envs.reset(seed=[1, 2])
+    seen = preprocess_observation(observation)
+    given = {key: tuple(value.shape[1:]) for key, value in seen.items()}
+    assert given | {"action": envs.single_action_space.shape} == shapes(config)
+    assert envs.call("task_description")[0]
+    assert envs.call("_max_episode_steps") == (100, 100)
+    assert envs.metadata["render_fps"] == 20
+
+
+def test_options_reach_the_simulation():
+    config = ManipILEnv(fps=25, episode_length=7, tolerance=0.3, success_steps=2)
+    env = vector_env(config, 1).envs[0].unwrapped
+    assert (env.config.control_hz, env.config.horizon) == (25, 7)
+    assert (env.config.tolerance, env.config.success_steps) == (0.3, 2)
+
+
+def test_success_in_the_step_that_ends_an_episode_is_told_although_the_next_one_has_begun():
+    config = ManipILEnv(task="PandaReach-v0", episode_length=2, tolerance=0.99, success_steps=2)
+    envs = vector_env(config, 2)
+    observation, _ = envs.reset(seed=[1, 2])
+    *_, first = envs.step(observation["agent_pos"])
+    *_, truncated, last = envs.step(observation["agent_pos"])
+    assert "final_info" not in first
+    assert truncated.all()
+    assert last["final_info"]["is_success"].tolist() == [True, True]
+    assert not last["is_success"].any()
+
+
+def test_a_film_can_be_left_out():
+    (env,) = vector_env(ManipILEnv(render_mode="none"), 1).envs
+    assert not env.render().any()
+
+
+def test_a_saved_configuration_gives_the_same_environment():
+    config = ManipILEnv(task="FetchLift-v0", observation="both", cameras="front", tolerance=0.05)
+    assert draccus.decode(EnvConfig, {"type": "manip_il"} | draccus.encode(config)) == config
+
+
+def test_the_plugin_brings_our_policies():
+    assert {"mlp", "cnn"} <= set(PreTrainedConfig.get_known_choices())
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"task": "PandaPick-v0"}, UnknownName, "did you mean 'PandaPickPlace-v0'"),
+        ({"task": None}, UnknownName, "--env.task"),
+        ({"observation": "picture"}, UnknownName, "known: both, images, state"),
+        ({"observation": "images", "cameras": "front, top"}, UnknownName, "unknown camera 'top'.*front, wrist"),
+        ({"observation": "both", "observation_width": 33}, UsageError, "width 33"),
+        ({"render_mode": "human"}, UnknownName, "rgb_array"),
+        ({"fps": 33}, UsageError, "divisor of 500"),
+    ],
+)
+def test_what_cannot_be_is_refused(options: dict[str, object], error: type[Exception], words: str):
+    with pytest.raises(error, match=words):
+        ManipILEnv(**options)
+
+
+@pytest.mark.slow
+def test_lerobots_command_line_tells_it_without_a_traceback(monkeypatch, capsys):
+    words = ["--env.discover_packages_path=manip_il.lerobot_plugin", "--env.type=manip_il", "--env.task=PandaPick-v0"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *words])
+    from lerobot.scripts.lerobot_eval import main
+
+    with pytest.raises(SystemExit, match="1"):
+        main()
+    assert "unknown --env.task 'PandaPick-v0' (did you mean 'PandaPickPlace-v0'?)" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_asynchronous_environments_see_what_this_process_sees():
+    options = {"task": "PandaReach-v0", "observation": "images", "observation_height": 32, "observation_width": 32}
+    seen = []
+    for asynchronous in (False, True):
+        envs = vector_env(ManipILEnv(**options), 2, asynchronous)
+        observation, _ = envs.reset(seed=[3, 4])
+        seen.append(observation["pixels"])
+        envs.close()
+    for camera in ("front", "wrist"):
+        np.testing.assert_array_equal(seen[0][camera], seen[1][camera])
+        assert seen[0][camera].std() > 10

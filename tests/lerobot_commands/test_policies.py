@@ -1,0 +1,82 @@
+"""lerobot-train and lerobot-eval on our datasets, policies and environments: the same success for every seed."""
+
+from __future__ import annotations
+
+import ast
+import re
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.sim.env import EnvConfig
+
+pytestmark = pytest.mark.slow
+UNFILMED = "--env.render_mode=none"  # these tests need no OpenGL
+
+
+@pytest.fixture(scope="module")
+def demos(record):
+    return record("reach", 12)
+
+
+@pytest.fixture(scope="module")
+def mlp(demos, tmp_path_factory):
+    """A checkpoint of `manip-il train` that gets there on some seeds only."""
+    folder = tmp_path_factory.mktemp("mlp") / "run"
+    words = [f"--dataset.root={demos}", "--steps=40", "--policy.width=32", f"--output_dir={folder}"]
+    assert main(["train", *words]) == 0
+    return folder / "checkpoints/last/pretrained_model"
+
+
+@pytest.fixture(scope="module")
+def mlp_trial(trial, mlp):
+    """The evaluation of the mlp, and our results of it."""
+    evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.06), 12)
+    ours = evaluation.ours(mlp)
+    assert {episode.success for episode in ours} == {True, False}  # else equality would say little
+    return evaluation, ours
+
+
+@pytest.mark.parametrize(("asynchronous", "batch_size"), [(False, 5), (True, 2)], ids=["sync", "async"])
+def test_lerobot_eval_finds_our_mlps_success_for_every_seed(
+    command, lerobots, mlp, mlp_trial, tmp_path, asynchronous, batch_size
+):
+    evaluation, ours = mlp_trial
+    words = evaluation.words(batch_size, asynchronous)
+    command("lerobot-eval", f"--policy.path={mlp}", *words, UNFILMED, f"--output_dir={tmp_path}")
+    theirs = lerobots(tmp_path)
+    assert theirs["successes"] == [episode.success for episode in ours]
+    assert theirs["sum_rewards"] == [episode.ret for episode in ours]
+
+
+def test_lerobot_trains_act_with_evaluation_and_each_seed_ends_the_same_everywhere(
+    command, lerobots, trial, demos, act_words, tmp_path
+):
+    env = EnvConfig("panda", "reach", horizon=40, tolerance=0.1)
+    few, many = trial(env, 4), trial(env, 12)
+    train = act_words(demos, tmp_path / "run", steps=150)
+    said = command("lerobot-train", *train, "--batch_size=16", *few.words(2, asynchronous=False), UNFILMED)
+    policy = tmp_path / "run/checkpoints/last/pretrained_model"
+    words = many.words(5, asynchronous=False)
+    command("lerobot-eval", f"--policy.path={policy}", *words, UNFILMED, f"--output_dir={tmp_path / 'eval'}")
+
+    ours = many.ours(policy)
+    successes = [episode.success for episode in ours]
+    assert set(successes) == {True, False}
+    assert lerobots(tmp_path / "eval")["successes"] == successes
+    assert lerobots(tmp_path / "eval")["sum_rewards"] == [episode.ret for episode in ours]
+    during = re.search(r"'successes': (\[.*?\])", said)
+    assert during is not None
+    assert ast.literal_eval(during.group(1)) == successes[:4]
+
+
+def test_lerobot_trains_our_mlp_on_our_dataset(command, trial, demos, tmp_path):
+    command(
+        "lerobot-train", "--policy.discover_packages_path=manip_il.learn.mlp", "--policy.type=mlp",
+        "--policy.width=64", "--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=5",
+        "--dataset.repo_id=someone/reach", f"--dataset.root={demos}", f"--output_dir={tmp_path / 'run'}",
+        "--steps=100", "--batch_size=32", "--num_workers=0",
+    )  # fmt: skip
+    reach = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 8)
+    episodes = reach.ours(tmp_path / "run/checkpoints/last/pretrained_model")
+    assert sum(episode.success for episode in episodes) >= 6
