@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -14,6 +16,8 @@ from manip_il.cli.progress import say
 from manip_il.errors import UsageError
 
 if TYPE_CHECKING:
+    from manip_il.cli.stages import Stages
+    from manip_il.learn.checkpoint import CheckpointMeta
     from manip_il.learn.policy_config import PolicyFitConfig
     from manip_il.learn.train import TrainConfig
 
@@ -74,14 +78,12 @@ class TrainOptions:
         config = self._config()
         spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
         check_dataset(self.dataset.root, spec, fingerprint)
-        first = _is_first_process()
-        if first:
+        if _is_first_process():
             prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
             if self.resume:
                 check_same_options(self.output_dir, self, _FREE)
-            save_options(self.output_dir, self)
         path = self._fit(config, spec, fingerprint)
-        if first:
+        if _is_first_process():
             say(f"checkpoint: {path}")
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
 
@@ -148,14 +150,22 @@ class TrainOptions:
         )
 
     def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.cli.stages import Stages
         from manip_il.learn.train import TrainConfig
 
-        every = config.save_freq
-        with Stages(kept=f"the last checkpoint in {self.output_dir} (one every {every:,} steps)") as stages:
-            if isinstance(config, TrainConfig):
+        if isinstance(config, TrainConfig):
+            self._save_options()
+            with self._stages(config.save_freq) as stages:
                 return self._fit_mlp(config, spec, fingerprint, stages)
-            return self._fit_policy(config, spec, fingerprint, stages)
+        return self._fit_policy(config, spec, fingerprint)
+
+    def _save_options(self) -> None:
+        if _is_first_process():
+            save_options(self.output_dir, self)
+
+    def _stages(self, save_freq: int) -> Stages:
+        from manip_il.cli.stages import Stages
+
+        return Stages(kept=f"the last checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
 
     def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
         from manip_il.dagger.loop import LEARNING_COLUMNS
@@ -174,31 +184,44 @@ class TrainOptions:
             resume=self.resume,
         )
 
-    def _fit_policy(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
-        from manip_il.data.lerobot_io import dataset_info, read_provenance
+    def _fit_policy(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
+        from manip_il.learn.fit_policy import PolicyTrainer
+        from manip_il.learn.threads import threads
+
+        root, meta = self.dataset.root, self._meta(config, spec, fingerprint)
+        with threads(config.threads):
+            with self._decoding() as seen:
+                trainer = PolicyTrainer(root, config, self.output_dir, meta, resume=self.resume, on_frames=seen)
+            self._save_options()  # now, as much of what can be wrong has been found by now
+            with self._stages(config.save_freq) as stages:
+                stages.start(f"train {config.policy.type} on {len(trainer.samples.train):,} samples", config.steps)
+                return trainer.fit(lambda record: stages.log(record) if record else stages.check())
+
+    def _meta(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> CheckpointMeta:
+        from manip_il.data.lerobot_io import read_provenance
         from manip_il.learn.checkpoint import CheckpointMeta
-        from manip_il.learn.fit_policy import fit_policy
         from manip_il.learn.observation import recorded_look
 
-        root = self.dataset.root
-        look = recorded_look(read_provenance(root), fingerprint)
-        options = config.what_changes_the_weights()
-        stages.start(f"train {config.policy.type} on {dataset_info(root).frames:,} frames", config.steps)
+        look = recorded_look(read_provenance(self.dataset.root), fingerprint)
+        return CheckpointMeta.of(spec, fingerprint, config.what_changes_the_weights(), config.observation, look)
 
-        def seen(record: dict[str, Any]) -> None:
-            if record:
-                stages.log(record)
-            else:
-                stages.check()
+    @contextlib.contextmanager
+    def _decoding(self) -> Iterator[Callable[[int], None]]:
+        """What is told how many pictures more have been decoded; a bar, where there are any."""
+        from manip_il.cli.progress import progress
+        from manip_il.data.lerobot_io import camera_keys, dataset_info
 
-        return fit_policy(
-            root,
-            config,
-            self.output_dir,
-            meta=CheckpointMeta.of(spec, fingerprint, options, config.observation, look),
-            on_step=seen,
-            resume=self.resume,
-        )
+        with contextlib.ExitStack() as stack:
+            bar = None
+
+            def seen(frames: int) -> None:
+                nonlocal bar
+                if bar is None:
+                    total = dataset_info(self.dataset.root).frames * len(camera_keys(self.dataset.root))
+                    bar = stack.enter_context(progress(total, "decode pictures, once"))
+                bar.advance(frames)
+
+            yield seen
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
@@ -216,6 +239,4 @@ class TrainOptions:
 
 def _is_first_process() -> bool:
     """Whether this is the one of several processes (`accelerate launch`, `torchrun`) that writes."""
-    import os
-
     return os.environ.get("RANK", "0") == "0"

@@ -8,6 +8,7 @@ import logging
 import typing
 from collections.abc import Mapping
 from contextlib import contextmanager
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -98,8 +99,19 @@ def option_lines(cls: type[Any], group: str) -> list[tuple[str, str]]:
             continue
         missing = field.default is dataclasses.MISSING
         default = field.default_factory() if missing and callable(field.default_factory) else field.default
-        rows.append((f"--{group}.{field.name}", str(draccus.encode(default)) if default is not None else "null"))
+        rows.append((f"--{group}.{field.name}", _shown(default)))
     return rows
+
+
+def _shown(value: Any) -> str:
+    """A default as it would be given."""
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_shown(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_shown, value)) + "]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _decode(cls: type[Any], settings: Mapping[str, Any], where: str) -> Any:

@@ -57,30 +57,8 @@ def fit_policy(
     resumed on other data or options, `NotFiniteError` for data or a loss that is not finite, and what the policy
     refuses as `ManipError`.
     """
-    accelerator = _accelerator(config)
-    accelerator.wait_for_everyone()  # the first process may have had a folder to empty
-    checkpoint = last_checkpoint(output_dir)
-    if checkpoint is not None and not resume:
-        raise FolderExistsError(output_dir)
     with threads(config.threads):
-        trainer = PolicyTrainer(root, config, output_dir, meta, checkpoint, on_frames, accelerator)
-        with contextlib.ExitStack() as stack:
-            writers = trainer.open_metrics(stack)
-            for record in trainer.run():
-                for write in writers if record else []:
-                    write(record)
-                saved = trainer.step % config.save_freq == 0 or trainer.step == config.steps
-                if saved:
-                    trainer.save(record)
-                try:
-                    if on_step is not None:
-                        on_step(record)
-                except KeyboardInterrupt:  # asked for between two steps: nothing is lost
-                    if not saved:
-                        trainer.save(record)
-                    raise
-        trainer.close()
-    return output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
+        return PolicyTrainer(root, config, output_dir, meta, resume=resume, on_frames=on_frames).fit(on_step)
 
 
 class PolicyTrainer:
@@ -92,12 +70,16 @@ class PolicyTrainer:
         config: PolicyFitConfig,
         output_dir: Path,
         meta: CheckpointMeta,
-        checkpoint: Path | None,
+        *,
+        resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
-        accelerator: Accelerator | None = None,
     ):
         self.config, self.output_dir, self.meta = config, output_dir, meta
-        self.accelerator = accelerator or _accelerator(config)
+        self.accelerator = _accelerator(config)
+        self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
+        checkpoint = last_checkpoint(output_dir)
+        if checkpoint is not None and not resume:
+            raise FolderExistsError(output_dir)
         self.dataset = read_metadata(root)
         set_features(config.policy, self.dataset, config.observation)
         self.options = config.what_changes_the_weights()
@@ -127,6 +109,27 @@ class PolicyTrainer:
         if checkpoint is not None:
             self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
+
+    def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
+        """Take the steps that are left, with metrics and checkpoints; see `fit_policy`."""
+        config = self.config
+        with contextlib.ExitStack() as stack:
+            writers = self._open_metrics(stack)
+            for record in self.run():
+                for write in writers if record else []:
+                    write(record)
+                saved = self.step % config.save_freq == 0 or self.step == config.steps
+                if saved:
+                    self.save(record)
+                try:
+                    if on_step is not None:
+                        on_step(record)
+                except KeyboardInterrupt:  # asked for between two steps: nothing is lost
+                    if not saved:
+                        self.save(record)
+                    raise
+        self.accelerator.end_training()
+        return self.output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
@@ -172,7 +175,7 @@ class PolicyTrainer:
                 write_card(folder, self.pipeline, self.meta, self.dataset, record)
         self.accelerator.wait_for_everyone()
 
-    def open_metrics(self, stack: contextlib.ExitStack) -> list[Writer]:
+    def _open_metrics(self, stack: contextlib.ExitStack) -> list[Writer]:
         """Where metrics go, in the main process."""
         if not self.accelerator.is_main_process:
             return []
@@ -184,10 +187,6 @@ class PolicyTrainer:
             self.pipeline.resume = self.step > 0
             writers.append(stack.enter_context(weights_and_biases(self.pipeline)))
         return writers
-
-    def close(self) -> None:
-        """End the processes' group, where there is one."""
-        self.accelerator.end_training()
 
     def _update(self, batch: Batch) -> dict[str, float]:
         batch = self.preprocessor(self._augmented(batch))

@@ -145,9 +145,7 @@ def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(demos, tmp_path, 
     script = [sys.executable, "-c", ACTS, str(path)]
     one, two = (subprocess.run(script, capture_output=True, text=True, check=True).stdout for _ in range(2))
     assert one == two
-    trainer = PolicyTrainer(
-        demos, config(settings), tmp_path / "r", CheckpointMeta.of(read_spec(demos)), tmp_path / "r/checkpoints/last"
-    )
+    trainer = PolicyTrainer(demos, config(settings), tmp_path / "r", CheckpointMeta.of(read_spec(demos)), resume=True)
     rng = np.random.default_rng(0)
     states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
     actions = np.frombuffer(bytes.fromhex(one.strip().splitlines()[-1])).reshape(6, 3, 8)
