@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from manip_il.learn.policy_config import PolicyFitConfig
 from manip_il.learn.sources import TASK_INDEX, LibrarySource, MemorySource, Source
 from manip_il.learn.windows import Windows, windows_of
 
+_LOG = logging.getLogger(__name__)
 I64 = NDArray[np.int64]
 _ALWAYS = (EPISODE_INDEX, FRAME_INDEX, INDEX, TASK_INDEX, "timestamp")  # LeRobot's own columns
 _ROUND = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
@@ -141,10 +143,13 @@ def load_samples(
 def _source(root: Path, config: PolicyFitConfig, meta: Any, windows: Windows, table: Any, on_frames: Any) -> Source:
     cameras = [key for key in config.policy.input_features or {} if key in meta.camera_keys]
     frames: dict[str, NDArray[np.uint8]] | None = {}
+    limit = int(config.image_cache_gb * 1e9)
     if cameras:
-        limit = int(config.image_cache_gb * 1e9)
         frames = open_frame_cache(root, cameras, max_bytes=limit, on_frames=on_frames)
     if frames is None:
+        _LOG.warning(
+            "the pictures of %s take more than %g GB: LeRobot's loader decodes them as it goes", root, limit / 1e9
+        )
         ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
         return LibrarySource(lerobot_windows(root, meta.repo_id, ahead or None), config.num_workers)
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}

@@ -220,6 +220,25 @@ def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(seen, tm
     assert ours == pytest.approx(theirs, rel=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.gl
+def test_a_cnn_is_trained_and_evaluated_on_the_pictures_that_it_saw(seen, tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    run, small = tmp_path / "r", ["--policy.channels=[4, 8]", "--policy.keypoints=4", "--policy.width=8"]
+    words = ["train", f"--dataset.root={seen}", "--policy.type=cnn", *small, "--batch_size=4", "--steps=2"]
+    assert main([*words, f"--output_dir={run}"]) == 0
+    evaluate = ["eval", f"--policy.path={run}", "--eval.n_episodes=1", "--env.horizon=6", "--workers=1"]
+    assert main([*evaluate, f"--output_dir={tmp_path / 'eval'}"]) == 0
+    result = json.loads((tmp_path / "eval" / "eval.json").read_text())
+    assert result["fingerprint"]["cameras_sha256"]
+    assert result["episodes"][0]["steps"] == 6
+    assert main([*evaluate, "--robot.type=fetch", f"--output_dir={tmp_path / 'other'}"]) == 1
+    error = capfd.readouterr().err.strip().splitlines()[-1]
+    assert "panda" in error
+    assert "fetch" in error
+    assert not (tmp_path / "other").exists()
+
+
 def test_a_run_that_is_there_is_not_trained_over(demos, tmp_path) -> None:
     fit(demos, tmp_path / "r")
     with pytest.raises(FolderExistsError):
