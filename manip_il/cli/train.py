@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import check_dataset, check_same_options, option, save_options
 from manip_il.cli.options import Open
-from manip_il.cli.progress import say
+from manip_il.cli.progress import progress, say, set_quiet
 from manip_il.errors import UsageError
 
 if TYPE_CHECKING:
@@ -75,6 +75,8 @@ class TrainOptions:
         """Read the dataset, fit, and say where the checkpoint is."""
         from manip_il.data.lerobot_io import read_fingerprint, read_spec
 
+        if not _is_first_process():
+            set_quiet(True)
         config = self._config()
         spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
         check_dataset(self.dataset.root, spec, fingerprint)
@@ -208,7 +210,6 @@ class TrainOptions:
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
         """What is told how many pictures more have been decoded; a bar, where there are any."""
-        from manip_il.cli.progress import progress
         from manip_il.data.lerobot_io import camera_keys, dataset_info
 
         with contextlib.ExitStack() as stack:

@@ -371,6 +371,7 @@ def test_two_processes_learn_what_one_learns_from_both_shares(demos, tmp_path) -
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("checkpoint:") == 1
+    assert done.stderr.count("3/3") == 1
     assert main([*words, "--batch_size=8", f"--output_dir={tmp_path / 'one'}"]) == 0
     from safetensors.torch import load
 
