@@ -149,7 +149,8 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
     empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
     """
     path = folder / CONFIG_FILE
-    if not folder.is_dir() or not any(folder.iterdir()):
+    # A run that was killed in its first moment leaves at most the half of a file, under a hidden name.
+    if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
         return
     if not path.is_file():
         raise UsageError(f"{folder} holds no {CONFIG_FILE}, so no run to go on with; choose another folder")

@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
+from manip_il.cli.groups import CONFIG_FILE, check_same_options
 from manip_il.cli.options import CONFIG_HEADER
+from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
 
@@ -38,6 +40,15 @@ def test_a_folder_that_holds_something_is_refused_with_the_ways_on(ours):
 def test_resume_leaves_everything(ours):
     prepare_output(ours, resume=True, overwrite=False)
     assert (ours / "config.yaml").exists()
+
+
+def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(tmp_path):
+    options = RecordOptions(dataset=DatasetGroup(root=tmp_path / "demos"))
+    (tmp_path / f".{CONFIG_FILE}.123.tmp").write_text("# manip-")
+    check_same_options(tmp_path, options, ())
+    (tmp_path / "episode.mcap").touch()
+    with pytest.raises(UsageError, match=r"holds no config\.yaml"):
+        check_same_options(tmp_path, options, ())
 
 
 def test_resume_and_overwrite_contradict(ours):
