@@ -102,7 +102,7 @@ class LookGroup:
 class PolicyGroup:
     """`--policy.*` of what is fitted."""
 
-    type: str = option("mlp", "the policy; others of LeRobot's are fitted by lerobot-train on the same dataset")
+    type: str = option("mlp", "the policy; `manip-il train` fits every other one of LeRobot's")
     loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
     width: int = option(256, "units a layer")
     depth: int = option(3, "hidden layers")
@@ -111,8 +111,8 @@ class PolicyGroup:
         """The policy's configuration; `UsageError` for another type, an unknown loss or a size out of range."""
         if self.type not in POLICY_TYPES:
             raise UsageError(
-                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's other policies (act, diffusion, ...) "
-                "train on the same dataset by: lerobot-train --dataset.root=... --policy.type=..."
+                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) learn from "
+                "a dataset by: manip-il train --dataset.root=... --policy.type=..."
             )
         from manip_il.learn.mlp.configuration_mlp import MLPConfig
 
