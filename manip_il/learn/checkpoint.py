@@ -165,6 +165,19 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
+def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) -> None:
+    """Raise `MismatchError` unless the checkpoint's run learnt from the same data with the same options."""
+    saved = read_step(checkpoint)
+    if saved.get("data") != digest:
+        raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", digest)
+    before = saved.get("options", {})
+    for name, ours in options.items():
+        if before.get(name) != ours:
+            raise MismatchError(
+                f"training option {name}", f"checkpoint {checkpoint}", before.get(name), "this run", ours
+            )
+
+
 def load_optimizer(checkpoint: Path, optimizer: torch.optim.Optimizer) -> None:
     """Put the optimiser in the checkpoint's state."""
     from lerobot.optim.optimizers import load_optimizer_state

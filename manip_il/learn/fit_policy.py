@@ -19,9 +19,9 @@ from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.errors import FolderExistsError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
 from manip_il.learn.card import write_card
-from manip_il.learn.checkpoint import PRETRAINED_MODEL, CheckpointMeta, last_checkpoint, read_step
+from manip_il.learn.checkpoint import PRETRAINED_MODEL, CheckpointMeta, check_same_run, last_checkpoint
 from manip_il.learn.lerobot_checkpoint import Progress, save_lerobot_checkpoint
 from manip_il.learn.metrics import METRICS_FILE, Writer, json_lines, tensorboard, weights_and_biases
 from manip_il.learn.order import ShuffledRows, batches_of
@@ -83,7 +83,7 @@ class PolicyTrainer:
         self.dataset = read_metadata(root)
         set_features(config.policy, self.dataset, config.observation)
         self.options = config.what_changes_the_weights()
-        with self._main_first():
+        with self.accelerator.main_process_first():  # it fills the cache, the others find it full
             self.samples: Samples = load_samples(root, config, self.dataset, on_frames)
         if checkpoint is not None:
             check_same_run(checkpoint, self.samples.digest, self.options)
@@ -233,12 +233,6 @@ class PolicyTrainer:
         norm = self.config.resolved_optimizer().grad_clip_norm
         return norm if norm > 0 else math.inf
 
-    @contextlib.contextmanager
-    def _main_first(self) -> Iterator[None]:
-        """The main process fills the cache; the others find it full."""
-        with self.accelerator.main_process_first():
-            yield
-
 
 class _Log:
     """Means since the last record."""
@@ -267,19 +261,6 @@ class _Log:
         }
         self._start()
         return means | rates
-
-
-def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) -> None:
-    """Raise `MismatchError` unless the checkpoint's run learnt from the same data with the same options."""
-    saved = read_step(checkpoint)
-    if saved.get("data") != digest:
-        raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", digest)
-    before = saved.get("options", {})
-    for name, ours in options.items():
-        if before.get(name) != ours:
-            raise MismatchError(
-                f"training option {name}", f"checkpoint {checkpoint}", before.get(name), "this run", ours
-            )
 
 
 def _accelerator(config: PolicyFitConfig) -> Accelerator:

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import FolderExistsError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import (
     PRETRAINED_MODEL,
     CheckpointMeta,
+    check_same_run,
     last_checkpoint,
     load_optimizer,
     read_step,
@@ -111,10 +112,11 @@ def fit(
     rows = learning_rows(table)
     options = draccus.encode(config)
     meta = CheckpointMeta.of(spec, fingerprint, options)
-    key = {"data": _digest(rows), "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
+    digest = _digest(rows)
+    key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):
         if checkpoint is not None:
-            _check_same_run(checkpoint, key)
+            check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
         trainer = Trainer(rows, config, spec, checkpoint)
         output_dir.mkdir(parents=True, exist_ok=True)
         with json_lines(output_dir / METRICS_FILE, trainer.step) as write:
@@ -224,16 +226,6 @@ def _new_policy(config: TrainConfig, spec: RobotTaskSpec) -> MLPPolicy:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return MLPPolicy(policy_config)
-
-
-def _check_same_run(checkpoint: Path, key: Mapping[str, Any]) -> None:
-    saved = read_step(checkpoint)
-    if saved.get("data") != key["data"]:
-        raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", key["data"])
-    for name, ours in json.loads(json.dumps(key["options"])).items():
-        theirs = saved.get("options", {}).get(name)
-        if theirs != ours:
-            raise MismatchError(f"training option {name}", f"checkpoint {checkpoint}", theirs, "this run", ours)
 
 
 def _digest(rows: Rows) -> str:
