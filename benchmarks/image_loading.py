@@ -32,7 +32,7 @@ from manip_il.data.image_cache import open_frame_cache
 from manip_il.data.lerobot_io import camera_keys, read_table
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.learn.augment import Augment
-from manip_il.learn.sources import MemorySource, pictures_to_float
+from manip_il.learn.sources import JoinedFrames, MemorySource, pictures_to_float
 from manip_il.learn.threads import threads
 from manip_il.learn.windows import Windows
 
@@ -110,7 +110,8 @@ def our_source(root: Path, folder: Path) -> MemorySource:
     texts = read_metadata(root).tasks
     assert texts is not None
     tasks = tuple(map(str, texts.index))
-    return MemorySource(Windows(table["episode_index"], {}), columns, frames, tasks)
+    joined = {camera: JoinedFrames([one]) for camera, one in frames.items()}
+    return MemorySource(Windows(table["episode_index"], {}), columns, joined, tasks)
 
 
 def our_epoch(source: MemorySource, augment: Augment | None, number: Iterator[int]) -> int:

@@ -15,9 +15,10 @@ from pathlib import Path
 
 from _machine import describe_machine
 
-from manip_il.dagger.config import DaggerConfig, FitConfig
+from manip_il.dagger.config import DaggerConfig
 from manip_il.dagger.loop import run_dagger
 from manip_il.engine.engine import Engine, default_workers
+from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.env import EnvConfig
 
 LIMIT = 80.0  # [s]

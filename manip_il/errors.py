@@ -44,6 +44,10 @@ class NotFiniteError(ManipError):
     """NaN or infinity where a number was needed."""
 
 
+class NothingToLearnError(ManipError):
+    """Rollouts that leave no label behind."""
+
+
 class FolderExistsError(UsageError):
     """An output folder that holds something already."""
 

@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
 
 F64 = NDArray[np.float64]
@@ -78,7 +79,21 @@ class Turn:
     seed: int
     step: int
     observation: Observation
-    label: Label | None
+    state: State
+    labeller: Labeller | None = None
+    label: Label | None = None
+
+    def ask(self) -> Label:
+        """The expert's label of this state, from now on the turn's. Raises `ManipError` where there is no expert."""
+        if self.label is None:
+            self.label = self.peek()
+        return self.label
+
+    def peek(self) -> Label:
+        """What `ask` would give, without keeping it."""
+        if self.labeller is None:
+            raise ManipError(f"episode {self.seed}: nobody to ask for a label at step {self.step}")
+        return self.labeller.label(self.state)
 
 
 @dataclass(frozen=True)
@@ -86,12 +101,12 @@ class Rules:
     """How long an episode runs and when the expert is asked.
 
     horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
-    labels: in every state, in the last one only, or never.
+    labels: asked for in every state, in the last one only, or only where the driver asks.
     """
 
     horizon: int
     hold: int | None = None
-    labels: Literal["all", "last", "none"] = "all"
+    labels: Literal["all", "last", "driver"] = "all"
 
 
 @dataclass(slots=True)
@@ -101,7 +116,6 @@ class _Slot:
     intruder: Intruder | None
     step: int = 0
     held: int = 0
-    state: State = field(init=False)
     turn: Turn = field(init=False)
 
 
@@ -149,11 +163,10 @@ def _next_episode(
 def _look(slot: _Slot, rules: Rules, labeller: Labeller | None) -> None:
     if slot.intruder is not None:
         slot.intruder.before(slot.step)
-    slot.state = slot.env.get_state()
+    slot.turn = Turn(slot.seed, slot.step, slot.env.observe(), slot.env.get_state(), labeller)
     last = slot.step == rules.horizon - 1
-    wanted = rules.labels == "all" or (rules.labels == "last" and last)
-    label = labeller.label(slot.state) if labeller is not None and wanted else None
-    slot.turn = Turn(slot.seed, slot.step, slot.env.observe(), label)
+    if labeller is not None and (rules.labels == "all" or (rules.labels == "last" and last)):
+        slot.turn.ask()
 
 
 def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition:
@@ -168,7 +181,7 @@ def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition
     return Transition(
         seed=slot.seed,
         step=slot.step - 1,
-        state=slot.state,
+        state=slot.turn.state,
         observation=slot.turn.observation,
         label=slot.turn.label,
         executed_action=executed,

@@ -73,7 +73,10 @@ def test_lerobots_dataset_code_stays_in_the_files_for_it():
     assert users <= LEROBOT_DATASETS
 
 
-@pytest.mark.parametrize("module", ["statistics", "results", "report", "terminal"])
+@pytest.mark.parametrize(
+    "module",
+    ["statistics", "results", "report", "terminal", "comparison", "study", "certificate", "certificate_table"],
+)
 def test_reading_results_needs_neither_torch_nor_mujoco(module: str):
     code = f"import sys, manip_il.evaluation.{module}; print({{'torch', 'mujoco', 'lerobot'}} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

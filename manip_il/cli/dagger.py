@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -12,16 +13,18 @@ from manip_il.cli.groups import (
     ENGINE_HELP,
     WORKERS_HELP,
     EnvGroup,
-    PolicyGroup,
+    ImageGroup,
     RobotGroup,
     TaskGroup,
     check_same_options,
     command_line,
     option,
+    policy_help,
     save_options,
 )
-from manip_il.cli.options import to_plain
+from manip_il.cli.options import Open, to_plain
 from manip_il.cli.progress import say
+from manip_il.learn.fit_config import BATCH_SIZE, MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, FitConfig
 
 if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
@@ -35,10 +38,20 @@ FREE = ("workers", "engine", "output_dir")
 
 
 @dataclass
+class SamplingGroup:
+    """`--sampling.*`: how often frames are learnt from, relative to each other."""
+
+    demonstrations: float = option(1.0, "weight of a frame of round 0")
+    corrections: float = option(1.0, "of a later one where the expert drove or would have done something else")
+    rollouts: float = option(1.0, "of the other later ones")
+
+
+@dataclass
 class DaggerOptions:
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
-    Round 0 is behaviour cloning on the expert's own demonstrations. OUTPUT_DIR/best holds the round with the highest
+    Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
+    LeRobot's; its options are those of `manip-il train`. OUTPUT_DIR/best holds the round with the highest
     validation success.
     """
 
@@ -46,15 +59,41 @@ class DaggerOptions:
     robot: RobotGroup = field(default_factory=RobotGroup)
     task: TaskGroup = field(default_factory=TaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
+    method: Literal["dagger", "cloning", "dart"] = option(
+        "dagger",
+        "who drives after round 0: the learner, the expert, or the expert with noise like the learner's errors",
+    )
     demonstrations: int = option(50, "successful expert episodes of round 0")
     rounds: int = option(5, "after round 0; a resumed run may have more")
-    episodes_per_round: int = option(50, "rollouts a round")
+    episodes_per_round: int = option(50, "rollouts a round; with --method=cloning successful ones")
+    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
     disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
     beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
+    label: Literal["per_state", "takeover", "branch"] = option(
+        "per_state",
+        "where the expert is asked: its action, its drive to the end, or a branch of its own (see the docs)",
+    )
+    ask: str | None = option(
+        None,
+        "when: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; by default every, for "
+        "takeover one, for branch probability:1/STEPS",
+    )
+    branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
+    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --ask=ensemble:BOUND")
+    sampling: SamplingGroup = field(default_factory=SamplingGroup)
+    policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
+    observation: Literal["state", "images", "both"] | None = option(
+        None, "what the policy sees beside its joints; by default images where it is cnn, else state"
+    )
+    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both, for a policy that sees"})
+    image: ImageGroup = field(default_factory=ImageGroup)
     refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
-    policy: PolicyGroup = field(default_factory=PolicyGroup)
-    steps: int = option(3_000, "gradient steps a round")
-    batch_size: int = option(512, "frames a step")
+    steps: int | None = option(None, f"gradient steps a round; by default {MLP_STEPS:,} for mlp, else 20,000")
+    refit_steps: int | None = option(None, "of the rounds after the first, with --refit=warm; by default as many")
+    batch_size: int | None = option(None, f"frames a step; by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}")
+    lr: float | None = option(None, f"highest learning rate; by default {MLP_LR} for mlp, else the policy's own")
+    optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
+    scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
     validation_episodes: int = option(200, "unseen episodes that choose the best round")
     hold: int = option(10, "control steps that a rollout goes on for after success")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
@@ -92,24 +131,33 @@ class DaggerOptions:
         say(f"next: manip-il eval --policy.path={best} --output_dir={self.output_dir}/test")
 
     def config(self) -> DaggerConfig:
-        """What `run_dagger` takes."""
-        policy = self.policy.config()
+        """What `run_dagger` takes. Raises `UsageError` for what does not go together."""
         env = self.env.config(self.robot.type, self.task.type)
-        from manip_il.dagger.config import DaggerConfig, FitConfig
+        cameras = self.image.config(self.cameras)
+        from manip_il.dagger.config import DaggerConfig
+        from manip_il.dagger.fitting import check_labels, check_sight
+        from manip_il.dagger.sampling import Sampling
 
-        return DaggerConfig(
+        own = {one.name for one in fields(DaggerConfig)} - {"env", "fit", "sampling", "cameras"}
+        config = DaggerConfig(
             env=env,
-            demonstrations=self.demonstrations,
-            rounds=self.rounds,
-            episodes_per_round=self.episodes_per_round,
-            beta=self.beta,
-            refit=self.refit,
-            fit=FitConfig(policy.loss, self.steps, self.batch_size, policy.width, policy.depth),
-            validation_episodes=self.validation_episodes,
-            hold=self.hold,
-            disturbed_share=self.disturbed_share,
-            seed=self.seed,
+            fit=self._fit(),
+            sampling=Sampling(**to_plain(self.sampling)),
+            cameras=cameras,
+            **{name: getattr(self, name) for name in own},
         )
+        check_sight(config)
+        check_labels(config)
+        return config
+
+    def _fit(self) -> FitConfig:
+        own = ("policy", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
+        return FitConfig(**{name: getattr(self, name) for name in own})
+
+    @classmethod
+    def more_help(cls, words: Sequence[str]) -> str:
+        """The options of the policy that `--policy.type` names."""
+        return policy_help(words)
 
 
 def run_rounds(config: DaggerConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
@@ -117,7 +165,8 @@ def run_rounds(config: DaggerConfig, folder: Path, engine: Engine, stages: Stage
     from manip_il.dagger.loop import run_dagger
     from manip_il.engine.describe import env_fingerprint
 
-    atomic_write(folder / FINGERPRINT_FILE, json.dumps(env_fingerprint(config.env), indent=1) + "\n")
+    fingerprint = env_fingerprint(config.env, config.cameras)
+    atomic_write(folder / FINGERPRINT_FILE, json.dumps(fingerprint, indent=1) + "\n")
     results: list[RoundResult] = []
     for result in run_dagger(config, folder, engine, stages.watch()):
         stages.close()
@@ -148,7 +197,8 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
     from manip_il.evaluation.results import compare_results
 
     best = best_round(results)
-    names = ["cloning (round 0)", *(f"DAgger, round {result.round}" for result in results[1:])]
+    kind = {"dagger": "DAgger", "cloning": "cloning", "dart": "DART"}[config.method]
+    names = ["cloning (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
     rows = [
         PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
         for name, result in zip(names, results, strict=True)
@@ -158,7 +208,7 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
         comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
     return Report(
-        title=f"DAgger on {config.env.robot} {config.env.task}",
+        title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=(
             f"{names[best.round]} is the best of {len(results)}: "
             f"{best.validation.success} success on {best.validation.success.n:,} validation episodes."

@@ -7,7 +7,7 @@ import json
 import shlex
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,6 @@ from manip_il.errors import MismatchError, UnknownName, UsageError
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.data.schema import RobotTaskSpec
-    from manip_il.learn.mlp.configuration_mlp import MLPConfig
     from manip_il.sim.env import EnvConfig
     from manip_il.sim.look import CameraConfig, Look
 
@@ -107,16 +106,27 @@ class PolicyGroup:
     width: int = option(256, "units a layer")
     depth: int = option(3, "hidden layers")
 
-    def config(self) -> MLPConfig:
-        """The policy's configuration; `UsageError` for another type, an unknown loss or a size out of range."""
+    def settings(self) -> dict[str, Any]:
+        """As `--policy.*` of `manip-il train` has them; `UsageError` for another type."""
         if self.type not in POLICY_TYPES:
             raise UsageError(
-                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) learn from "
-                "a dataset by: manip-il train --dataset.root=... --policy.type=..."
+                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) learn by "
+                "manip-il train and manip-il dagger, with --policy.type=..."
             )
-        from manip_il.learn.mlp.configuration_mlp import MLPConfig
+        return to_plain(self)
 
-        return MLPConfig(**{one.name: getattr(self, one.name) for one in fields(self) if one.name != "type"})
+
+def policy_help(words: Iterable[str]) -> str:
+    """The options of the policy that `--policy.type=` in a command's words names; nothing where none does."""
+    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+    if not kind:
+        return ""
+    from manip_il.learn.choices import option_lines, policy_class
+
+    rows = option_lines(policy_class(kind), "policy")
+    width = max(len(left) for left, _ in rows) + 2
+    lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
+    return f"\n\noptions of {kind}:\n{lines}"
 
 
 def warn(lines: Iterable[str]) -> None:

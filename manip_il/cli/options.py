@@ -91,6 +91,18 @@ def from_yaml[T](path: Path, cls: type[T]) -> T:
     return _build(cls, _read_yaml(path, cls, known))
 
 
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]) -> T:
+    """Options from trees of differences, as YAML reads them; of two that say the same option, the later one counts.
+
+    layers: where a tree is from, for error messages, and the tree. `UsageError` as from a YAML file.
+    """
+    known = {option.name: option for option in options_of(cls)}
+    given: dict[str, _Given] = {}
+    for where, tree in layers:
+        given |= {name: _Given(value, f"{where}: {name}", False) for name, value in _leaves(tree, known, where)}
+    return _build(cls, given)
+
+
 def dump_yaml(options: Any) -> str:
     """The resolved options as YAML: `from_yaml` gives them back equal."""
     import yaml
@@ -184,14 +196,16 @@ def _read_yaml(path: Path, cls: type, known: Mapping[str, Option]) -> dict[str, 
     return {name: _Given(value, f"{path}: {name}", False) for name, value in _leaves(tree or {}, known, path)}
 
 
-def _leaves(tree: dict[Any, Any], known: Mapping[str, Option], path: Path, prefix: str = "") -> Iterator[tuple]:
+def _leaves(
+    tree: Mapping[Any, Any], known: Mapping[str, Option], path: Path | str, prefix: str = ""
+) -> Iterator[tuple]:
     for key, value in tree.items():
         name = f"{prefix}{key}"
         if name in known and known[name].is_open:
             if not isinstance(value, dict | None):
                 raise UsageError(f"{path}: {name}: expected a mapping of options, got {value!r}")
             yield from ((f"{name}.{inner}", one) for inner, one in (value or {}).items())
-        elif name in known:
+        elif name in known or _open_group(name, known):
             yield name, value
         elif not any(option.startswith(f"{name}.") for option in known):
             raise _unknown(f"key in {path}:", name, known)

@@ -99,9 +99,10 @@ class QuickstartOptions:
             story.tell()
 
     def _config(self) -> DaggerConfig:
-        shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "policy", "steps")
+        shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "steps")
         shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
-        return replace(DaggerOptions(), **{name: getattr(self, name) for name in shared}).config()
+        same = {name: getattr(self, name) for name in shared}
+        return DaggerOptions(**same, policy=self.policy.settings()).config()
 
 
 class _Story:

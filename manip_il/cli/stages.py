@@ -67,7 +67,10 @@ class Stages:
         self.check()
 
     def log(self, record: dict[str, Any]) -> None:
-        """A fit's metrics at a step."""
+        """A fit's metrics at a step; {} where there are none."""
+        if not record:
+            self.check()
+            return
         if self._bar is not None:
             self._bar.advance(record["step"] - self._done, loss=record["loss"])
         self._done = record["step"]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from manip_il.dagger.collect import MAX_TRIES, collect_successes, provenance, record
-from manip_il.dagger.loop import LEARNING_COLUMNS, fit_policy
+from manip_il.dagger.fitting import LEARNING_COLUMNS, fit_table, round_fit
 from manip_il.data import schema
 from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
@@ -67,8 +67,8 @@ def clone_with_labels(
     table = read_table(folder / "dataset", LEARNING_COLUMNS)
     so_far = np.cumsum(table[schema.LABEL_VALID])
     rows = int(np.searchsorted(so_far, labels)) + 1
-    stages.start("cloning with as many labels, fit", config.fit.steps)
-    policy = fit_policy(
+    stages.start("cloning with as many labels, fit", round_fit(config, False).total_steps)
+    policy = fit_table(
         config, {key: column[:rows] for key, column in table.items()}, folder / "policy", on_log=stages.log
     )
     stages.close()

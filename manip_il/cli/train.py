@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import check_dataset, check_same_options, option, save_options
+from manip_il.cli.groups import check_dataset, check_same_options, option, policy_help, save_options
 from manip_il.cli.options import Open
 from manip_il.cli.progress import progress, say, set_quiet
-from manip_il.errors import UsageError
+from manip_il.learn.fit_config import MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, STEPS, FitConfig
 
 if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from manip_il.learn.policy_config import PolicyFitConfig
     from manip_il.learn.train import TrainConfig
 
-MLP = "mlp"  # the one policy with a loop of its own
-MLP_STEPS, MLP_BATCH_SIZE, MLP_LR = 3_000, 512, 2e-3
-STEPS, BATCH_SIZE = 100_000, 8  # LeRobot's defaults
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir", "num_workers", "tensorboard", "wandb")
 
@@ -89,67 +86,12 @@ class TrainOptions:
             say(f"checkpoint: {path}")
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
 
-    @property
-    def _is_mlp(self) -> bool:
-        return "path" not in self.policy and self.policy.get("type", MLP) == MLP
-
     def _config(self) -> TrainConfig | PolicyFitConfig:
-        return self._mlp_config() if self._is_mlp else self._policy_config()
-
-    def _mlp_config(self) -> TrainConfig:
-        if self.observation not in (None, "state"):
-            raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={self.observation}; use cnn")
-        for name in ("optimizer", "scheduler", "wandb", "tensorboard"):
-            if getattr(self, name):
-                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop of its own (metrics.jsonl)")
-        from manip_il.learn.choices import policy_config
-        from manip_il.learn.mlp.configuration_mlp import MLPConfig
-        from manip_il.learn.train import TrainConfig
         from manip_il.seeding import stream_base
 
-        policy = policy_config(self.policy, MLP)
-        assert isinstance(policy, MLPConfig)
-        return TrainConfig(
-            steps=MLP_STEPS if self.steps is None else self.steps,
-            batch_size=MLP_BATCH_SIZE if self.batch_size is None else self.batch_size,
-            lr=MLP_LR if self.lr is None else self.lr,
-            val_fraction=self.dataset.eval_split,
-            seed=stream_base("training", self.seed),
-            threads=self.threads,
-            save_freq=1_000 if self.save_freq is None else self.save_freq,
-            log_freq=self.log_freq,
-            policy=policy,
-        )
-
-    def _policy_config(self) -> PolicyFitConfig:
-        from lerobot.configs.default import WandBConfig
-        from lerobot.optim import LRSchedulerConfig, OptimizerConfig
-
-        from manip_il.learn.augment import Augment
-        from manip_il.learn.choices import choice, plain, policy_config
-        from manip_il.learn.policy_config import PolicyFitConfig
-        from manip_il.seeding import stream_base
-
-        policy = policy_config(self.policy)
-        return PolicyFitConfig(
-            policy=policy,
-            steps=STEPS if self.steps is None else self.steps,
-            batch_size=BATCH_SIZE if self.batch_size is None else self.batch_size,
-            seed=stream_base("training", self.seed),
-            observation=self.observation or ("images" if policy.type == "cnn" else "state"),
-            eval_split=self.dataset.eval_split,
-            lr=self.lr,
-            optimizer=choice(OptimizerConfig, self.optimizer, "optimizer") if self.optimizer else None,
-            scheduler=choice(LRSchedulerConfig, self.scheduler, "scheduler") if self.scheduler else None,
-            augment=Augment() if self.image_augment else None,
-            image_cache_gb=self.image_cache_gb,
-            num_workers=self.num_workers,
-            threads=self.threads,
-            log_freq=self.log_freq,
-            save_freq=20_000 if self.save_freq is None else self.save_freq,
-            tensorboard=self.tensorboard,
-            wandb=plain(WandBConfig, self.wandb, "wandb"),
-        )
+        same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name != "eval_split"}
+        fit, seed = FitConfig(**same, eval_split=self.dataset.eval_split), stream_base("training", self.seed)
+        return fit.mlp(seed) if fit.is_mlp else fit.other(seed)
 
     def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
         from manip_il.learn.train import TrainConfig
@@ -170,7 +112,7 @@ class TrainOptions:
         return Stages(kept=f"the last checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
 
     def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
-        from manip_il.dagger.loop import LEARNING_COLUMNS
+        from manip_il.dagger.fitting import LEARNING_COLUMNS
         from manip_il.data.lerobot_io import read_table
         from manip_il.learn.train import fit
 
@@ -197,7 +139,7 @@ class TrainOptions:
             self._save_options()  # now, as much of what can be wrong has been found by now
             with self._stages(config.save_freq) as stages:
                 stages.start(f"train {config.policy.type} on {len(trainer.samples.train):,} samples", config.steps)
-                return trainer.fit(lambda record: stages.log(record) if record else stages.check())
+                return trainer.fit(stages.log)
 
     def _meta(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> CheckpointMeta:
         from manip_il.data.lerobot_io import read_provenance
@@ -227,15 +169,7 @@ class TrainOptions:
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
         """The options of the policy that `--policy.type` names."""
-        kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
-        if not kind:
-            return ""
-        from manip_il.learn.choices import option_lines, policy_class
-
-        rows = option_lines(policy_class(kind), "policy")
-        width = max(len(left) for left, _ in rows) + 2
-        lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
-        return f"\n\noptions of {kind}:\n{lines}"
+        return policy_help(words)
 
 
 def _is_first_process() -> bool:

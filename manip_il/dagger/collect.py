@@ -143,7 +143,11 @@ def record(
 
 def provenance(job: RolloutJob) -> dict[str, Any]:
     """Who drove, as datasets say it."""
-    return {"driver": job.driver, "round": job.round, "beta": job.beta}
+    said = {"driver": job.driver, "round": job.round, "beta": job.beta}
+    if job.driver not in ("policy", "mixture"):
+        return said
+    steps = {"branch_steps": job.branch_steps} if job.labels == "branch" else {}
+    return {**said, "label": job.labels, "ask": str(job.ask), **steps}
 
 
 def check_journals(journals: Path, job: RolloutJob) -> list[str]:

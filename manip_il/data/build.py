@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from manip_il.data.atomic import write_file
+from manip_il.data.episodes import count_labels, first_labels, parts
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import Header, list_episodes, read_journal
 from manip_il.data.lerobot_io import DatasetInfo, DatasetWriter, VideoConfig, new_dataset
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
@@ -28,7 +29,9 @@ RECORDING = "recording.json"
 class Recording:
     """What a folder of journals becomes: its `recording.json`.
 
-    only_successes: failed episodes are left out. episodes: at most so many, the first in seed order; None: all.
+    A rollout becomes as many episodes as it has parts (see `parts`). only_successes: failed ones are left out.
+    only_labelled: those without a sound label are. episodes: at most so many, the first in seed order; None: all.
+    labels: at most so many sound ones; what comes after the last has `label_valid` 0, episodes beyond it are left out.
     provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it.
     """
 
@@ -37,6 +40,8 @@ class Recording:
     episodes: int | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     video: dict[str, Any] = field(default_factory=dict)
+    only_labelled: bool = False
+    labels: int | None = None
 
     def open(
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
@@ -79,12 +84,14 @@ class Builder:
         self._writer, self._recording = writer, recording
         self._first: Header | None = None
         self._seeds: list[int] = []  # first and last
-        self.count = self.failed = 0  # episodes taken and left out
+        self._rollouts = 0
+        self.count = self.failed = self.labels = 0  # episodes taken and left out as they failed; sound labels
 
     @property
     def is_full(self) -> bool:
-        """Whether every asked episode is in."""
-        return self._recording.episodes is not None and self.count >= self._recording.episodes
+        """Whether every asked episode or label is in."""
+        episodes, labels = self._recording.episodes, self._recording.labels
+        return (episodes is not None and self.count >= episodes) or (labels is not None and self.labels >= labels)
 
     def add(self, header: Header, episode: Episode) -> None:
         """Take an episode and what its journal says; `MismatchError` where that is about something else than before."""
@@ -96,16 +103,34 @@ class Builder:
             f"the journal of seed {header.seed}", header.fingerprint, "the first", self._first.fingerprint
         ):
             _LOG.warning("%s", line)
+        if self.is_full:
+            return
         self._seeds = [*self._seeds[:1], header.seed]
-        if self._recording.only_successes and not episode.success:
+        self._rollouts += 1
+        for part in parts(episode):
+            if not self.is_full:
+                self._add_part(part)
+
+    def _add_part(self, part: Episode) -> None:
+        if self._recording.only_successes and not part.success:
             self.failed += 1
             return
-        self._writer.add(episode)
+        if self._recording.labels is not None:
+            part = first_labels(part, self._recording.labels - self.labels)
+        labels = count_labels(part)
+        if self._recording.only_labelled and not labels:
+            return
+        self._writer.add(part)
         self.count += 1
+        self.labels += labels
 
     def finish(self) -> DatasetInfo:
-        """Make the dataset whole, with where it came from."""
-        seeds = {"seeds": [self._seeds[0], self._seeds[-1]], "tried": self.count + self.failed} if self._seeds else {}
+        """Make the dataset whole, with where it came from. Raises `NothingToLearnError` where no episode is left."""
+        if not self.count:
+            raise NothingToLearnError(
+                "no episode is left to learn from: nobody asked the expert, or it had no sound answer"
+            )
+        seeds = {"seeds": [self._seeds[0], self._seeds[-1]], "tried": self._rollouts} if self._seeds else {}
         return self._writer.finish({**self._recording.provenance, **seeds})
 
 

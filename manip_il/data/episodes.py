@@ -1,8 +1,13 @@
-"""Transitions to episodes: the columns that a dataset holds."""
+"""Transitions to episodes: the columns that a dataset holds.
+
+One rollout is one episode here, whatever comes of it: the learner's path, and what the expert did from where it took
+over or was asked to show the way. Each part ends with `next.done`; in a dataset each is an episode (`parts`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,18 +17,24 @@ from manip_il.data import schema
 from manip_il.mdp import Episode, Phase, Transition
 
 
-def group_episodes(transitions: Iterable[Transition], round_: int = 0, beta: float = 1.0) -> Iterator[Episode]:
-    """Yield each episode as its last transition arrives, from interleaved ones."""
-    open_episodes: dict[int, list[Transition]] = {}
+def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
+    """Yield each rollout's transitions as its last one arrives, from interleaved ones."""
+    running: dict[int, list[Transition]] = {}
     for transition in transitions:
-        frames = open_episodes.setdefault(transition.seed, [])
+        frames = running.setdefault(transition.seed, [])
         frames.append(transition)
         if transition.done:
-            yield to_episode(open_episodes.pop(transition.seed), round_, beta)
+            yield running.pop(transition.seed)
 
 
-def to_episode(frames: list[Transition], round_: int, beta: float) -> Episode:
-    """An episode with the schema's columns; those of the expert are left out where it was not asked throughout."""
+def to_episode(
+    frames: Sequence[Transition], round_: int = 0, beta: float = 1.0, *, labelled: bool = True, path: int | None = None
+) -> Episode:
+    """An episode with the schema's columns.
+
+    labelled: with the columns of labels; where nobody asked, `label_valid` is 0, the phase NONE, and the label the
+    executed action. path: the first so many frames decide whether it succeeded; by default all.
+    """
     count = len(frames)
     columns: dict[str, NDArray[Any]] = {
         schema.STATE: np.stack([frame.observation.state for frame in frames]),
@@ -41,16 +52,47 @@ def to_episode(frames: list[Transition], round_: int, beta: float) -> Episode:
     }
     for camera in frames[0].observation.images:
         columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
-    labels = [frame.label for frame in frames if frame.label is not None]
-    if len(labels) == count:
-        columns[schema.ACTION] = np.stack([label.action for label in labels]).astype(np.float32)
-        columns[schema.LABEL_VALID] = _column([label.valid for label in labels], np.int64)
+    if labelled:
+        columns[schema.ACTION] = np.stack([_taught(frame) for frame in frames]).astype(np.float32)
+        columns[schema.LABEL_VALID] = _column([bool(frame.label and frame.label.valid) for frame in frames], np.int64)
+    decides = frames[:path]
     return Episode(
         seed=frames[0].seed,
         columns=columns,
-        success=any(frame.success for frame in frames),
-        success_at_end=frames[-1].success,
+        success=any(frame.success for frame in decides),
+        success_at_end=decides[-1].success,
     )
+
+
+def parts(episode: Episode) -> list[Episode]:
+    """What a dataset has as episodes of their own: cut behind every frame that is `next.done`."""
+    ends = np.flatnonzero(episode.columns[schema.DONE].ravel()) + 1
+    if len(ends) < 2:
+        return [episode]
+    starts = [0, *ends[:-1].tolist()]
+    return [_part(episode, slice(start, end)) for start, end in zip(starts, ends.tolist(), strict=True)]
+
+
+def count_labels(episode: Episode) -> int:
+    """Its sound labels."""
+    return int(episode.columns[schema.LABEL_VALID].sum()) if schema.LABEL_VALID in episode.columns else 0
+
+
+def first_labels(episode: Episode, most: int) -> Episode:
+    """The episode with `label_valid` 0 behind its first `most` sound labels."""
+    valid = episode.columns[schema.LABEL_VALID].astype(np.int64)
+    kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
+    return replace(episode, columns=episode.columns | {schema.LABEL_VALID: kept})
+
+
+def _part(episode: Episode, rows: slice) -> Episode:
+    columns = {key: column[rows] for key, column in episode.columns.items()}
+    solved = columns[schema.SUCCESS]
+    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()))
+
+
+def _taught(frame: Transition) -> NDArray[np.float64]:
+    return frame.executed_action if frame.label is None else frame.label.action
 
 
 def _column(values: list[Any], dtype: type) -> NDArray[Any]:

@@ -11,6 +11,7 @@ from manip_il.data.lerobot_read import (
     read_provenance,
     read_spec,
     read_table,
+    read_tables,
     video_rows,
 )
 from manip_il.data.lerobot_write import DatasetWriter, new_dataset, write_dataset
@@ -32,6 +33,7 @@ __all__ = [
     "read_provenance",
     "read_spec",
     "read_table",
+    "read_tables",
     "video_rows",
     "write_dataset",
 ]

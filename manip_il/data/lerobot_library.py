@@ -9,12 +9,14 @@ from typing import Any, override
 
 import numpy as np
 from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
 
 from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, MismatchError
 
 Frame = dict[str, Any]  # column -> array of the feature's dtype and shape, or text; and `task`
 
@@ -60,19 +62,51 @@ def _save(dataset: LeRobotDataset) -> None:
             enable_progress_bar()
 
 
-def read_metadata(root: Path) -> LeRobotDatasetMetadata:
-    """LeRobot's own description of a dataset, from which its factories build policies.
+def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
+    """LeRobot's own joining of datasets into `root`, which must not exist; every video stays a file of its own."""
+    names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
+    aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+
+
+class Metadata(LeRobotDatasetMetadata):
+    """LeRobot's, of one dataset or of several as one; `roots` are their folders."""
+
+    roots: tuple[Path, ...] = ()
+
+
+def read_metadata(*roots: Path) -> Metadata:
+    """LeRobot's own description of a dataset, or of several as one, from which its factories build policies.
 
     The cameras' statistics are ImageNet's, as `lerobot-train` takes them by default. Raises `ManipError` for a folder
-    that is no dataset.
+    that is no dataset, `MismatchError` for several of different features or tasks.
     """
+    metas = [_metadata(root) for root in roots]
+    first = metas[0]
+    first.roots = roots
+    for root, meta in zip(roots[1:], metas[1:], strict=True):
+        for what, ours, theirs in zip(("features", "rate", "tasks"), _nature(first), _nature(meta), strict=True):
+            if ours != theirs:
+                raise MismatchError(what, str(roots[0]), ours, str(root), theirs)
+    stats = [meta.stats for meta in metas if meta.stats is not None]
+    joined = stats[0] if len(metas) == 1 else aggregate_stats(stats)
+    for key in first.camera_keys:
+        joined[key] |= {name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()}
+    first.stats = joined
+    first.info.total_episodes = sum(meta.total_episodes for meta in metas)
+    first.info.total_frames = sum(meta.total_frames for meta in metas)
+    return first
+
+
+def _nature(meta: LeRobotDatasetMetadata) -> tuple[list[str], int, list[str]]:
+    return list(meta.features), meta.fps, [] if meta.tasks is None else list(map(str, meta.tasks.index))
+
+
+def _metadata(root: Path) -> Metadata:
     if not (root / INFO).is_file():  # LeRobot would ask the Hub for it
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {INFO}")
-    meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    meta = Metadata(f"local/{root.name}", root=root)
     if meta.stats is None:
         raise ManipError(f"{root} has no statistics (meta/stats.json); `manip-il doctor` tells what is left")
-    for key in meta.camera_keys:
-        meta.stats[key] |= {name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()}
     return meta
 
 

@@ -64,6 +64,21 @@ def read_table(
     return {name: _to_numpy(table.column(name), table_features[name]["shape"]) for name in names}
 
 
+def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The columns of several datasets one after the other, with frames and episodes numbered throughout.
+
+    Raises what `read_table` raises.
+    """
+    tables = [read_table(root, columns) for root in roots]
+    counts = {layout.EPISODE_INDEX: "total_episodes", layout.INDEX: "total_frames"}
+    infos = [_read_info(root) for root in roots]
+    joined = {name: np.concatenate([table[name] for table in tables]) for name in columns}
+    for name in counts.keys() & joined.keys():
+        before = np.cumsum([0, *(info[counts[name]] for info in infos[:-1])])
+        joined[name] = np.concatenate([table[name] + start for table, start in zip(tables, before, strict=True)])
+    return joined
+
+
 def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     """The dataset's episodes in order, scalars as (T, 1) columns, pictures decoded unless they are not wanted.
 

@@ -34,6 +34,14 @@ _EPISODE_ROWS = 100  # rows of meta/episodes held before they are written
 FORMAT = 1  # of meta/manip_il.json
 
 
+def own_file(
+    repo_id: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], provenance: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """What stands in `meta/manip_il.json`."""
+    ours = {"format": FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
+    return ours | {"provenance": dict(provenance or {})}
+
+
 @contextlib.contextmanager
 def new_dataset(
     root: Path,
@@ -55,7 +63,7 @@ def new_dataset(
     video = video or VideoConfig()
     if spec.cameras:
         video.check(spec.image_size, spec.fps)
-    ours = {"format": FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
+    ours = own_file(repo_id, spec, fingerprint)
     with new_folder(root, replace=replace) as folder:
         writer = DatasetWriter(folder, root, spec, ours, video, (data_files_size_in_mb, video_files_size_in_mb))
         try:

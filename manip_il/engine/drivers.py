@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import ManipError
+from manip_il.engine.ask import Gate, seen
 from manip_il.mdp import Actor
-from manip_il.rollout import Turn
+from manip_il.rollout import Driver, Turn
 from manip_il.seeding import rng_for
 
 F64 = NDArray[np.float64]
@@ -43,8 +43,24 @@ class ExpertDriver:
     """Executes the expert's label."""
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The label of every episode. Raises `ManipError` where the expert was not asked."""
-        return [(_expert_action(turn), Actor.EXPERT) for turn in turns]
+        """The label of every episode."""
+        return [(turn.ask().action, Actor.EXPERT) for turn in turns]
+
+
+class NoisyExpertDriver:
+    """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: (n, n), of actions."""
+
+    def __init__(self, covariance: F64):
+        self._covariance = covariance
+        self._rngs: dict[int, np.random.Generator] = {}
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """The label plus a draw from each episode's own generator."""
+        return [(turn.ask().action + self._draw(turn.seed), Actor.NOISY_EXPERT) for turn in turns]
+
+    def _draw(self, seed: int) -> F64:
+        rng = self._rngs.setdefault(seed, rng_for(seed, "dart"))
+        return rng.multivariate_normal(np.zeros(len(self._covariance)), self._covariance)
 
 
 class LearnerDriver:
@@ -57,13 +73,7 @@ class LearnerDriver:
         """The policy's action in every episode."""
         if started := [turn.seed for turn in turns if turn.step == 0]:
             self._policy.reset(started)
-        seen = [turn.observation for turn in turns]
-        actions = self._policy.act(
-            np.stack([one.state for one in seen]),
-            np.stack([one.environment_state for one in seen]),
-            {camera: np.stack([one.images[camera] for one in seen]) for camera in self._policy.cameras},
-            [turn.seed for turn in turns],
-        )
+        actions = self._policy.act(*seen(turns, self._policy.cameras), [turn.seed for turn in turns])
         return [(action, Actor.LEARNER) for action in actions]
 
 
@@ -80,8 +90,39 @@ class MixtureDriver:
         for i, turn in enumerate(turns):
             rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "mixture"))
             if rng.uniform() < self._beta:
-                chosen[i] = (_expert_action(turn), Actor.EXPERT)
+                chosen[i] = (turn.ask().action, Actor.EXPERT)
         return chosen
+
+
+class AskingDriver:
+    """Another driver, and a label where its gate wants one."""
+
+    def __init__(self, driver: Driver, gate: Gate):
+        self._driver, self._gate = driver, gate
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """What the other driver does."""
+        chosen = self._driver.act(turns)
+        for turn, wanted in zip(turns, self._gate.wants(turns, [action for action, _ in chosen]), strict=True):
+            if wanted:
+                turn.ask()
+        return chosen
+
+
+class TakeoverDriver:
+    """The learner drives until its gate wants the expert, who then drives to the end."""
+
+    def __init__(self, learner: Driver, gate: Gate):
+        self._learner, self._gate = learner, gate
+        self._taken: set[int] = set()
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """The learner's action, or the expert's in episodes that it has taken over."""
+        rolling = [turn for turn in turns if turn.seed not in self._taken]
+        chosen = dict(zip([turn.seed for turn in rolling], self._learner.act(rolling), strict=True)) if rolling else {}
+        wanted = self._gate.wants(rolling, [chosen[turn.seed][0] for turn in rolling]) if rolling else []
+        self._taken.update(turn.seed for turn, wants in zip(rolling, wanted, strict=True) if wants)
+        return [(turn.ask().action, Actor.EXPERT) if turn.seed in self._taken else chosen[turn.seed] for turn in turns]
 
 
 class RandomDriver:
@@ -99,9 +140,3 @@ class RandomDriver:
         rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "random policy"))
         q = turn.observation.state[:-1].astype(np.float64)
         return np.append(q + rng.uniform(-self._reach, self._reach, len(q)), rng.uniform(0, self._max_opening))
-
-
-def _expert_action(turn: Turn) -> F64:
-    if turn.label is None:
-        raise ManipError(f"episode {turn.seed}: the expert was to drive at step {turn.step} but was not asked")
-    return turn.label.action

@@ -8,20 +8,22 @@ from functools import cache
 from pathlib import Path
 from typing import Literal, cast
 
-from manip_il.data.episodes import group_episodes
-from manip_il.engine.describe import env_spec
-from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
+from manip_il.data.episodes import group_rollouts, to_episode
+from manip_il.engine.ask import Ask, drawn_step
+from manip_il.engine.branches import Brancher
+from manip_il.engine.choose import choose_driver
 from manip_il.engine.sight import drawn_cameras
 from manip_il.errors import UsageError
 from manip_il.expert.expert import Expert
-from manip_il.learn.pretrained import check_interface
-from manip_il.mdp import Episode, Transition
-from manip_il.rollout import Driver, Environment, Intruder, Rules, rollout
+from manip_il.mdp import Actor, Episode, Transition
+from manip_il.rollout import Environment, Intruder, Rules, rollout
 from manip_il.sim.disturb import Disturbance, Disturber
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig
+from manip_il.sim.perturb import Perturbation, Perturber
 from manip_il.sim.scene import build_scene
 
+Labels = Literal["per_state", "takeover", "branch", "last"]
 LOCKSTEP = 25  # environments that share one call of the policy
 
 
@@ -29,25 +31,49 @@ LOCKSTEP = 25  # environments that share one call of the policy
 class RolloutJob:
     """Who drives in which environment, for how long, and what is kept.
 
-    policy: a checkpoint's `pretrained_model` folder, needed where a learner drives. beta: the share of steps
-    that the expert drives (`mixture`). hold: end an episode this many steps after success; None: at the horizon.
+    policy: a checkpoint's `pretrained_model` folder, needed where a learner drives; ensemble: others that answer with
+    it where `ask` wants their disagreement. beta: the share of steps that the expert drives (`mixture`). noise: the
+    covariance (n, n) of a noisy expert's actions. hold: end an episode this many steps after success; None: at the
+    horizon.
+
+    labels: what becomes of the states in which `ask` wants the expert. `per_state`: its label. `takeover`: from the
+    first one on it drives to the end, for which it has a horizon of its own. `branch`: in a copy of the simulator it
+    drives `branch_steps` ahead. `last`: none of this, but the label of the last state, for its phase.
+
+    perturbation: what happens once, in place of a disturbance.
+
     cameras: what is pictured in every step and kept; None for nothing. A policy that looks at cameras is shown them
     all the same.
     """
 
     env: EnvConfig
-    driver: Literal["expert", "policy", "mixture", "random"]
+    driver: Literal["expert", "noisy_expert", "policy", "mixture", "random"]
     policy: Path | None = None
+    ensemble: tuple[Path, ...] = ()
     beta: float = 0.0
+    noise: tuple[tuple[float, ...], ...] = ()
     hold: int | None = None
-    labels: Literal["all", "last"] = "all"
+    labels: Labels = "per_state"
+    ask: Ask = field(default_factory=Ask)
+    branch_steps: int = 1
     disturbance: Disturbance = field(default_factory=Disturbance)
+    perturbation: Perturbation | None = None
     round: int = 0
     cameras: CameraConfig | None = None
 
     def __post_init__(self) -> None:
         if self.driver in ("policy", "mixture") and self.policy is None:
             raise UsageError(f"a rollout driven by {self.driver!r} needs a policy's folder")
+        if self.driver == "noisy_expert" and not self.noise:
+            raise UsageError("a rollout driven by 'noisy_expert' needs its noise")
+        if self.labels == "takeover" and self.driver != "policy":
+            raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver!r}")
+        if self.ask.kind == "ensemble" and not self.ensemble:
+            raise UsageError("ask=ensemble needs other policies to disagree with")
+        if self.perturbation is not None and self.disturbance != Disturbance():
+            raise UsageError("a rollout has a disturbance or a perturbation, not both")
+        if self.branch_steps < 1:
+            raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
 
 
 def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
@@ -57,13 +83,48 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         return
     cameras = drawn_cameras(job)
     envs = [_environment(job.env, cameras) for _ in range(min(side_by_side, len(seeds)))]
-    rules = Rules(job.env.horizon, job.hold, "all" if job.driver in ("expert", "mixture") else job.labels)
-    transitions = rollout(
-        envs, seeds, _driver(job, envs[0]), rules, _expert(job.env.robot, job.env.task), _intrude(job.disturbance)
-    )
+    expert = _expert(job.env.robot, job.env.task)
+    driver = choose_driver(job, envs[0])
+    transitions = rollout(envs, seeds, driver, _rules(job), expert, _intrude(job))
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
-    yield from group_episodes(transitions, job.round, job.beta)
+    brancher = (
+        Brancher(_environment(job.env, job.cameras), expert, job.branch_steps) if job.labels == "branch" else None
+    )
+    for frames in group_rollouts(transitions):
+        yield _finish(job, frames, expert, brancher)
+
+
+def _rules(job: RolloutJob) -> Rules:
+    if job.labels == "last":
+        return Rules(job.env.horizon, job.hold, "last")
+    twice = 2 if job.labels == "takeover" else 1  # a horizon for the learner, and one for the expert
+    everywhere = job.labels == "per_state" and job.ask.kind == "every"
+    return Rules(twice * job.env.horizon, job.hold, "all" if everywhere else "driver")
+
+
+def _finish(job: RolloutJob, frames: list[Transition], expert: Expert, brancher: Brancher | None) -> Episode:
+    if job.labels == "last":
+        return to_episode(frames, job.round, job.beta, labelled=False)
+    if job.ask.kind == "one" and job.labels != "takeover":
+        chosen = drawn_step(frames[0].seed, len(frames))
+        frames[chosen] = replace(frames[chosen], label=expert.label(frames[chosen].state))
+    if job.labels == "takeover":
+        return to_episode(_cut_at_takeover(frames, job.env.horizon), job.round, job.beta)
+    if brancher is None:
+        return to_episode(frames, job.round, job.beta)
+    path = [replace(frame, label=None) for frame in frames]
+    return to_episode([*path, *brancher.from_labelled(frames)], job.round, job.beta, path=len(path))
+
+
+def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
+    """The learner's frames as a part of their own, with its end; all of them, up to the horizon, where it drove on."""
+    taken = next((i for i, frame in enumerate(frames) if frame.actor != Actor.LEARNER), None)
+    if taken == 0:
+        return frames
+    last = min(len(frames) if taken is None else taken, horizon) - 1
+    rest = [] if taken is None else frames[taken:]
+    return [*frames[:last], replace(frames[last], done=True), *rest]
 
 
 def _environment(env: EnvConfig, cameras: CameraConfig | None) -> ManipEnv:
@@ -81,24 +142,13 @@ def _expert(robot: str, task: str) -> Expert:
     return Expert(build_scene(robot, task))
 
 
-def _driver(job: RolloutJob, env: ManipEnv) -> Driver:
-    if job.driver == "expert":
-        return ExpertDriver()
-    if job.driver == "random":
-        return RandomDriver(env.scene.robot.max_joint_step, env.scene.robot.max_opening)
-    from manip_il.learn.policy import LearnedPolicy  # torch only where a learner drives
-
-    assert job.policy is not None
-    policy = LearnedPolicy.load(job.policy, task=env.task_description)
-    check_interface(policy.interface, env_spec(job.env, drawn_cameras(job)))
-    return LearnerDriver(policy) if job.driver == "policy" else MixtureDriver(policy, job.beta)
-
-
-def _intrude(disturbance: Disturbance):
-    if disturbance == Disturbance():
+def _intrude(job: RolloutJob):
+    if job.disturbance == Disturbance() and job.perturbation is None:
         return None
 
     def make(env: Environment, seed: int) -> Intruder:
-        return Disturber(cast(ManipEnv, env), disturbance, seed)
+        if job.perturbation is not None:
+            return Perturber(cast(ManipEnv, env), job.perturbation, seed)
+        return Disturber(cast(ManipEnv, env), job.disturbance, seed)
 
     return make

@@ -14,6 +14,8 @@ from manip_il.evaluation.statistics import Proportion
 from manip_il.mdp import F64, require_finite
 
 Kind = Literal["expert", "dagger", "cloning", "baseline"]
+Cost = Literal["labels", "episodes", "seconds"]
+COSTS: tuple[Cost, ...] = ("labels", "episodes", "seconds")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
@@ -56,33 +58,63 @@ class PolicyRow:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Validation success of one policy that learnt from `labels` expert labels; `name` such as `round 3`."""
+    """Validation success of one policy that learnt from `labels` expert labels; `name` such as `round 3`.
+
+    episodes, seconds: what it had cost beside labels, where that is known; seconds of collecting and fitting.
+    """
 
     labels: int
     success: Proportion
     name: str = ""
+    episodes: int | None = None
+    seconds: float | None = None
 
     def __post_init__(self) -> None:
-        if self.labels < 0:
-            raise ManipError(f"a learning curve's point has {self.labels} labels; expected 0 or more")
+        for cost in COSTS:
+            amount = self.amount(cost)
+            if amount is not None and amount < 0:
+                raise ManipError(f"a learning curve's point has {amount} {cost}; expected 0 or more")
+
+    def amount(self, cost: Cost) -> float | None:
+        """Labels, episodes or seconds; None where not known."""
+        return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[cost]
 
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """Validation success over expert labels: DAgger's rounds in order, cloning at labels of its own.
+    """Validation success over what it cost: DAgger's rounds in order, cloning at labels of its own.
 
-    log_x: None chooses a logarithmic axis where labels span a factor of 20 or more.
+    target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a logarithmic axis where labels span a
+    factor of 20 or more.
     """
 
     dagger: tuple[CurvePoint, ...]
     cloning: tuple[CurvePoint, ...] = ()
     expert: Proportion | None = None
     log_x: bool | None = None
+    target: float | None = None
 
     @property
     def points(self) -> tuple[CurvePoint, ...]:
         """All points of both."""
         return (*self.dagger, *self.cloning)
+
+
+@dataclass(frozen=True)
+class ArmCurve:
+    """One arm of a study: a run's points a training seed, each in the order of rounds."""
+
+    name: str
+    runs: tuple[tuple[CurvePoint, ...], ...]
+
+    def __post_init__(self) -> None:
+        if not self.runs or not all(self.runs):
+            raise ManipError(f"learning curve of {self.name!r} has a training seed without a round, or none at all")
+
+    @property
+    def points(self) -> tuple[CurvePoint, ...]:
+        """All points of all training seeds."""
+        return tuple(point for run in self.runs for point in run)
 
 
 @dataclass(frozen=True)
@@ -190,6 +222,11 @@ def format_seconds(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02d} s"
     return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def format_amount(cost: Cost, amount: float) -> str:
+    """`8,012 labels`, `150 episodes`, `3 min 20 s`."""
+    return format_seconds(amount) if cost == "seconds" else f"{amount:,.0f} {cost}"
 
 
 def format_percent(rate: float) -> str:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import base64
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from typing import Any, Protocol
 
-from manip_il.evaluation.charts import curve_axes, learning_curve, success_bar
+from manip_il.evaluation.charts import success_bar
 from manip_il.evaluation.path_charts import side_view, top_view
 from manip_il.evaluation.report_data import (
-    CurvePoint,
     Film,
-    LearningCurve,
     Paths,
-    PolicyRow,
     Report,
     Strip,
     flatten,
@@ -27,37 +25,62 @@ from manip_il.evaluation.statistics import Proportion
 NOT_MEASURED = '<span class="none" aria-label="not measured">&ndash;</span>'
 
 
-def header(report: Report) -> str:
+class Told(Protocol):
+    """What every report begins and ends with."""
+
+    @property
+    def title(self) -> str:
+        """What it is about."""
+        ...
+
+    @property
+    def verdict(self) -> str:
+        """The first sentence, in plain words with its numbers."""
+        ...
+
+    @property
+    def command(self) -> str:
+        """What made it."""
+        ...
+
+    @property
+    def facts(self) -> Sequence[str]:
+        """Further sentences under the verdict."""
+        ...
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """Nested."""
+        ...
+
+    @property
+    def fingerprint(self) -> Mapping[str, Any]:
+        """Nested."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """What -> [s]."""
+        ...
+
+
+def header(report: Told) -> str:
     """The verdict comes first; then what else can be said in a sentence."""
-    facts = "".join(f"<li>{_prose(fact)}</li>" for fact in report.facts)
+    facts = "".join(f"<li>{prose(fact)}</li>" for fact in report.facts)
     return (
-        f'<header><p class="kicker">{escape(report.title)}</p><h1>{_prose(report.verdict)}</h1>'
+        f'<header><p class="kicker">{escape(report.title)}</p><h1>{prose(report.verdict)}</h1>'
         f"{f'<ul class="facts">{facts}</ul>' if facts else ''}</header>"
     )
 
 
 def results(report: Report) -> str:
     """The table, and under it the same success as bars."""
-    return _section("Results", _table(report), _bars(report.rows), _how_measured(report))
-
-
-def curve(data: LearningCurve) -> str:
-    """The learning curve with its legend, and its numbers for those who cannot see it."""
-    legend = [
-        ("dagger", "DAgger, one point a round", bool(data.dagger)),
-        ("cloning", "behaviour cloning", bool(data.cloning)),
-        ("expert", f"expert, {data.expert and format_percent(data.expert.rate)}", data.expert is not None),
-    ]
-    keys = "".join(f'<li><i class="key {kind}"></i>{escape(words)}</li>' for kind, words, shown in legend if shown)
-    x, y = curve_axes(data)
-    across = "expert labels, logarithmic" if x.log else "expert labels"
-    cut = f" The axis starts at {y.low:.0f}\u00a0%." if y.low > 0 else ""
-    return _section(
-        "What the labels bought",
-        f'<p class="note">Validation success over expert labels used; bars are {_confidence(data)} intervals.{cut}</p>',
-        f'<ul class="legend">{keys}</ul>',
-        f'<div class="plot">{learning_curve(data)}<p class="x-title">{across}</p></div>',
-        _details("The curve in numbers", _curve_table(data)),
+    drawn = [(row.name, success_bar(row), row.success.rate) for row in report.rows]
+    return section(
+        "Results",
+        _table(report),
+        bars(drawn),
+        _how_measured(report),
     )
 
 
@@ -67,17 +90,17 @@ def pictures(report: Report) -> str:
     rest = "".join([*map(_strip, report.strips), *map(_paths, report.paths)])
     if not films and not rest and not report.pictures_note:
         return ""
-    note = f'<p class="note">{_prose(report.pictures_note)}</p>' if report.pictures_note else ""
+    note = f'<p class="note">{prose(report.pictures_note)}</p>' if report.pictures_note else ""
     groups = [f'<div class="{kind}">{part}</div>' for kind, part in (("films", films), ("stacked", rest)) if part]
-    return _section("How it looks", note, *groups)
+    return section("How it looks", note, *groups)
 
 
-def making(report: Report) -> str:
+def making(report: Told) -> str:
     """The command, and folded away: timings, configuration and fingerprint."""
     # Word by word, so that a narrow page breaks lines between options and not inside them.
     words = " ".join(f"<span>{escape(word)}</span>" for word in report.command.split(" "))
     timings = {what: format_seconds(seconds) for what, seconds in report.timings.items()}
-    return _section(
+    return section(
         "How it was made",
         f'<pre class="command"><code>{words}</code></pre>',
         _folded("Time taken", timings),
@@ -113,11 +136,12 @@ def _table(report: Report) -> str:
     )
 
 
-def _bars(rows: Iterable[PolicyRow]) -> str:
+def bars(drawn: Iterable[tuple[str, str, float]]) -> str:
+    """Name, drawn bar and rate, a line each, and the scale below."""
     lines = "".join(
-        f'<div class="bar-line"><span class="bar-name">{escape(row.name)}</span>{success_bar(row)}'
-        f'<span class="bar-rate">{format_percent(row.success.rate)}</span></div>'
-        for row in rows
+        f'<div class="bar-line"><span class="bar-name">{escape(name)}</span>{bar}'
+        f'<span class="bar-rate">{format_percent(rate)}</span></div>'
+        for name, bar, rate in drawn
     )
     scale = "".join(f"<span>{tick} %</span>" for tick in (0, 25, 50, 75, 100))
     below = f'<div class="bar-line scale-line"><span></span><div>{scale}</div><span></span></div>'
@@ -130,20 +154,7 @@ def _how_measured(report: Report) -> str:
     parts = [f"Each policy ran {episodes} episodes. Intervals are Wilson's score intervals."]
     if report.disturbance:
         parts.append(f"Disturbed: {report.disturbance}.")
-    return f'<p class="note">{_prose(" ".join(parts))}</p>'
-
-
-def _curve_table(data: LearningCurve) -> str:
-    rows = [(kind, point) for kind, points in (("DAgger", data.dagger), ("cloning", data.cloning)) for point in points]
-    return _pairs({_point_name(kind, point): str(point.success) for kind, point in rows})
-
-
-def _point_name(kind: str, point: CurvePoint) -> str:
-    return f"{kind}, {point.name + ', ' if point.name else ''}{point.labels:,} labels"
-
-
-def _confidence(data: LearningCurve) -> str:
-    return f"{100 * data.points[0].success.confidence:g} %"
+    return f'<p class="note">{prose(" ".join(parts))}</p>'
 
 
 def _film(film: Film) -> str:
@@ -201,24 +212,28 @@ def _proportion(proportion: Proportion | None) -> str:
     )
 
 
-def _folded(name: str, pairs: Mapping[str, str]) -> str:
-    return _details(name, _pairs(pairs)) if pairs else ""
+def _folded(name: str, named: Mapping[str, str]) -> str:
+    return details(name, pairs(named)) if named else ""
 
 
-def _details(name: str, content: str) -> str:
+def details(name: str, content: str) -> str:
+    """Folded away under a name."""
     return f"<details><summary>{escape(name)}</summary>{content}</details>"
 
 
-def _pairs(pairs: Mapping[str, str]) -> str:
-    rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in pairs.items())
+def pairs(named: Mapping[str, str]) -> str:
+    """Names and values, a line each."""
+    rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in named.items())
     return f'<dl class="pairs">{rows}</dl>'
 
 
-def _section(name: str, *parts: str) -> str:
+def section(name: str, *parts: str) -> str:
+    """A part of the page with its heading."""
     return f"<section><h2>{escape(name)}</h2>{''.join(parts)}</section>"
 
 
-def _prose(sentence: str) -> str:
+def prose(sentence: str) -> str:
+    """A sentence, escaped."""
     # A number keeps its unit, and a comparison its sign, on one line.
     joined = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", sentence)
     return escape(joined, quote=False)

@@ -90,11 +90,22 @@ def split_by_episode(
     return np.flatnonzero(~mask), np.flatnonzero(mask)
 
 
-def read_columns(root: Path) -> dict[str, NDArray[Any]]:
-    """The learning columns of a LeRobot v3.0 dataset's parquet files, whole, in order of `index`.
+def read_columns(*roots: Path) -> dict[str, NDArray[Any]]:
+    """The learning columns of LeRobot v3.0 datasets' parquet files, whole, in order of `index`, which goes on.
 
     Raises `ManipError` where the files are not there.
     """
+    tables: list[dict[str, NDArray[Any]]] = []
+    rows = 0
+    for root in roots:
+        table = _read_root(root)
+        table[INDEX] = table[INDEX] + rows
+        rows += len(table[INDEX])
+        tables.append(table)
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def _read_root(root: Path) -> dict[str, NDArray[Any]]:
     folder = Path(root) / "data"
     if not folder.is_dir():
         raise ManipError(f"no folder {folder}: mlp and cnn read their statistics there; download the dataset first")

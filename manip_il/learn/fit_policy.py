@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +25,20 @@ from manip_il.learn.card import write_card
 from manip_il.learn.checkpoint import PRETRAINED_MODEL, CheckpointMeta, check_same_run, last_checkpoint
 from manip_il.learn.lerobot_checkpoint import Progress, save_lerobot_checkpoint
 from manip_il.learn.metrics import METRICS_FILE, Writer, json_lines, tensorboard, weights_and_biases
-from manip_il.learn.order import ShuffledRows, batches_of
+from manip_il.learn.order import batches_of, order_of
 from manip_il.learn.policy_config import PolicyFitConfig
 from manip_il.learn.prefetch import prefetched
 from manip_il.learn.setup import Samples, build_policy, build_processors, load_samples, set_features
 from manip_il.learn.sources import Batch, pictures_to_float
 from manip_il.learn.threads import threads
 
-I64 = NDArray[np.int64]
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
 TENSORBOARD_FOLDER = "tensorboard"
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
 def fit_policy(
-    root: Path,
+    root: Path | Sequence[Path],
     config: PolicyFitConfig,
     output_dir: Path,
     *,
@@ -45,10 +46,12 @@ def fit_policy(
     on_step: Callable[[dict[str, Any]], None] | None = None,
     on_frames: Callable[[int], None] | None = None,
     resume: bool = False,
+    weights: F64 | None = None,
 ) -> Path:
-    """Clone the labels of the dataset in `root`; return `output_dir/checkpoints/last/pretrained_model`.
+    """Clone the labels of the dataset in `root`, or of several; return `output_dir/checkpoints/last/pretrained_model`.
 
-    meta: what the policy is trained for. on_step: called after every step, with the metrics where there are some,
+    meta: what the policy is trained for. weights: how often each frame is drawn, relative to the others, (N,); by
+    default each once an epoch. on_step: called after every step, with the metrics where there are some,
     else with {}; an exception from it ends the fit, `KeyboardInterrupt` after a checkpoint. on_frames: sees how many
     frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
     resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
@@ -58,7 +61,8 @@ def fit_policy(
     refuses as `ManipError`.
     """
     with threads(config.threads):
-        return PolicyTrainer(root, config, output_dir, meta, resume=resume, on_frames=on_frames).fit(on_step)
+        trainer = PolicyTrainer(root, config, output_dir, meta, resume=resume, on_frames=on_frames, weights=weights)
+        return trainer.fit(on_step)
 
 
 class PolicyTrainer:
@@ -66,13 +70,14 @@ class PolicyTrainer:
 
     def __init__(
         self,
-        root: Path,
+        root: Path | Sequence[Path],
         config: PolicyFitConfig,
         output_dir: Path,
         meta: CheckpointMeta,
         *,
         resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
+        weights: F64 | None = None,
     ):
         self.config, self.output_dir, self.meta = config, output_dir, meta
         self.accelerator = _accelerator(config)
@@ -80,18 +85,21 @@ class PolicyTrainer:
         checkpoint = last_checkpoint(output_dir)
         if checkpoint is not None and not resume:
             raise FolderExistsError(output_dir)
-        self.dataset = read_metadata(root)
+        roots = [root] if isinstance(root, Path) else list(root)
+        self.dataset = read_metadata(*roots)
         set_features(config.policy, self.dataset, config.observation)
         self.options = config.what_changes_the_weights()
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
-            self.samples: Samples = load_samples(root, config, self.dataset, on_frames)
+            self.samples: Samples = load_samples(roots, config, self.dataset, on_frames)
+        self.digest = _digest(self.samples.digest, weights)
         if checkpoint is not None:
-            check_same_run(checkpoint, self.samples.digest, self.options)
-        self.pipeline = config.lerobot(self.dataset.repo_id, str(root), output_dir)
+            check_same_run(checkpoint, self.digest, self.options)
+        self.pipeline = config.lerobot(self.dataset.repo_id, str(roots[-1]), output_dir)
         self.step = 0
         self._build(checkpoint)
         world = self.accelerator.num_processes
-        self._order = ShuffledRows(len(self.samples.train), config.batch_size * world, config.seed)
+        drawn = weights[self.samples.train] if weights is not None else None
+        self._order = order_of(len(self.samples.train), drawn, config.batch_size * world, config.seed)
 
     def _build(self, checkpoint: Path | None) -> None:
         config = self.config
@@ -168,7 +176,7 @@ class PolicyTrainer:
     def save(self, record: Mapping[str, Any]) -> None:
         """Write a checkpoint of this step and make it the last one. record: metrics for the model card."""
         if self.accelerator.is_main_process:
-            progress = Progress(self.step, self.config.steps, self.samples.digest, self.options)
+            progress = Progress(self.step, self.config.steps, self.digest, self.options)
             parts = (self.accelerator.unwrap_model(self.policy), self.preprocessor, self.postprocessor)
             state = (self.optimizer, self.scheduler)
             with save_lerobot_checkpoint(self.output_dir, progress, parts, state, self.pipeline, self.meta) as folder:
@@ -232,6 +240,10 @@ class PolicyTrainer:
     def _clip(self) -> float:
         norm = self.config.resolved_optimizer().grad_clip_norm
         return norm if norm > 0 else math.inf
+
+
+def _digest(samples: str, weights: F64 | None) -> str:
+    return samples if weights is None else hashlib.sha256(samples.encode() + weights.tobytes()).hexdigest()
 
 
 class _Log:

@@ -36,6 +36,25 @@ class ShuffledRows:
         return self._order
 
 
+class WeightedRows:
+    """Row numbers in batches, each drawn with a probability in proportion to its weight, (N,), with replacement."""
+
+    def __init__(self, weights: NDArray[np.float64], batch_size: int, seed: int) -> None:
+        self._edges = np.cumsum(weights) / weights.sum()
+        self.batch_size, self.seed = batch_size, seed
+
+    def batch(self, step: int) -> torch.Tensor:
+        """Row numbers of the batch of `step`, (batch_size,)."""
+        draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
+        rows = np.searchsorted(self._edges, draws, side="right")
+        return torch.from_numpy(np.minimum(rows, len(self._edges) - 1))
+
+
+def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> ShuffledRows | WeightedRows:
+    """By weight where there are weights, else every row once an epoch."""
+    return ShuffledRows(rows, batch_size, seed) if weights is None else WeightedRows(weights, batch_size, seed)
+
+
 def batches_of(samples: NDArray[np.int64], size: int) -> list[NDArray[np.int64]]:
     """Samples in their order, in pieces of at most `size`."""
     return [samples[start : start + size] for start in range(0, len(samples), size)]

@@ -22,6 +22,7 @@ from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, 
 from manip_il.learn.threads import threads
 
 Batch = dict[str, torch.Tensor]
+LIKELIHOODS = ("mixture", "categorical")  # losses whose spread depends on the state
 
 
 class Chooser(Protocol):
@@ -115,6 +116,31 @@ class LearnedPolicy:
         """Forget the past of episodes that begin."""
         self._chooser.forget(episodes)
 
+    def require_likelihood(self) -> None:
+        """Raise `UsageError` unless this is a policy that tells how likely it finds an action, state by state."""
+        if not isinstance(self._chooser, _Perceptron) or self._chooser.loss not in LIKELIHOODS:
+            raise UsageError(
+                "ask=likelihood needs a policy that knows how sure it is: "
+                f"--policy.type=mlp with --policy.loss={' or '.join(LIKELIHOODS)}"
+            )
+
+    @torch.inference_mode()
+    def log_likelihood(
+        self,
+        states: NDArray[np.float32],
+        environment_states: NDArray[np.float32],
+        actions: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """How likely the policy finds an action (B, n) in a state: nats a dimension, in normalised units, (B,).
+
+        Raises `UsageError` as `require_likelihood` does.
+        """
+        self.require_likelihood()
+        assert isinstance(self._chooser, _Perceptron)
+        batch = self._numbers(states, environment_states)
+        with threads(1):
+            return self._chooser.log_likelihood(batch, torch.from_numpy(actions)).numpy().astype(np.float64)
+
     def _numbers(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> Batch:
         batch = {}
         for key, values in ((STATE, states), (ENVIRONMENT_STATE, environment_states)):
@@ -154,7 +180,7 @@ class _Perceptron:
     """The mlp: no memory, and one call for all rows, which do not feel each other."""
 
     def __init__(self, path: Path, config: dict[str, Any], interface: Interface, device: str):
-        self._device = device
+        self._device, self.loss = device, config.get("loss", "")
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in interface.numbers]
         try:
             shape = Shape(**{field.name: config[field.name] for field in fields(Shape)})
@@ -169,6 +195,14 @@ class _Perceptron:
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """One action a row. The mlp's processors are the identity (see MLPConfig), so there is nothing else to do."""
         return self._network.act(torch.cat([batch[key] for key in self._keys], dim=1).to(self._device))
+
+    def log_likelihood(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
+        """Of absolute actions (B, n), a dimension, (B,)."""
+        inputs = torch.cat([batch[key] for key in self._keys], dim=1)
+        targets = actions.to(torch.float32)
+        targets[:, :-1] -= inputs[:, : self._network.n - 1]
+        x, y = self._network.encode(inputs.to(self._device)), self._network.encode_targets(targets.to(self._device))
+        return -self._network.row_losses(x, y).cpu() / self._network.n
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Do nothing: there is nothing to forget."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,14 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 
 from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.lerobot_io import read_tables
 from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.schema import ACTION, IMAGES, LABEL_VALID
 from manip_il.errors import ManipError, NotFiniteError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, split_by_episode
 from manip_il.learn.observation import policy_features
 from manip_il.learn.policy_config import PolicyFitConfig
-from manip_il.learn.sources import TASK_INDEX, LibrarySource, MemorySource, Source
+from manip_il.learn.sources import TASK_INDEX, JoinedFrames, LibrarySource, MemorySource, Source
 from manip_il.learn.windows import Windows, windows_of
 
 _LOG = logging.getLogger(__name__)
@@ -112,9 +112,9 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 
 
 def load_samples(
-    root: Path, config: PolicyFitConfig, meta: Any, on_frames: Callable[[int], None] | None = None
+    roots: Sequence[Path], config: PolicyFitConfig, meta: Any, on_frames: Callable[[int], None] | None = None
 ) -> Samples:
-    """The samples of a dataset for one policy, in memory where they fit.
+    """The samples of datasets, taken as one, for one policy; in memory where they fit.
 
     on_frames: sees how many frames more have been decoded. Raises `NotFiniteError`, and what `windows_of` and
     `Windows.usable` raise.
@@ -124,36 +124,50 @@ def load_samples(
     cameras = tuple(key for key in features if key in meta.camera_keys)
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    table = read_table(root, [*numbers, *_ALWAYS, *label])
-    _require_finite(root, table, numbers)
+    table = read_tables(roots, [*numbers, *_ALWAYS, *label])
+    _require_finite(roots[0], table, numbers)
     episodes = table[EPISODE_INDEX].astype(np.int64).reshape(-1)
     valid = table[LABEL_VALID].reshape(-1) != 0 if label else np.ones(len(episodes), dtype=bool)
     windows = windows_of(policy, features, episodes)
     usable = windows.usable(valid, getattr(policy, "drop_n_last_frames", 0))
     train, held_out = split_by_episode(episodes[usable], config.eval_split, config.seed)
     return Samples(
-        source=_source(root, config, meta, windows, {key: table[key] for key in (*numbers, *_ALWAYS)}, on_frames),
+        source=_source(roots, config, meta, windows, {key: table[key] for key in (*numbers, *_ALWAYS)}, on_frames),
         train=usable[train],
         held_out=_evenly(usable[held_out], _MAX_HELD_OUT),
         cameras=cameras,
-        digest=_digest(root, table),
+        digest=_digest(roots, table),
     )
 
 
-def _source(root: Path, config: PolicyFitConfig, meta: Any, windows: Windows, table: Any, on_frames: Any) -> Source:
+def _source(
+    roots: Sequence[Path], config: PolicyFitConfig, meta: Any, windows: Windows, table: Any, on_frames: Any
+) -> Source:
     cameras = [key for key in config.policy.input_features or {} if key in meta.camera_keys]
-    frames: dict[str, NDArray[np.uint8]] | None = {}
     limit = int(config.image_cache_gb * 1e9)
-    if cameras:
-        frames = open_frame_cache(root, cameras, max_bytes=limit, on_frames=on_frames)
+    frames = _frames(roots, cameras, limit, on_frames)
     if frames is None:
+        names = ", ".join(map(str, roots))
         _LOG.warning(
-            "the pictures of %s take more than %g GB: LeRobot's loader decodes them as it goes", root, limit / 1e9
+            "the pictures of %s take more than %g GB: LeRobot's loader decodes them as it goes", names, limit / 1e9
         )
         ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
-        return LibrarySource(lerobot_windows(root, meta.repo_id, ahead or None), config.num_workers)
+        read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
+        return LibrarySource(torch.utils.data.ConcatDataset(read), config.num_workers)
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     return MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
+
+
+def _frames(roots: Sequence[Path], cameras: list[str], limit: int, on_frames: Any) -> dict[str, JoinedFrames] | None:
+    """Camera -> the pictures of all datasets; None where they would take more than `limit` bytes."""
+    found: list[Mapping[str, Any]] = []
+    for root in roots if cameras else []:
+        frames = open_frame_cache(root, cameras, max_bytes=limit, on_frames=on_frames)
+        if frames is None:
+            return None
+        limit -= sum(one.nbytes for one in frames.values())
+        found.append(frames)
+    return {camera: JoinedFrames([frames[camera] for frames in found]) for camera in cameras}
 
 
 def _require_finite(root: Path, table: Mapping[str, NDArray[Any]], keys: list[str]) -> None:
@@ -169,9 +183,11 @@ def _evenly(samples: I64, most: int) -> I64:
     return samples if len(samples) <= most else samples[np.linspace(0, len(samples) - 1, most).astype(np.int64)]
 
 
-def _digest(root: Path, table: Mapping[str, NDArray[Any]]) -> str:
-    """Of the columns, and of the dataset's statistics, which stand for the pictures."""
-    digest = hashlib.sha256((root / "meta" / "stats.json").read_bytes())
+def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
+    """Of the columns, and of the datasets' statistics, which stand for the pictures."""
+    digest = hashlib.sha256()
+    for root in roots:
+        digest.update((root / "meta" / "stats.json").read_bytes())
     for key, column in table.items():
         digest.update(key.encode())
         digest.update(np.ascontiguousarray(column).tobytes())

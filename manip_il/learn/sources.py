@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, override
 
@@ -26,6 +26,25 @@ class Source(Protocol):
         ...
 
 
+class JoinedFrames:
+    """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
+
+    def __init__(self, pieces: Sequence[NDArray[np.uint8]]):
+        self._pieces = pieces
+        self._ends = np.cumsum([len(piece) for piece in pieces])
+
+    def __getitem__(self, rows: I64) -> NDArray[np.uint8]:
+        if len(self._pieces) == 1:
+            return self._pieces[0][rows]
+        flat = rows.reshape(-1)
+        read = np.empty((len(flat), *self._pieces[0].shape[1:]), np.uint8)
+        which = np.searchsorted(self._ends, flat, side="right")
+        for number in np.unique(which):
+            start = self._ends[number - 1] if number else 0
+            read[which == number] = self._pieces[number][flat[which == number] - start]
+        return read.reshape(*rows.shape, *read.shape[1:])
+
+
 @dataclass(frozen=True)
 class MemorySource:
     """A batch is one gather a column.
@@ -36,7 +55,7 @@ class MemorySource:
 
     windows: Windows
     columns: Mapping[str, torch.Tensor]
-    frames: Mapping[str, NDArray[np.uint8]]
+    frames: Mapping[str, JoinedFrames]
     tasks: tuple[str, ...]
 
     def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
@@ -96,5 +115,5 @@ def pictures_to_float(batch: Batch, cameras: Iterable[str]) -> Batch:
     return batch | {key: to_float(batch[key]) for key in cameras if batch[key].dtype == torch.uint8}
 
 
-def _read(frames: NDArray[np.uint8], rows: I64) -> torch.Tensor:
+def _read(frames: JoinedFrames, rows: I64) -> torch.Tensor:
     return torch.from_numpy(frames[rows])

@@ -30,12 +30,12 @@ from manip_il.learn.checkpoint import (
     read_step,
     save_checkpoint,
 )
-from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode
+from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
 from manip_il.learn.metrics import METRICS_FILE, json_lines
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.normalise import fit_statistics
-from manip_il.learn.order import ShuffledRows
+from manip_il.learn.order import order_of
 from manip_il.learn.threads import threads
 from manip_il.learn.warm_start import warm_start
 
@@ -93,11 +93,13 @@ def fit(
     fingerprint: Mapping[str, Any] | None = None,
     on_log: Callable[[dict[str, Any]], None] | None = None,
     resume: bool = False,
+    weights: NDArray[np.float64] | None = None,
 ) -> Path:
     """Clone the labels of `table` and return `output_dir/checkpoints/last/pretrained_model`.
 
     table: the schema's `observation.state`, `observation.environment_state`, `action` and, where
-    there, `label_valid`, `episode_index`, `frame_index`. The same table, config and number of
+    there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
+    to the others, (N,); by default each once an epoch. The same table, config and number of
     threads give the same bits, resumed or not. Metrics go to `on_log` and `metrics.jsonl`.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for
@@ -110,14 +112,15 @@ def fit(
         raise FolderExistsError(output_dir)
     check_table(table, spec)
     rows = learning_rows(table)
+    drawn = weights[valid_frames(table)] if weights is not None else None
     options = draccus.encode(config)
     meta = CheckpointMeta.of(spec, fingerprint, options)
-    digest = _digest(rows)
+    digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):
         if checkpoint is not None:
             check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
-        trainer = Trainer(rows, config, spec, checkpoint)
+        trainer = Trainer(rows, config, spec, checkpoint, drawn)
         output_dir.mkdir(parents=True, exist_ok=True)
         with json_lines(output_dir / METRICS_FILE, trainer.step) as write:
             for record in trainer.run():
@@ -133,7 +136,14 @@ def fit(
 class Trainer:
     """Policy, optimiser and encoded data of one run; `run()` yields once a step."""
 
-    def __init__(self, rows: Rows, config: TrainConfig, spec: RobotTaskSpec, checkpoint: Path | None = None) -> None:
+    def __init__(
+        self,
+        rows: Rows,
+        config: TrainConfig,
+        spec: RobotTaskSpec,
+        checkpoint: Path | None = None,
+        weights: NDArray[np.float64] | None = None,
+    ) -> None:
         self.config = config
         self.step = 0
         train, held_out = split_by_episode(rows.episodes, config.val_fraction, config.seed)
@@ -148,6 +158,8 @@ class Trainer:
         elif config.init_from is not None:
             warm_start(self.policy.model, config.init_from)
         self._encode(rows, train, held_out)
+        drawn = weights[train] if weights is not None else None
+        self.order = order_of(len(train), drawn, config.batch_size, config.seed)
 
     def _restore(self, checkpoint: Path) -> None:
         self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
@@ -162,7 +174,6 @@ class Trainer:
         self.width = inputs.shape[1]
         self.data, self.held_out = encoded[train], encoded[held_out]
         self.held_out_inputs, self.held_out_targets = inputs[held_out], targets[held_out]
-        self.order = ShuffledRows(len(self.data), self.config.batch_size, self.config.seed)
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
@@ -228,8 +239,8 @@ def _new_policy(config: TrainConfig, spec: RobotTaskSpec) -> MLPPolicy:
         return MLPPolicy(policy_config)
 
 
-def _digest(rows: Rows) -> str:
+def _digest(rows: Rows, weights: NDArray[np.float64] | None) -> str:
     digest = hashlib.sha256()
-    for column in (rows.inputs, rows.targets, rows.episodes):
+    for column in (rows.inputs, rows.targets, rows.episodes, *([weights] if weights is not None else [])):
         digest.update(np.ascontiguousarray(column).tobytes())
     return digest.hexdigest()

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manip_il.cli.options import CONFIG_HEADER, dump_yaml, from_yaml, options_of, parse, to_plain
+from manip_il.cli.options import CONFIG_HEADER, Open, dump_yaml, from_layers, from_yaml, options_of, parse, to_plain
 from manip_il.cli.values import expected, metavar
 from manip_il.errors import UsageError
 
@@ -235,3 +235,29 @@ def test_types_are_named_for_people():
     assert metavar(list[float]) == "FLOAT,..."
     assert metavar(float | Literal["linear"]) == "FLOAT|linear"
     assert expected(int | None) == "a whole number or null"
+
+
+@dataclass
+class Fit:
+    policy: Open = field(default_factory=dict)
+    data: Dataset = field(default_factory=Dataset)
+    steps: int = 10
+
+
+def test_of_layers_the_later_one_counts():
+    common = {"policy": {"width": 8, "depth": 1}, "data": {"num_episodes": 7}, "steps": 20}
+    fit = from_layers(Fit, [("common", common), ("arm", {"policy.width": 16, "data.repo_id": "a/b", "steps": 5})])
+    assert fit == Fit({"width": 16, "depth": 1}, Dataset("a/b", num_episodes=7), 5)
+    assert from_layers(Fit, []) == Fit()
+
+
+def test_a_layers_error_says_which_layer():
+    with pytest.raises(UsageError, match=r"unknown key in x.yaml: arms.a: 'stepps' \(did you mean 'steps'\?\)"):
+        from_layers(Fit, [("x.yaml: common", {"steps": 3}), ("x.yaml: arms.a", {"stepps": 3})])
+    with pytest.raises(UsageError, match=r"x.yaml: arms.a: data.num_episodes: expected a whole number, got 'many'"):
+        from_layers(Fit, [("x.yaml: arms.a", {"data": {"num_episodes": "many"}})])
+
+
+def test_an_open_options_dotted_name_may_stand_in_yaml(tmp_path):
+    (tmp_path / "c.yaml").write_text("policy.width: 16\npolicy: {depth: 2}\n")
+    assert from_yaml(tmp_path / "c.yaml", Fit).policy == {"width": 16, "depth": 2}

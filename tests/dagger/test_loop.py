@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,17 @@ import numpy as np
 import pytest
 
 from manip_il.dagger import loop
-from manip_il.dagger.config import DaggerConfig, FitConfig
-from manip_il.dagger.loop import RoundResult, Watch, aggregate, best_round, round_folder, run_dagger
-from manip_il.data.lerobot_io import dataset_info, read_table
+from manip_il.dagger.config import DaggerConfig
+from manip_il.dagger.fitting import LEARNING_COLUMNS
+from manip_il.dagger.loop import RoundResult, Watch, best_round, datasets, round_folder, run_dagger
+from manip_il.data.lerobot_io import dataset_info, read_table, read_tables
 from manip_il.engine.engine import Engine
 from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig
 
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
@@ -27,7 +31,7 @@ CONFIG = DaggerConfig(
     rounds=1,
     episodes_per_round=2,
     beta="constant:0.5",
-    fit=FitConfig(steps=20, batch_size=32, width=16),
+    fit=FitConfig({"width": 16}, steps=20, batch_size=32),
     validation_episodes=2,
 )
 
@@ -60,7 +64,7 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
     assert [result.beta for result in results] == [1.0, 0.5]
     assert [result.episodes for result in results] == [4, 6]
     for result in results:
-        table = aggregate(folder, result.round)
+        table = read_tables(datasets(folder, result.round), LEARNING_COLUMNS)
         assert result.labels == table["label_valid"].sum()
         record = result.to_json()
         assert record["validation_success"] == result.validation.success.rate
@@ -99,13 +103,13 @@ def test_of_equally_good_rounds_the_later_is_best(run):
 
 def test_aggregating_is_putting_one_round_behind_the_other(run):
     folder, _, _ = run
-    parts = [read_table(round_folder(folder, i) / "dataset", loop.LEARNING_COLUMNS) for i in range(2)]
-    table = aggregate(folder, 1)
+    parts = [read_table(round_folder(folder, i) / "dataset", LEARNING_COLUMNS) for i in range(2)]
+    table = read_tables(datasets(folder, 1), LEARNING_COLUMNS)
     for key in ("observation.state", "observation.environment_state", "action", "label_valid"):
         np.testing.assert_array_equal(table[key], np.concatenate([part[key] for part in parts]))
     lengths = [count for part in parts for count in np.bincount(part["episode_index"])]
     np.testing.assert_array_equal(table["episode_index"], np.repeat(np.arange(6), lengths))
-    for key, column in aggregate(folder, 0).items():
+    for key, column in read_tables(datasets(folder, 0), LEARNING_COLUMNS).items():
         np.testing.assert_array_equal(column, parts[0][key])
 
 
@@ -114,7 +118,7 @@ def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
     table = read_table(folder / "dataset", ("action", "executed_action", "actor", "round", "episode_index"))
     round_, actor = table["round"].ravel(), table["actor"].ravel()
     assert len(np.unique(table["episode_index"])) == 6
-    np.testing.assert_array_equal(table["action"], aggregate(folder, 1)["action"])
+    np.testing.assert_array_equal(table["action"], read_tables(datasets(folder, 1), LEARNING_COLUMNS)["action"])
     assert set(actor[round_ == 0]) == {Actor.EXPERT}
     np.testing.assert_array_equal(table["action"][round_ == 0], table["executed_action"][round_ == 0])
     assert {Actor.LEARNER} < set(actor[round_ == 1])
@@ -167,13 +171,100 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
 
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypatch):
     begun: list[Path | None] = []
-    plain = loop.train_config
+    plain = loop.fit_round
 
-    def watch(config: DaggerConfig, init_from: Path | None = None):
+    def watch(config: DaggerConfig, roots, folder: Path, init_from: Path | None = None, *rest):
         begun.append(init_from)
-        return plain(config, init_from)
+        return plain(config, roots, folder, init_from, *rest)
 
-    monkeypatch.setattr(loop, "train_config", watch)
+    monkeypatch.setattr(loop, "fit_round", watch)
     results = list(run_dagger(replace(CONFIG, refit="warm"), tmp_path, Engine()))
     assert begun == [None, results[0].policy]
     assert files(results[1].policy) != files(run[1][1].policy)
+
+
+def labels(folder: Path, rounds: int) -> int:
+    return int(read_tables(datasets(folder, rounds), ("label_valid",))["label_valid"].sum())
+
+
+def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
+    config = replace(CONFIG, rounds=5, beta="constant:0", label_budget=180)
+    results = list(run_dagger(config, tmp_path, Engine()))
+    assert [result.labels for result in results][-1] == 180 == labels(tmp_path, results[-1].round)
+    assert results[-1].round < 5
+    assert dataset_info(tmp_path / "dataset").frames >= 180
+
+
+@pytest.mark.parametrize("method", ["cloning", "dart"])
+def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path):
+    results = list(run_dagger(replace(CONFIG, method=method, beta="constant:0"), tmp_path, Engine()))
+    table = read_tables(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
+    later = table["round"].ravel() == 1
+    drove = {"cloning": Actor.EXPERT, "dart": Actor.NOISY_EXPERT}[method]
+    assert (table["actor"].ravel()[later] == drove).all()
+    assert np.array_equal(table["executed_action"], table["action"]) == (method == "cloning")
+    assert set(table["seed"].ravel()[later]) <= set(stream_seeds("round/1", 10))
+    held_out = tmp_path / "held_out/dataset"
+    assert held_out.is_dir() == (method == "dart")
+    extra = dataset_info(held_out).frames if method == "dart" else 0
+    assert results[1].queries == results[1].labels + extra
+
+
+def test_a_round_in_which_nobody_asks_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
+    config = replace(CONFIG, beta="constant:0", ask="safety:1000", rounds=2)
+    results = list(run_dagger(config, tmp_path, Engine()))
+    assert len({result.labels for result in results}) == 1
+    assert not (round_folder(tmp_path, 1) / "dataset").exists()
+    assert "in none of them was the expert asked" in caplog.text
+    assert results[2].queries > results[0].queries  # it was asked in every state, to know
+    assert dataset_info(tmp_path / "dataset").episodes == 4
+
+
+def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
+    config = replace(CONFIG, beta="constant:0", ask="ensemble:0.05", ensemble=2)
+    results = list(run_dagger(config, tmp_path, Engine()))
+    first, second = (round_folder(tmp_path, 0) / name for name in ("policy", "policy_1"))
+    assert files(first).keys() == files(second).keys()
+    weights = "checkpoints/000020/pretrained_model/model.safetensors"
+    assert (first / weights).read_bytes() != (second / weights).read_bytes()
+    assert results[1].labels > results[0].labels
+
+
+ACT = {
+    "type": "act",
+    "device": "cpu",
+    "chunk_size": 4,
+    "n_action_steps": 2,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 16,
+    "n_encoder_layers": 1,
+    "n_vae_encoder_layers": 1,
+}
+
+
+@pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])
+def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(label, length, tmp_path):
+    config = replace(CONFIG, beta="constant:0", fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm")
+    results = list(run_dagger(config, tmp_path, Engine()))
+    assert results[1].labels > results[0].labels
+    assert json.loads((results[1].policy / "config.json").read_text())["type"] == "act"
+    table = read_tables(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
+    later = table["round"].ravel() == 1
+    by_learner = table["actor"].ravel()[later] == Actor.LEARNER
+    assert by_learner.all() if label == "per_state" else not by_learner.any()
+    if length is not None:
+        assert set(np.unique(table["episode_index"].ravel()[later], return_counts=True)[1]) == {length}
+
+
+@pytest.mark.gl
+def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
+    fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
+    config = replace(CONFIG, beta="constant:0", demonstrations=2, env=EnvConfig("panda", "reach", horizon=10), fit=fit)
+    config = replace(config, cameras=CameraConfig(("front",), 64, 64), validation_episodes=1)
+    results = list(run_dagger(config, tmp_path, Engine()))
+    assert results[1].labels > results[0].labels
+    sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
+    assert set(sees) == {"observation.state", "observation.images.front"}
+    merged = dataset_info(tmp_path / "dataset")
+    assert merged.episodes == sum(dataset_info(root).episodes for root in datasets(tmp_path, 1))

@@ -217,3 +217,28 @@ def test_a_tree_is_flattened_to_the_command_lines_names():
 )
 def test_durations_read_well(seconds: float, words: str):
     assert format_seconds(seconds) == words
+
+
+def test_a_curve_that_knows_its_costs_is_drawn_over_each_of_them():
+    points = tuple(
+        CurvePoint(100 * i, Proportion(10 * i, 40), f"round {i}", episodes=5 * i, seconds=400.0 * i) for i in (1, 2, 3)
+    )
+    page = Page(render_report(replace(REPORT, curve=LearningCurve(points, target=0.6))))
+    assert page.open == []
+    assert sum(attributes.get("class") == "curve" for _, attributes in page.tags) == 3
+    assert sum(attributes.get("class") == "target-level" for _, attributes in page.tags) == 3
+    for words in (
+        "expert labels",
+        "wall-clock [min]",
+        "target, 60.0 %",
+        "round 2, 200 labels, 10 episodes, 13 min 20 s",
+    ):
+        assert words in page.text
+    labels_only = Page(render_report(REPORT))
+    assert sum(attributes.get("class") == "curve" for _, attributes in labels_only.tags) == 1
+    assert "What the labels bought" in labels_only.text
+
+
+def test_a_cost_below_nothing_is_refused():
+    with pytest.raises(ManipError, match=r"-1.0 seconds"):
+        CurvePoint(1, Proportion(1, 2), seconds=-1.0)

@@ -164,7 +164,7 @@ def test_held_out_episodes_are_never_learnt_from(demos) -> None:
     one = config(eval_split=0.4)
     meta = read_metadata(demos)
     set_features(one.policy, meta, "state")
-    samples = load_samples(demos, one, meta)
+    samples = load_samples([demos], one, meta)
     episodes = read_table(demos, ["episode_index"])["episode_index"]
     assert len(np.unique(episodes[samples.held_out])) == 2
     assert not set(episodes[samples.held_out]) & set(episodes[samples.train])
@@ -188,7 +188,7 @@ def _same_batches(root: Path, settings, observation: str) -> None:
     one = config(settings)
     meta = read_metadata(root)
     set_features(one.policy, meta, observation)
-    source = load_samples(root, one, meta).source
+    source = load_samples([root], one, meta).source
     assert isinstance(source, MemorySource)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in source.windows.deltas.items()}
     library = LibrarySource(lerobot_windows(root, meta.repo_id, ahead), workers=0)

@@ -15,8 +15,9 @@ from manip_il.learn.columns import learning_rows, split_by_episode
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.normalise import fit_statistics, scale_targets
+from manip_il.learn.order import ShuffledRows
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import METRICS_FILE, ShuffledRows, TrainConfig, fit
+from manip_il.learn.train import METRICS_FILE, TrainConfig, fit
 
 
 def tiny(**changes) -> TrainConfig:

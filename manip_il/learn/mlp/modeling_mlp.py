@@ -21,7 +21,7 @@ class MLPPolicy(PreTrainedPolicy):
     Batches hold `observation.state` (B, n), `observation.environment_state` (B, k) and, to learn,
     `action` (B, n), all raw ([rad], [m]).
 
-    dataset_meta: LeRobot's, given by `make_policy` for training; the statistics are then those of
+    dataset_meta: LeRobot's, given by `make_policy` for training, or ours of several; the statistics are then those of
     its columns, and frames without a valid label are left out of the loss.
     """
 
@@ -35,7 +35,8 @@ class MLPPolicy(PreTrainedPolicy):
         self._build(config)
         self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
-            self._learn_columns(read_columns(dataset_meta.root), config.loss)
+            roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
+            self._learn_columns(read_columns(*roots), config.loss)
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:

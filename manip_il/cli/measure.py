@@ -1,0 +1,118 @@
+"""Policies on the same test episodes, each measured once: what is done is known by what the policy is."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from manip_il.data.fingerprint import canonical_json
+from manip_il.errors import ManipError, MismatchError
+from manip_il.evaluation.comparison import Measured
+from manip_il.evaluation.results import EvalResult, EvalSettings
+
+if TYPE_CHECKING:
+    from manip_il.cli.sides import Source
+    from manip_il.cli.stages import Stages
+    from manip_il.engine.engine import Engine
+    from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.rounds import Rule
+    from manip_il.sim.env import EnvConfig
+
+FOLDER = "evaluations"
+TEST_EPISODES = 500
+TOLD_TO_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
+
+
+@dataclass(frozen=True)
+class Trial:
+    """In which environment, on which seeds and under which disturbance policies are measured."""
+
+    env: EnvConfig
+    seeds: range
+    disturbance: Literal["none", "standard"] = "none"
+
+    def job(self, policy: Path) -> RolloutJob:
+        """The rollouts of one policy."""
+        from manip_il.engine.jobs import RolloutJob
+        from manip_il.sim.disturb import NONE, STANDARD
+
+        disturbance = STANDARD if self.disturbance == "standard" else NONE
+        return RolloutJob(self.env, "policy", policy=policy, labels="last", disturbance=disturbance)
+
+    def file(self, folder: Path, policy: Path) -> Path:
+        """Where the evaluation of `policy` lies: named after its files, the environment and the episodes.
+
+        So another policy of the same name is another file, and what was measured before stays true.
+        """
+        from manip_il.engine.describe import env_fingerprint
+
+        digest = hashlib.sha256()
+        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), self.disturbance)
+        digest.update(canonical_json(made_of).encode())
+        for path in sorted(policy.iterdir()):
+            if path.is_file() and path.name not in TOLD_TO_PEOPLE:
+                digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+        return folder / FOLDER / f"{digest.hexdigest()[:16]}.json"
+
+    def check_result(self, name: str, result: EvalResult) -> None:
+        """Raise `MismatchError` or `ManipError` unless an evaluation from elsewhere is this test's."""
+        from manip_il.evaluation.runner import describe_disturbance
+
+        disturbance = describe_disturbance(self.job(Path()).disturbance)
+        settings = EvalSettings(self.env.horizon, self.env.tolerance, disturbance)
+        wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
+        for what, value in wanted.items():
+            if getattr(result, what) != value:
+                raise MismatchError(what, name, getattr(result, what), "this comparison", value)
+        theirs = {episode.seed for episode in result.episodes}
+        if theirs != set(self.seeds):
+            raise ManipError(
+                f"test episodes differ: {name} has {len(theirs)}, this comparison {len(self.seeds)}, of which "
+                f"{len(theirs & set(self.seeds))} are the same; give its --seed and --eval.n_episodes here"
+            )
+
+
+def check_policies(trial: Trial, policies: dict[str, Path], folder: Path, engine: str) -> None:
+    """Raise, before any episode runs, where one of the policies (name -> folder) cannot be measured by `trial`."""
+    from manip_il.cli.evaluate import check_policy
+    from manip_il.learn.checkpoint import read_meta
+
+    for name, policy in policies.items():
+        if not trial.file(folder, policy).is_file():
+            meta = read_meta(policy)
+            if meta is not None and meta.task != trial.env.task:
+                raise MismatchError("task", name, meta.task, "the comparison", trial.env.task)
+            check_policy(policy, meta, trial.env, draw=engine == "local")
+
+
+def measure(
+    trial: Trial, policy: Path, name: str, folder: Path, engine: Engine, stages: Stages
+) -> tuple[EvalResult, Path]:
+    """The evaluation of one policy and its file: read where it is there, else made."""
+    from manip_il.evaluation.runner import evaluate
+
+    file = trial.file(folder, policy)
+    if not file.is_file():
+        stages.start(f"test {name}", len(trial.seeds))
+        result = evaluate(engine, trial.job(policy), trial.seeds, name, stages.episode)
+        stages.close()
+        if len(result.episodes) < len(trial.seeds):
+            raise ManipError(f"{name} has {len(result.episodes)} of {len(trial.seeds)} test episodes, as workers died")
+        result.write(file)
+    return replace(EvalResult.read(file), policy=name), file
+
+
+def measured(
+    source: Source, rule: Rule, limit: float | None, trial: Trial, folder: Path, engine: Engine, stages: Stages
+) -> Measured:
+    """The policy that `rule` takes of `source`, with its evaluation."""
+    policy, chosen = source.chosen(rule, limit)
+    result, file = measure(trial, policy, source.name, folder, engine, stages)
+    return Measured(source.name, result, file, source.training_seed, policy, chosen, source.history)
+
+
+def rule_json(rule: Rule, limit: float | None) -> dict[str, Any]:
+    """The rule as `compare.json` and `study.json` hold it."""
+    return {"checkpoint": rule.checkpoint, "at": str(rule), "limit": limit}

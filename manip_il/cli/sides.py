@@ -1,0 +1,213 @@
+"""What a comparison is given: an evaluation, a policy, a DAgger run, or a folder of one of these a training seed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from manip_il.cli.folders import read_jsonl
+from manip_il.cli.groups import CONFIG_FILE, DEFAULT_ROBOT, DEFAULT_TASK, EnvGroup, find_policy
+from manip_il.cli.options import from_yaml
+from manip_il.errors import MismatchError, UsageError
+from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.rounds import END, History, Round, Rule, budget, choose, history
+
+if TYPE_CHECKING:
+    from manip_il.cli.dagger import DaggerOptions
+    from manip_il.sim.env import EnvConfig
+
+METRICS_FILE = "metrics.jsonl"
+SEED_FOLDER = re.compile(r"seed_(\d+)")
+EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
+
+
+@dataclass(frozen=True)
+class Source:
+    """One policy to compare, or what was found of one.
+
+    training_seed: None where nothing says it. result: of an evaluation that is taken as it is. policy: a policy that
+    is no run's. history, env, finished: of a run; env is None where its options are not beside it.
+    """
+
+    path: Path
+    training_seed: int | None = None
+    result: EvalResult | None = None
+    policy: Path | None = None
+    history: History = ()
+    env: EnvConfig | None = None
+    finished: bool = True
+
+    @property
+    def name(self) -> str:
+        """For tables and errors."""
+        return str(self.path)
+
+    def chosen(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
+        """The policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
+        if self.policy is not None:
+            return self.policy, None
+        round_ = choose(rule, self.history, limit, self.name)
+        return round_policy(self.path, round_.round), round_
+
+
+@dataclass(frozen=True)
+class Side:
+    """LEFT or RIGHT: one source, or one a training seed (`several`)."""
+
+    path: Path
+    sources: tuple[Source, ...]
+    several: bool = False
+
+
+def read_side(path: Path) -> Side:
+    """What lies at `path`; `UsageError` in one line where it is nothing that can be compared."""
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; {EXPECTED}")
+    seeds = seed_folders(path) if path.is_dir() else {}
+    if not seeds:
+        return Side(path, (_read_source(path),))
+    return Side(path, tuple(_of_seed(folder, seed) for seed, folder in sorted(seeds.items())), several=True)
+
+
+def matched(left: Side, right: Side) -> tuple[Side, Side, list[str]]:
+    """Both sides with the training seeds that both have, and a line for each side that loses some.
+
+    Raises `UsageError` where a single policy meets several training seeds, or none is shared.
+    """
+    if not left.several and not right.several:
+        return left, right, []
+    if left.several != right.several:
+        one, many = (right, left) if left.several else (left, right)
+        raise UsageError(
+            f"{one.path} is one policy, {many.path} holds {len(many.sources)} training seeds; compare two folders of "
+            f"seeds, or one of the runs in it, such as {many.sources[0].path}"
+        )
+    ours, theirs = ({source.training_seed for source in side.sources} for side in (left, right))
+    shared = ours & theirs
+    if not shared:
+        raise UsageError(
+            f"no training seed is shared: {left.path} has {_listed(ours)}, {right.path} {_listed(theirs)}; runs are "
+            "paired by seed"
+        )
+    lines = [
+        f"{side.path}: training seeds {_listed(seeds - shared)} have no partner and are left out"
+        for side, seeds in ((left, ours), (right, theirs))
+        if seeds - shared
+    ]
+    return _only(left, shared), _only(right, shared), lines
+
+
+def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
+    """The amount of `rule.axis` that every run may have used; `UsageError` where a source has no rounds to choose."""
+    sources = list(sources)
+    for source in sources:
+        if rule.axis != END and not source.history:
+            what = "an evaluation" if source.result is not None else "a policy"
+            raise UsageError(f"--at={rule}: {source.name} is {what} and has no rounds; give a run of manip-il dagger")
+    return budget(rule, [source.history for source in sources])
+
+
+def common_env(sources: Sequence[Source], group: EnvGroup, robot: str | None, task: str | None) -> EnvConfig:
+    """The environment that all are tested in: the runs' own, else `--env.*` with the policies' robot and task.
+
+    Raises `MismatchError` naming the first setting in which two differ.
+    """
+    claims: list[tuple[str, EnvConfig]] = []
+    run = next((source.env for source in sources if source.env is not None), None)
+    for source in sources:
+        if source.result is None:
+            claims.append((source.name, source.env or _policy_env(source, run, group, robot, task)))
+    name, env = claims[0]
+    for other, theirs in claims[1:]:
+        require_same_env(name, env, other, theirs)
+    return env
+
+
+def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) -> None:
+    """Raise `MismatchError` naming the first field that differs."""
+    for field in fields(env):
+        ours, theirs = getattr(env, field.name), getattr(other, field.name)
+        if ours != theirs:
+            raise MismatchError(field.name, left, ours, right, theirs)
+
+
+def seed_folders(path: Path) -> dict[int, Path]:
+    """Training seed -> its folder in `path`."""
+    named = ((SEED_FOLDER.fullmatch(folder.name), folder) for folder in path.iterdir() if folder.is_dir())
+    return {int(match.group(1)): folder for match, folder in named if match}
+
+
+def run_history(folder: Path) -> History:
+    """The rounds of a DAgger run so far."""
+    return history(read_jsonl(folder / METRICS_FILE), str(folder))
+
+
+def round_policy(folder: Path, round_: int) -> Path:
+    """The `pretrained_model` folder of a run's round."""
+    from manip_il.dagger.loop import round_folder
+
+    return find_policy(round_folder(folder, round_) / "policy")
+
+
+def run_finished(folder: Path) -> bool:
+    """Whether all rounds of a run are done: the best policy is put beside them last."""
+    return (folder / "best" / "pretrained_model" / "config.json").is_file()
+
+
+def _read_source(path: Path) -> Source:
+    if path.is_file():
+        return Source(path, result=EvalResult.read(path))
+    options = _run_options(path)
+    records = read_jsonl(path / METRICS_FILE) if (path / METRICS_FILE).is_file() else []
+    if options is not None or any("round" in record for record in records):  # `manip-il train` counts steps there
+        env = None if options is None else options.env.config(options.robot.type, options.task.type)
+        rounds, seed = history(records, str(path)), None if options is None else options.seed
+        return Source(path, seed, history=rounds, env=env, finished=run_finished(path))
+    if (path / FILE_NAME).is_file():
+        return Source(path, result=EvalResult.read(path))
+    try:
+        return Source(path, policy=find_policy(path))
+    except UsageError:
+        raise UsageError(f"{path} holds nothing to compare; {EXPECTED}") from None
+
+
+def _of_seed(folder: Path, seed: int) -> Source:
+    source = _read_source(folder)
+    if source.training_seed not in (None, seed):
+        raise MismatchError("training seed", f"the name {folder}", seed, f"its {CONFIG_FILE}", source.training_seed)
+    return replace(source, training_seed=seed)
+
+
+def _run_options(folder: Path) -> DaggerOptions | None:
+    """The options of the DAgger run in `folder`; None where it is none."""
+    from manip_il.cli.dagger import DaggerOptions
+
+    path = folder / CONFIG_FILE
+    if not path.is_file() or f"({DaggerOptions.__name__})" not in path.read_text(errors="replace").partition("\n")[0]:
+        return None
+    return from_yaml(path, DaggerOptions)
+
+
+def _policy_env(
+    source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: str | None
+) -> EnvConfig:
+    """Of a policy, which knows its robot, task and rate, but neither tolerance nor horizon."""
+    from manip_il.learn.checkpoint import read_meta
+
+    meta = read_meta(source.policy or round_policy(source.path, 0))
+    if run is not None:
+        return run if meta is None else replace(run, robot=meta.robot, task=meta.task, control_hz=meta.fps)
+    robot = robot or (meta.robot if meta else DEFAULT_ROBOT)
+    task = task or (meta.task if meta else DEFAULT_TASK)
+    return group.config(robot, task, meta.fps) if meta else group.config(robot, task)
+
+
+def _only(side: Side, seeds: set[int | None]) -> Side:
+    return replace(side, sources=tuple(source for source in side.sources if source.training_seed in seeds))
+
+
+def _listed(seeds: Iterable[int | None]) -> str:
+    return ", ".join(str(seed) for seed in sorted(seed for seed in seeds if seed is not None))

@@ -1,0 +1,132 @@
+"""The file of a study: what its arms share, how they differ, and how they are compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from manip_il.cli.compare import TrialGroup
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.folders import atomic_write
+from manip_il.cli.groups import option
+from manip_il.cli.measure import FOLDER
+from manip_il.cli.options import Open, dump_yaml, from_layers, from_yaml, to_plain
+from manip_il.cli.sides import require_same_env
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.evaluation.report_data import flatten
+from manip_il.evaluation.rounds import Rule
+from manip_il.seeding import MAX_SEED
+
+if TYPE_CHECKING:
+    from manip_il.sim.env import EnvConfig
+
+STUDY_FILE = "study.yaml"
+OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+
+
+@dataclass
+class StudyFile:
+    """What a study's YAML file may hold.
+
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs.
+    """
+
+    common: Open = field(default_factory=dict[str, Any])
+    arms: Open = field(default_factory=dict[str, Any])
+    training_seeds: int = 3
+    eval: TrialGroup = field(default_factory=TrialGroup)
+    checkpoint: Literal["best", "last"] = "best"
+    at: str = "end"
+    baseline: str | None = option(None, "the arm that others are compared with; by default the first")
+    target: float = option(0.95, "validation success of which the cost is told")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A file that has been checked: every arm's options are sound, and all arms share one environment."""
+
+    file: StudyFile
+    arms: Mapping[str, DaggerOptions]
+    rule: Rule
+    baseline: str
+    env: EnvConfig
+
+
+def read_plan(path: Path, training_seeds: int | None) -> Plan:
+    """The study in `path`; training_seeds: in place of the file's. `UsageError` in one line for what is not sound."""
+    file = from_yaml(path, StudyFile)
+    if training_seeds is not None:
+        file = replace(file, training_seeds=training_seeds)
+    _check_numbers(path, file)
+    arms = {name: _arm(path, file, name) for name in file.arms}
+    envs = {name: _checked(path, name, options) for name, options in arms.items()}
+    first = next(iter(envs))
+    for name, env in envs.items():
+        require_same_env(f"arm {first!r}", envs[first], f"arm {name!r}", env)
+    baseline = file.baseline or first
+    if baseline not in arms:
+        raise UnknownName("arm as a baseline", baseline, arms)
+    return Plan(file, arms, Rule.parse(file.checkpoint, file.at), baseline, envs[first])
+
+
+def keep_file(folder: Path, file: StudyFile) -> None:
+    """Write the study's file beside its runs."""
+    atomic_write(folder / STUDY_FILE, dump_yaml(file))
+
+
+def check_same_file(folder: Path, file: StudyFile) -> None:
+    """Raise `MismatchError` naming the option unless the study in `folder` was started with the same file.
+
+    There may be more training seeds than before.
+    """
+    path = folder / STUDY_FILE
+    if not path.is_file():
+        return
+    before = from_yaml(path, StudyFile)
+    was, now = flatten(to_plain(before)), flatten(to_plain(file))
+    if before.training_seeds <= file.training_seeds:
+        was["training_seeds"] = now["training_seeds"]
+    for name in [*was, *(name for name in now if name not in was)]:
+        if was.get(name) != now.get(name):
+            raise MismatchError(name, str(path), was.get(name, "nothing"), "the file", now.get(name, "nothing"))
+
+
+def _check_numbers(path: Path, file: StudyFile) -> None:
+    if not file.arms:
+        raise UsageError(f"{path}: arms is empty; expected a mapping of names to options of manip-il dagger")
+    if not 1 <= file.training_seeds <= MAX_SEED:
+        raise UsageError(f"training_seeds is {file.training_seeds}; expected 1 to {MAX_SEED}")
+    if file.eval.n_episodes < 1:
+        raise UsageError(f"{path}: eval.n_episodes is {file.eval.n_episodes}; expected at least 1")
+    if not 0 < file.target <= 1:
+        raise UsageError(f"{path}: target is {file.target}; expected a share above 0 and up to 1, such as 0.95")
+    for name in file.arms:
+        if not ARM_NAME.fullmatch(name) or name == FOLDER:
+            raise UsageError(
+                f"{path}: an arm is named {name!r}, which becomes a folder; expected letters, digits, _ . and -"
+                f"{', and not ' + FOLDER if name == FOLDER else ''}"
+            )
+
+
+def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
+    differences = file.arms[name]
+    if not isinstance(differences, dict | None):
+        raise UsageError(f"{path}: arms.{name}: expected a mapping of options of manip-il dagger, got {differences!r}")
+    layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
+    for where, tree in layers:
+        for own in OWN:
+            if own in tree:
+                raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
+    return from_layers(DaggerOptions, layers)
+
+
+def _checked(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
+    try:
+        return options.config().env
+    except ManipError as error:
+        error.args = (f"{path}: arm {name!r}: {error}",)
+        raise

@@ -1,0 +1,215 @@
+"""`certificate.json`: from where the expert recovers, and what one wrong action costs it.
+
+The cost of a state is the number of control steps until the task is solved. Where Q*(s, a) is the expert's cost of
+going on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is what the action a
+makes worse. Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest of them, u: a learner that errs
+in a share e of the states it visits within T steps costs at most u T e more than the expert, so linearly in T where a
+mistake can be undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among
+drawn actions, as here, is a lower bound of u: `Row.above_largest` says how much of the draw may lie above it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.statistics import CONFIDENCE, Proportion
+
+FILE_NAME = "certificate.json"
+Group = Literal["start", "state", "action", "learner"]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One episode. moment: the control step from which the expert is judged.
+
+    steps: until solved from there [control steps]; None where not within a horizon. undisturbed: the same without the
+    perturbation, where it is known. labelled: the expert's last label was sound; it is not
+    where the object is out of reach, say. Raises `ManipError` for counts that cannot be.
+    """
+
+    seed: int
+    moment: int
+    steps: int | None
+    undisturbed: int | None = None
+    labelled: bool = True
+
+    def __post_init__(self) -> None:
+        counts = [count for count in (self.steps, self.undisturbed) if count is not None]
+        if self.moment < 0 or any(count < 1 for count in counts):
+            raise ManipError(f"certificate of seed {self.seed}: {self} counts steps that cannot be")
+
+    def gap(self, horizon: int) -> int | None:
+        """Q*(s, a) - V*(s) [control steps]; the whole horizon where the expert did not recover."""
+        if self.undisturbed is None:
+            return None
+        return horizon if self.steps is None else self.steps - self.undisturbed
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Of the cost-to-go, over the cases of a row [control steps]. unrecovered: counted as a whole horizon."""
+
+    mean: float
+    p95: int
+    p99: int
+    largest: int
+    unrecovered: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """The cases of one kind. name: of the kind; words: the same, for people; horizon: [control steps].
+
+    left_out: cases that are none, as no place was found for the perturbation, nothing was changed by it, or the task
+    was solved before its moment.
+    """
+
+    group: Group
+    name: str
+    words: str
+    cases: tuple[Case, ...]
+    horizon: int
+    left_out: int = 0
+
+    def __post_init__(self) -> None:
+        longest = max((case.steps or 0 for case in self.cases), default=0)
+        if longest > self.horizon:
+            raise ManipError(f"certificate, {self.words}: solved after {longest} steps of {self.horizon}")
+
+    @property
+    def success(self) -> Proportion | None:
+        """Solved within a horizon from the moment on; None without cases."""
+        return Proportion.of([case.steps is not None for case in self.cases]) if self.cases else None
+
+    @property
+    def failed_seeds(self) -> tuple[int, ...]:
+        """Of the cases that were not solved."""
+        return tuple(case.seed for case in self.cases if case.steps is None)
+
+    @property
+    def without_label(self) -> int:
+        """Of the cases that were not solved: those that ended where the expert has no sound label."""
+        return sum(case.steps is None and not case.labelled for case in self.cases)
+
+    @property
+    def mean_steps(self) -> float | None:
+        """Until solved, over the cases that were [control steps]."""
+        steps = [case.steps for case in self.cases if case.steps is not None]
+        return float(np.mean(steps)) if steps else None
+
+    @property
+    def gaps(self) -> Gaps | None:
+        """Of the cost-to-go; None where no case knows its own."""
+        gaps = [gap for case in self.cases if (gap := case.gap(self.horizon)) is not None]
+        if not gaps:
+            return None
+        # A percentile that was seen, the one above where it falls between two.
+        p95, p99 = (int(np.percentile(gaps, share, method="higher")) for share in (95, 99))
+        return Gaps(float(np.mean(gaps)), p95, p99, max(gaps), len(self.failed_seeds))
+
+    @property
+    def above_largest(self) -> float | None:
+        """Share of such draws that may exceed the largest gap seen, at 95 %; exact for independent draws."""
+        return 1 - (1 - CONFIDENCE) ** (1 / len(self.cases)) if self.cases else None
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        success, gaps = self.success, self.gaps
+        return {
+            "group": self.group,
+            "kind": self.name,
+            "words": self.words,
+            "n": len(self.cases),
+            "left_out": self.left_out,
+            "success_rate": success.rate if success else None,
+            "interval": list(success.interval) if success else None,
+            "without_label": self.without_label,
+            "mean_steps": self.mean_steps,
+            "gap": asdict(gaps) if gaps and self.group == "action" else None,
+            "cases": [[case.seed, case.moment, case.steps, case.undisturbed] for case in self.cases],
+        }
+
+
+def pooled(rows: tuple[Row, ...], words: str) -> Row:
+    """All cases of some rows of one group as one row. Raises `UsageError` without rows."""
+    if not rows:
+        raise UsageError(f"certificate: no rows to pool as {words!r}")
+    cases = tuple(case for row in rows for case in row.cases)
+    return Row(rows[0].group, "all", words, cases, rows[0].horizon, sum(row.left_out for row in rows))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What was run. cases: asked for, a kind; horizon: [control steps]; tolerance: to the goal [m]."""
+
+    cases: int
+    seed: int
+    horizon: int
+    control_hz: int
+    tolerance: float
+    success_steps: int
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Of the expert on one robot and task. policy: whose visited states it went on from, None for nobody's.
+
+    rows: one a kind.
+    """
+
+    robot: str
+    task: str
+    policy: str | None
+    fingerprint: Mapping[str, Any]
+    settings: Settings
+    rows: tuple[Row, ...]
+
+    def of(self, group: Group) -> tuple[Row, ...]:
+        """The rows of a group."""
+        return tuple(row for row in self.rows if row.group == group)
+
+    @property
+    def states(self) -> Row:
+        """Every state that was changed."""
+        return pooled(self.of("state"), "all changed states")
+
+    @property
+    def actions(self) -> Row:
+        """Every wrong action: its `gaps.largest` is the empirical u of Ross et al. (2011)."""
+        return pooled(self.of("action"), "all wrong actions")
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of `certificate.json`.
+
+        robot, task, policy (or null), fingerprint, settings (`Settings`), confidence of every interval, mu (the largest
+        gap of all wrong actions [control steps]), and rows, a list of: group (start, state, action, learner), kind,
+        words, n, left_out, success_rate and interval (null without cases), without_label (failures in which the expert
+        had no sound label at the end), mean_steps until solved, gap (`Gaps`; for wrong actions), and cases, each
+        [seed, moment, steps or null, undisturbed or null].
+        """
+        gaps = self.actions.gaps
+        rows = [*self.of("start"), *self.of("state"), self.states, *self.of("action"), self.actions]
+        return {
+            "robot": self.robot,
+            "task": self.task,
+            "policy": self.policy,
+            "fingerprint": dict(self.fingerprint),
+            "settings": asdict(self.settings),
+            "confidence": CONFIDENCE,
+            "mu": gaps.largest if gaps else None,
+            "rows": [row.to_json() for row in [*rows, *self.of("learner")]],
+        }
+
+    def write(self, path: Path) -> None:
+        """Write `path` whole or not at all, creating its folder."""
+        text = json.dumps(self.to_json(), allow_nan=False, ensure_ascii=False)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, (text + "\n").encode())

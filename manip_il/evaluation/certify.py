@@ -1,0 +1,156 @@
+"""Measure the expert's recoverability: rollouts that are perturbed once, beside the same ones undisturbed.
+
+Expert and simulator are deterministic. So the undisturbed run of a seed tells the cost-to-go of every state on it, and
+the same run with one wrong action tells what that action costs.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data import schema
+from manip_il.engine.ask import Ask
+from manip_il.engine.describe import env_fingerprint
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
+from manip_il.mdp import Actor, Episode
+from manip_il.seeding import rng_for, stream_seeds
+from manip_il.sim.disturb import Disturbance
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.perturb import Perturbation, kinds_for
+from manip_il.sim.task import get_task
+
+_LOG = logging.getLogger(__name__)
+NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
+Progress = Callable[[Episode], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Undisturbed:
+    """The expert's own run of a seed. steps: until solved; states (steps, m) and actions (steps, n) on the way."""
+
+    steps: int
+    states: NDArray[np.float64]
+    actions: NDArray[np.float32]
+
+
+def certify(
+    engine: Engine,
+    env: EnvConfig,
+    cases: int,
+    seed: int = 0,
+    policy: Path | None = None,
+    on_episode: Progress | None = None,
+) -> Certificate:
+    """Certify the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
+
+    A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
+    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too. on_episode:
+    sees every episode as it ends.
+    """
+    if cases < 1:
+        raise UsageError(f"cases is {cases}; expected at least 1")
+    run = _Run(engine, env, stream_seeds("certificate", cases, seed), on_episode)
+    rows = [run.starts()]
+    rows += [run.perturbed(kind) for kind in kinds_for(get_task(env.task))]
+    rows.append(run.noisy())
+    if policy is not None:
+        rows.append(run.taken_over(policy))
+    if engine.given_up:
+        _LOG.warning("left out, as each killed its worker again and again: seeds %s", engine.given_up)
+    settings = Settings(cases, seed, env.horizon, env.control_hz, env.tolerance, env.success_steps)
+    name = None if policy is None else str(policy)
+    return Certificate(env.robot, env.task, name, env_fingerprint(env), settings, tuple(rows))
+
+
+def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> int:
+    """How many episodes `certify` runs at most."""
+    return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
+
+
+class _Run:
+    """The rows of one certificate; `starts` comes first, as the others lean on its runs."""
+
+    def __init__(self, engine: Engine, env: EnvConfig, seeds: Sequence[int], on_episode: Progress | None):
+        self._engine, self._env, self._seeds, self._seen = engine, env, seeds, on_episode
+        self._undisturbed: dict[int, Undisturbed] = {}
+
+    def starts(self) -> Row:
+        """From where episodes begin."""
+        cases: list[Case] = []
+        for episode in self._episodes(RolloutJob(self._env, "expert", hold=0), self._seeds):
+            case = self._case(episode, 0)
+            cases.append(case)
+            if case.steps is not None:
+                states, actions = episode.columns[schema.SIM_STATE], episode.columns[schema.EXECUTED_ACTION]
+                self._undisturbed[case.seed] = Undisturbed(case.steps, states, actions)  # pyright: ignore[reportArgumentType]
+        if not self._undisturbed:
+            raise ManipError(
+                f"the expert solved none of {len(self._seeds)} undisturbed episodes within {self._env.horizon} steps, "
+                "so there is nothing to perturb; give it a longer --env.horizon"
+            )
+        return self._row("start", "start", "undisturbed, from the start", cases)
+
+    def noisy(self) -> Row:
+        """From where episodes begin, with noise on every action."""
+        job = RolloutJob(self._env, "expert", hold=0, disturbance=Disturbance(NOISE))
+        cases = [self._case(episode, 0) for episode in self._episodes(job, self._seeds)]
+        return self._row("start", "noise", f"{NOISE:.0%} noise on every action", cases)
+
+    def perturbed(self, kind: str) -> Row:
+        """After a perturbation."""
+        moments = {seed: draw_moment(seed, kind, run.steps) for seed, run in self._undisturbed.items()}
+        longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
+        job = RolloutJob(longer, "expert", hold=0, perturbation=Perturbation(kind, moments))
+        cases: list[Case] = []
+        for episode in self._episodes(job, list(moments)):
+            moment, run = moments[episode.seed], self._undisturbed[episode.seed]
+            if happened(episode, run, moment):
+                cases.append(self._case(episode, moment, run.steps - moment))
+        known = kinds_for(get_task(self._env.task))[kind]
+        return self._row("action" if known.wrong else "state", kind, known.words, cases)
+
+    def taken_over(self, policy: Path) -> Row:
+        """From states that a learner visits: at a drawn step of a horizon the expert takes over."""
+        job = RolloutJob(self._env, "policy", policy=policy, hold=0, labels="takeover", ask=Ask("one"))
+        cases: list[Case] = []
+        for episode in self._episodes(job, self._seeds):
+            taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)
+            if taken.size:  # else the learner had solved it before
+                cases.append(self._case(episode, int(taken[0])))
+        return self._row("learner", "learner", "states that the policy visited", cases)
+
+    def _episodes(self, job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
+        for episode in self._engine.run(job, seeds):
+            yield episode
+            if self._seen is not None:
+                self._seen(episode)
+
+    def _case(self, episode: Episode, moment: int, undisturbed: int | None = None) -> Case:
+        solved = np.flatnonzero(episode.columns[schema.SUCCESS].ravel()[moment : moment + self._env.horizon])
+        steps = int(solved[0]) + 1 if solved.size else None
+        labelled = bool(episode.columns[schema.LABEL_VALID][-1, 0])
+        return Case(episode.seed, moment, steps, undisturbed, labelled)
+
+    def _row(self, group: Group, name: str, words: str, cases: list[Case]) -> Row:
+        in_order = tuple(sorted(cases, key=lambda case: case.seed))
+        return Row(group, name, words, in_order, self._env.horizon, len(self._seeds) - len(cases))
+
+
+def draw_moment(seed: int, kind: str, steps: int) -> int:
+    """One of the `steps` steps of an undisturbed run, for one kind of perturbation."""
+    return int(rng_for(seed, f"moment of {kind}").integers(steps))
+
+
+def happened(episode: Episode, run: Undisturbed, moment: int) -> bool:
+    """Whether the state or the action of that moment is another than in the undisturbed run."""
+    state, action = episode.columns[schema.SIM_STATE][moment], episode.columns[schema.EXECUTED_ACTION][moment]
+    return not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment]))

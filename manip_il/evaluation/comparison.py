@@ -1,0 +1,253 @@
+"""Two arms, each of one or several training seeds, on the same test episodes: which is better, and how sure that is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from manip_il.data.atomic import write_file
+from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.over_seeds import mean_interval, sign_flip_exact
+from manip_il.evaluation.results import EvalResult, compare_results
+from manip_il.evaluation.rounds import History, Round
+from manip_il.evaluation.statistics import PairedComparison, format_p
+
+FILE_NAME = "compare.json"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One policy with its test.
+
+    training_seed: None where nothing says it. file: the evaluation's. policy: its folder, None where only an
+    evaluation is there. chosen, history: the round that it is and all rounds of its run, where it is a run's.
+    """
+
+    name: str
+    result: EvalResult
+    file: Path
+    training_seed: int | None = None
+    policy: Path | None = None
+    chosen: Round | None = None
+    history: History = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """For `compare.json` and `study.json`."""
+        return {
+            "name": self.name,
+            "policy": None if self.policy is None else str(self.policy),
+            "chosen": None if self.chosen is None else self.chosen.to_json(),
+            "success_rate": self.result.success.rate,
+            "interval": list(self.result.success.interval),
+            "n_episodes": self.result.success.n,
+            "evaluation": str(self.file),
+        }
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What is compared: one policy, or one a training seed."""
+
+    name: str
+    members: tuple[Measured, ...]
+
+    def __post_init__(self) -> None:
+        seeds = self.training_seeds
+        if not seeds or len(set(seeds)) != len(seeds):
+            raise ManipError(f"{self.name} has training seeds {seeds}; expected each once, and at least one")
+
+    @property
+    def training_seeds(self) -> list[int | None]:
+        """In the order of the members."""
+        return [member.training_seed for member in self.members]
+
+    @property
+    def test_rate(self) -> float:
+        """Mean success over training seeds."""
+        return fmean(member.result.success.rate for member in self.members)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`right` against `left`, paired by training seed and by test episode. Differences are right minus left.
+
+    Raises `UsageError` where training seeds do not match, `MismatchError` where robot, task or settings differ, and
+    `ManipError` where the test episodes are not the same.
+    """
+
+    left: Arm
+    right: Arm
+
+    def __post_init__(self) -> None:
+        if self.left.name == self.right.name:
+            raise UsageError(f"{self.left.name} is compared with itself; give two different ones")
+        if len(self.left.members) != len(self.right.members) or (
+            len(self.left.members) > 1 and self.left.training_seeds != self.right.training_seeds
+        ):
+            raise UsageError(
+                f"training seeds differ: {self.left.name} has {_listed(self.left)}, {self.right.name} "
+                f"{_listed(self.right)}; runs are paired by seed, so both sides need the same ones"
+            )
+        # Every policy meets the same starts: also those of different training seeds.
+        first, *others = [*self.left.members, *self.right.members]
+        for other in others:
+            require_same_episodes(first.name, first.result, other.name, other.result)
+        _ = self.pairs
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of both arms."""
+        return self.left.name, self.right.name
+
+    @cached_property
+    def pairs(self) -> tuple[PairedComparison, ...]:
+        """One a training seed."""
+        members = zip(self.left.members, self.right.members, strict=True)
+        return tuple(compare_results(a.result, b.result, self.names) for a, b in members)
+
+    @property
+    def difference(self) -> float:
+        """Mean over training seeds, in [-1, 1]."""
+        return fmean(pair.difference for pair in self.pairs)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Of `difference`: Newcombe's for one training seed, Student's over training seeds for more."""
+        if len(self.pairs) == 1:
+            return self.pairs[0].interval
+        return mean_interval([pair.difference for pair in self.pairs], self.confidence)
+
+    @cached_property
+    def p_value(self) -> float:
+        """Two-sided and exact over test episodes, all training seeds together; with one it is McNemar's.
+
+        It is about these trained policies: what other training seeds would give, only `interval` speaks of.
+        """
+        margins: dict[int, int] = {}
+        for left, right in zip(self.left.members, self.right.members, strict=True):
+            lost = {episode.seed: episode.success for episode in left.result.episodes}
+            for episode in right.result.episodes:
+                margins[episode.seed] = margins.get(episode.seed, 0) + episode.success - lost[episode.seed]
+        return sign_flip_exact(list(margins.values()))
+
+    @property
+    def confidence(self) -> float:
+        """Of all intervals, and one minus the level of the tests."""
+        return self.pairs[0].confidence
+
+    @property
+    def shown(self) -> bool:
+        """Whether one arm is shown to be better: by the exact test, and with several seeds by the t interval too."""
+        tested = self.p_value < 1 - self.confidence
+        low, high = self.interval
+        return tested and (len(self.pairs) == 1 or low > 0 or high < 0)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence in words, with the numbers that carry it."""
+        n, left, right = len(self.pairs), *self.names
+        swapped = self.difference < 0
+        better, worse = (left, right) if swapped else (right, left)
+        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
+        if n > 1:
+            tested += f" on each of {n} training seeds"
+        over = f" on average over {n} training seeds (ahead in {self.ahead(better)} of {n})" if n > 1 else ""
+        points = self._points(-1 if swapped else 1)
+        if self.shown:
+            return f"{better} is better than {worse} by {points}{over}, {tested}."
+        if self.p_value < 1 - self.confidence:
+            return (
+                f"These policies of {better} are better than those of {worse} ({tested}), but {n} training seeds do "
+                f"not show that others would be: {points}{over}."
+            )
+        if not self.difference:
+            over = over.partition(" (")[0]
+        return f"No difference shown between {right} and {left}: {self._points(1, '+')}{over}, {tested}."
+
+    def ahead(self, name: str) -> int:
+        """In how many training seeds the arm of this name has the higher success."""
+        sign = 1 if name == self.right.name else -1
+        return sum(sign * pair.difference > 0 for pair in self.pairs)
+
+    def _points(self, sign: int, plus: str = "") -> str:
+        low, high = sorted(100 * sign * end for end in self.interval)
+        return f"{_number(100 * sign * self.difference, plus)} points [{_number(low, plus)}, {_number(high, plus)}]"
+
+    @property
+    def numbers(self) -> str:
+        """`+4.2 points [+1.1, +7.3], p = 0.002`: right minus left, for a table."""
+        return f"{self._points(1, '+')}, {format_p(self.p_value)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """For `compare.json` and `study.json`; differences are right minus left."""
+        several = len(self.pairs) > 1
+        return {
+            "left": self.left.name,
+            "right": self.right.name,
+            "difference": self.difference,
+            "interval": list(self.interval),
+            "interval_method": "Student's t over training seeds" if several else "Newcombe's for paired proportions",
+            "confidence": self.confidence,
+            "p_value": self.p_value,
+            "test": (
+                "exact sign flips of test episodes, training seeds summed; conditional on these training seeds"
+                if several
+                else "McNemar's, exact"
+            ),
+            "only_left": sum(pair.only_left for pair in self.pairs),
+            "only_right": sum(pair.only_right for pair in self.pairs),
+            "left_ahead": self.ahead(self.left.name),
+            "right_ahead": self.ahead(self.right.name),
+            "n_episodes": self.pairs[0].n,
+            "verdict": self.verdict,
+            "training_seeds": [
+                {"left_seed": left.training_seed, "right_seed": right.training_seed}
+                | {"left": left.to_json(), "right": right.to_json()}
+                | _pair_json(pair)
+                for left, right, pair in zip(self.left.members, self.right.members, self.pairs, strict=True)
+            ],
+        }
+
+
+def require_same_episodes(left_name: str, left: EvalResult, right_name: str, right: EvalResult) -> None:
+    """Raise `ManipError` with both numbers unless both ran exactly the same seeds."""
+    ours, theirs = ({episode.seed for episode in one.episodes} for one in (left, right))
+    if ours != theirs:
+        raise ManipError(
+            f"test episodes differ: {left_name} has {len(ours)}, {right_name} {len(theirs)}, of which "
+            f"{len(ours & theirs)} are the same; evaluate both with the same --seed and --eval.n_episodes"
+        )
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write `content` whole or not at all, creating the folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+
+
+def _pair_json(pair: PairedComparison) -> dict[str, Any]:
+    return {
+        "both": pair.both,
+        "only_left": pair.only_left,
+        "only_right": pair.only_right,
+        "neither": pair.neither,
+        "difference": pair.difference,
+        "interval": list(pair.interval),
+        "p_value": pair.p_value,
+    }
+
+
+def _listed(arm: Arm) -> str:
+    if arm.training_seeds == [None]:
+        return "one policy"
+    return ", ".join("?" if seed is None else str(seed) for seed in arm.training_seeds)
+
+
+def _number(points: float, plus: str) -> str:
+    text = f"{points:{plus}.1f}"
+    return text.replace("-0.0", f"{plus}0.0") if text == "-0.0" else text

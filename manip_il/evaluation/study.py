@@ -1,0 +1,181 @@
+"""Several arms, each with the same training seeds: who is better than the baseline, and what success had cost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from statistics import fmean
+from typing import Any
+
+from manip_il.errors import ManipError, UnknownName
+from manip_il.evaluation.comparison import Arm, Comparison, Measured
+from manip_il.evaluation.comparison_table import over_seeds_fact, rule_facts
+from manip_il.evaluation.report_data import COSTS, Cost, format_amount, format_percent
+from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip
+from manip_il.evaluation.tables import Cells
+
+FILE_NAME, TABLE_FILE = "study.json", "table.md"
+
+
+@dataclass(frozen=True)
+class Study:
+    """All arms' runs with their tests. baseline: whom the others are compared with. target: in (0, 1].
+
+    rule, limit: by which a run's round was taken. Every member is of a run, and knows its history.
+    """
+
+    arms: tuple[Arm, ...]
+    baseline: str
+    target: float
+    rule: Rule
+    limit: float | None = None
+
+    def __post_init__(self) -> None:
+        names = [arm.name for arm in self.arms]
+        if self.baseline not in names:
+            raise UnknownName("baseline", self.baseline, names)
+        for arm in self.arms:
+            if not all(member.history and member.chosen for member in arm.members):
+                raise ManipError(f"arm {arm.name!r} holds a policy that is of no run")
+
+    @property
+    def training_seeds(self) -> list[int | None]:
+        """The same in every arm."""
+        return self.arms[0].training_seeds
+
+    @cached_property
+    def comparisons(self) -> dict[str, Comparison]:
+        """Every other arm against the baseline."""
+        [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
+        return {arm.name: Comparison(baseline, arm) for arm in self.arms if arm is not baseline}
+
+    @property
+    def verdict(self) -> str:
+        """The headline: the best arm's success, and the baseline's, or the second's where the baseline is best."""
+        ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
+        best, count, seeds = ranked[0], ranked[0].members[0].result.success.n, len(self.training_seeds)
+        over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
+        other = next((arm for arm in ranked[1:] if best.name == self.baseline or arm.name == self.baseline), None)
+        behind = f"; {other.name} {format_percent(other.test_rate)}" if other else ""
+        return f"{best.name} solves {format_percent(best.test_rate)} of {count:,} unseen starts{over}{behind}."
+
+    @property
+    def facts(self) -> list[str]:
+        """What can be said in a sentence each."""
+        chosen = [_chosen(member) for arm in self.arms for member in arm.members]
+        facts = [comparison.verdict for comparison in self.comparisons.values()]
+        if self.comparisons and len(self.training_seeds) > 1:
+            facts.append(over_seeds_fact(len(self.training_seeds)))
+        return [
+            *facts,
+            *rule_facts(self.rule, self.limit, chosen),
+            "Wall-clock is what collecting and fitting took; validating is not counted.",
+        ]
+
+    def reached(self, arm: Arm) -> list[Round | None]:
+        """The round of each training seed in which validation first reached the target."""
+        return [first_reaching(member.history, self.target) for member in arm.members]
+
+    def results_table(self) -> Cells:
+        """An arm a row: what its policies had cost, how they did, and against the baseline."""
+        columns = ("arm", *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
+        columns += ("validation", "test", f"test, against {self.baseline}")
+        return Cells((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
+
+    def target_table(self) -> Cells:
+        """An arm a row: labels, episodes and wall-clock when validation first reached the target."""
+        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {_percent(self.target)}" for cost in COSTS]
+        rows = [(arm.name, *(self._to_target(arm, cost) for cost in COSTS), self._fewer(arm)) for arm in self.arms]
+        return Cells(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract of `study.json`."""
+        return {
+            "verdict": self.verdict,
+            "facts": self.facts,
+            "baseline": self.baseline,
+            "target": self.target,
+            "training_seeds": self.training_seeds,
+            "arms": {arm.name: self._arm_json(arm) for arm in self.arms},
+        }
+
+    def _arm_json(self, arm: Arm) -> dict[str, Any]:
+        comparison = self.comparisons.get(arm.name)
+        return {
+            "test_success": arm.test_rate,
+            "validation_success": fmean(_chosen(member).validation.rate for member in arm.members),
+            "against_baseline": comparison.to_json() if comparison else None,
+            "training_seeds": [
+                {"seed": member.training_seed}
+                | member.to_json()
+                | {"largest_dip": largest_dip(member.history)}
+                | {"first_at_target": at.to_json() if at else None}
+                | {"rounds": [one.to_json() for one in member.history]}
+                for member, at in zip(arm.members, self.reached(arm), strict=True)
+            ],
+        }
+
+    def _row(self, arm: Arm) -> tuple[str, ...]:
+        chosen = [_chosen(member) for member in arm.members]
+        costs = [_plain(cost, fmean(one.amount(cost) for one in chosen)) for cost in COSTS]
+        validation = _rates([one.validation.rate for one in chosen])
+        test = _rates([member.result.success.rate for member in arm.members])
+        comparison = self.comparisons.get(arm.name)
+        dip = max(largest_dip(member.history) for member in arm.members)
+        return (arm.name, *costs, validation, test, comparison.numbers if comparison else "", f"{100 * dip:.1f}")
+
+    def _to_target(self, arm: Arm, cost: Cost) -> str:
+        """The mean where all training seeds got there, else each: what it took, or more than it had in all."""
+        reached = self.reached(arm)
+        if all(reached):
+            return _plain(cost, fmean(one.amount(cost) for one in reached if one))
+        each = zip(arm.members, reached, strict=True)
+        return ", ".join(
+            _plain(cost, one.amount(cost)) if one else f"> {_plain(cost, member.history[-1].amount(cost))}"
+            for member, one in each
+        )
+
+    def _fewer(self, arm: Arm) -> str:
+        """Labels of the baseline over this arm's, to the target; a lower bound where the baseline did not get there."""
+        if arm.name == self.baseline:
+            return ""
+        ours = [one.labels for one in self.reached(arm) if one]
+        if len(ours) < len(arm.members):
+            return "not reached"
+        baseline = next(one for one in self.arms if one.name == self.baseline)
+        reached = self.reached(baseline)
+        theirs = [
+            one.labels if one else member.history[-1].labels
+            for member, one in zip(baseline.members, reached, strict=True)
+        ]
+        return f"{'' if all(reached) else '> '}{sum(theirs) / sum(ours):.1f}"
+
+
+def table_markdown(study: Study) -> str:
+    """Both tables, for the documentation."""
+    results, target = study.results_table().filled(), study.target_table().filled()
+    count = study.arms[0].members[0].result.success.n
+    seeds = ", ".join(map(str, study.training_seeds))
+    where = [f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."]
+    facts = "".join(f"- {fact}\n" for fact in [*where, *study.facts])
+    return f"{results.markdown()}\n{target.markdown()}\n{facts}"
+
+
+def _chosen(member: Measured) -> Round:
+    assert member.chosen is not None
+    return member.chosen
+
+
+def _plain(cost: Cost, amount: float) -> str:
+    """Without the unit that the column's head says."""
+    return format_amount(cost, amount).removesuffix(f" {cost}")
+
+
+def _rates(rates: Sequence[float]) -> str:
+    each = f" ({', '.join(f'{100 * rate:.1f}' for rate in rates)})" if len(rates) > 1 else ""
+    return f"{format_percent(fmean(rates))}{each}"
+
+
+def _percent(rate: float) -> str:
+    return f"{100 * rate:g} %"

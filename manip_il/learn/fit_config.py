@@ -1,0 +1,113 @@
+"""How a policy is to be fitted, as a user says it: the mlp by its own loop, every other one by LeRobot's means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from manip_il.errors import UsageError
+
+if TYPE_CHECKING:  # torch and LeRobot take seconds to import
+    from pathlib import Path
+
+    from manip_il.learn.policy_config import PolicyFitConfig
+    from manip_il.learn.train import TrainConfig
+
+MLP = "mlp"  # the one policy with a loop of its own
+MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
+STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Options by LeRobot's names; None is the default of the policy's kind.
+
+    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). optimizer, scheduler:
+    in place of the policy's own. tensorboard, wandb: not for the mlp.
+    """
+
+    policy: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    observation: str | None = None
+    steps: int | None = None
+    batch_size: int | None = None
+    lr: float | None = None
+    optimizer: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    scheduler: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    eval_split: float = 0.05
+    image_augment: bool = True
+    image_cache_gb: float = 20.0
+    num_workers: int = 4
+    threads: int = 1
+    save_freq: int | None = None
+    log_freq: int = 200
+    tensorboard: bool = False
+    wandb: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def is_mlp(self) -> bool:
+        """Whether the policy is fitted by `manip_il.learn.train`."""
+        return "path" not in self.policy and self.policy.get("type", MLP) == MLP
+
+    @property
+    def total_steps(self) -> int:
+        """Gradient steps."""
+        return self.steps if self.steps is not None else MLP_STEPS if self.is_mlp else STEPS
+
+    def mlp(self, seed: int, init_from: Path | None = None) -> TrainConfig:
+        """For `manip_il.learn.train.fit`. Raises `UsageError` for what the mlp does not know."""
+        if self.observation not in (None, "state"):
+            raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={self.observation}; use cnn")
+        for name in ("optimizer", "scheduler", "wandb", "tensorboard"):
+            if getattr(self, name):
+                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop of its own (metrics.jsonl)")
+        from manip_il.learn.choices import policy_config
+        from manip_il.learn.mlp.configuration_mlp import MLPConfig
+        from manip_il.learn.train import TrainConfig
+
+        policy = policy_config(self.policy, MLP)
+        assert isinstance(policy, MLPConfig)
+        return TrainConfig(
+            steps=self.total_steps,
+            batch_size=MLP_BATCH_SIZE if self.batch_size is None else self.batch_size,
+            lr=MLP_LR if self.lr is None else self.lr,
+            val_fraction=self.eval_split,
+            seed=seed,
+            threads=self.threads,
+            save_freq=MLP_SAVE_FREQ if self.save_freq is None else self.save_freq,
+            log_freq=self.log_freq,
+            init_from=init_from,
+            policy=policy,
+        )
+
+    def other(self, seed: int, init_from: Path | None = None) -> PolicyFitConfig:
+        """For `manip_il.learn.fit_policy`. init_from: weights to start from. Raises what `policy_config` raises."""
+        from lerobot.configs.default import WandBConfig
+        from lerobot.optim import LRSchedulerConfig, OptimizerConfig
+
+        from manip_il.learn.augment import Augment
+        from manip_il.learn.choices import choice, plain, policy_config
+        from manip_il.learn.policy_config import PolicyFitConfig
+
+        policy = policy_config(self.policy)
+        if init_from is not None:
+            policy.pretrained_path = init_from
+        return PolicyFitConfig(
+            policy=policy,
+            steps=self.total_steps,
+            batch_size=BATCH_SIZE if self.batch_size is None else self.batch_size,
+            seed=seed,
+            observation=self.observation or ("images" if policy.type == "cnn" else "state"),
+            eval_split=self.eval_split,
+            lr=self.lr,
+            optimizer=choice(OptimizerConfig, self.optimizer, "optimizer") if self.optimizer else None,
+            scheduler=choice(LRSchedulerConfig, self.scheduler, "scheduler") if self.scheduler else None,
+            augment=Augment() if self.image_augment else None,
+            image_cache_gb=self.image_cache_gb,
+            num_workers=self.num_workers,
+            threads=self.threads,
+            log_freq=self.log_freq,
+            save_freq=SAVE_FREQ if self.save_freq is None else self.save_freq,
+            tensorboard=self.tensorboard,
+            wandb=plain(WandBConfig, self.wandb, "wandb"),
+        )

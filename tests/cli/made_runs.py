@@ -1,0 +1,63 @@
+"""Runs of `manip-il dagger` as they lie on disk, made without running anything."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.folders import append_jsonl
+from manip_il.cli.groups import EnvGroup, TaskGroup, save_options
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.sim.env import EnvConfig
+
+from ..learn.tiny_policies import write_checkpoint
+
+ENV = EnvConfig("panda", "reach", horizon=8)
+OPTIONS = DaggerOptions(task=TaskGroup("reach"), env=EnvGroup(horizon=8))
+SUCCESSES = (0.2, 0.6, 0.4)
+
+
+def make_policy(folder: Path) -> Path:
+    """A policy that acts, badly."""
+    spec = env_spec(ENV)
+    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(ENV)))
+
+
+def mark(policy: Path, words: str) -> Path:
+    """Make a policy another one, that acts the same."""
+    path = policy / META_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"options": {"mark": words}}))
+    return policy
+
+
+def make_run(
+    folder: Path, policy: Path, seed: int = 0, successes: tuple[float, ...] = SUCCESSES, labels: int = 100
+) -> Path:
+    """A finished run of as many rounds as successes, each with a policy of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_options(folder, replace(OPTIONS, seed=seed, rounds=len(successes) - 1, output_dir=folder))
+    for number, success in enumerate(successes):
+        made = folder / f"round_{number:03d}" / "policy" / "checkpoints" / "last" / "pretrained_model"
+        shutil.copytree(policy, made)
+        mark(made, f"{folder} {number}")
+        record = {"round": number, "labels": labels * (number + 1), "episodes": 2 * (number + 1), "beta": 0.0}
+        record |= {"validation_success": success, "validation_episodes": 10}
+        append_jsonl(
+            folder / "metrics.jsonl", record | {"seconds": {"collect": 1.0, "fit": labels / 100, "validate": 5.0}}
+        )
+    shutil.copytree(policy, folder / "best" / "pretrained_model")
+    (folder / "report.html").write_text("")
+    return folder
+
+
+def make_eval(path: Path, outcomes: list[bool], seed: int = 4_000_000, horizon: int = 8, task: str = "reach") -> Path:
+    """An evaluation with these outcomes."""
+    episodes = tuple(EpisodeResult(seed + i, good, good, 8, 0.0) for i, good in enumerate(outcomes))
+    settings = EvalSettings(horizon, ENV.tolerance)
+    EvalResult(path.parent.name, "panda", task, env_fingerprint(ENV), episodes, settings).write(path)
+    return path

@@ -1,0 +1,202 @@
+"""Two sides of any kind meet on the same episodes; what is measured is not measured again; bad input is one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.evaluation import runner
+
+from .made_runs import ENV, OPTIONS, make_eval, make_policy, make_run, mark
+
+GOOD, BAD = [True] * 19 + [False], [True] * 8 + [False] * 12
+SIZES = ("--eval.n_episodes=2", "--workers=1")
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Path:
+    return make_policy(tmp_path_factory.mktemp("made") / "policy")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def evaluated(monkeypatch) -> list[str]:
+    """The policies that were evaluated, by name."""
+    names: list[str] = []
+    real = runner.evaluate
+
+    def counted(engine, job, seeds, name, *rest):
+        names.append(name)
+        return real(engine, job, seeds, name, *rest)
+
+    monkeypatch.setattr(runner, "evaluate", counted)
+    return names
+
+
+def compare(*words: object) -> int:
+    return main(["compare", *map(str, words)])
+
+
+def result(folder: Path = Path("runs/compare")) -> dict:
+    return json.loads((folder / "compare.json").read_text())
+
+
+def error(capsys) -> str:
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_two_evaluations_are_compared_as_they_are(here, capsys, evaluated):
+    make_eval(here / "a" / "eval.json", BAD)
+    make_eval(here / "b" / "eval.json", GOOD)
+    assert compare("a/eval.json", "b") == 0
+    out = capsys.readouterr().out
+    assert "b is better than a/eval.json by 55.0 points [" in out
+    assert "next: manip-il study --help" in out
+    data = result()
+    assert (data["n_episodes"], data["only_left"], data["only_right"]) == (20, 0, 11)
+    assert data["p_value"] == pytest.approx(2 / 2**11)
+    assert evaluated == []
+
+
+def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
+    make_run(here / "a", policy)
+    make_run(here / "b", policy, successes=(0.2, 0.6, 0.4, 0.9), labels=60)
+    assert compare("a", "b", *SIZES, "--at=labels", "--checkpoint=last") == 0
+    pair = result()["training_seeds"][0]
+    assert result()["rule"] == {"checkpoint": "last", "at": "labels", "limit": 240}
+    assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
+    assert pair["right"]["policy"] == "b/round_003/policy/checkpoints/last/pretrained_model"
+    assert pair["left"]["n_episodes"] == 2
+    assert result()["test_seeds"] == [4_000_000, 4_000_001]
+    out = capsys.readouterr().out
+    assert "within 240 labels" in out
+    assert f"No difference shown between b and a: {'+0.0 points'}" in out
+    assert "compare a b --eval.disturbance=standard --output_dir=runs/compare_disturbed --checkpoint=last" in out
+    assert compare("a", "b", *SIZES, "--overwrite=true") == 0
+    pair = result()["training_seeds"][0]
+    assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
+
+
+def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(here, policy, evaluated, capsys):
+    make_run(here / "a", policy)
+    make_run(here / "b", policy)
+    assert compare("a", "b", *SIZES) == 0
+    assert evaluated == ["a", "b"]
+    first = result()
+    assert compare("a", "b", *SIZES, "--resume=true") == 0
+    assert evaluated == ["a", "b"]
+    assert result() == first
+    mark(here / "b" / "round_001/policy/checkpoints/last/pretrained_model", "trained anew")
+    assert compare("a", "b", *SIZES, "--resume=true") == 0
+    assert evaluated == ["a", "b", "b"]
+    capsys.readouterr()
+    assert compare("a", "b", *SIZES, "--resume=true", "--checkpoint=last") == 1
+    assert "--checkpoint differs" in error(capsys)
+    assert compare("a", "b", *SIZES) == 2
+    assert "exists already" in error(capsys)
+
+
+def test_training_seeds_are_matched_by_number(here, policy, capsys):
+    for seed in (0, 1):
+        make_run(here / "a" / f"seed_{seed}", policy, seed)
+    for seed in (1, 2, 0):
+        make_run(here / "b" / f"seed_{seed}", policy, seed)
+    assert compare("a", "b", *SIZES) == 0
+    out, err = capsys.readouterr()
+    assert "warning: b: training seeds 2 have no partner and are left out" in err
+    assert "on average over 2 training seeds" in out
+    assert [pair["left_seed"] for pair in result()["training_seeds"]] == [0, 1]
+    assert [pair["right"]["name"] for pair in result()["training_seeds"]] == ["b/seed_0", "b/seed_1"]
+
+
+def test_a_policy_meets_a_run_in_the_runs_environment(here, policy, evaluated):
+    make_run(here / "a", policy)
+    shutil.copytree(policy, here / "p")
+    assert compare("p", "a", *SIZES) == 0
+    assert result()["settings"]["horizon"] == ENV.horizon
+    assert compare("p", "a", *SIZES, "--overwrite=true", "--seed=1") == 0
+    assert result()["test_seeds"][0] == 114_000_000
+    assert evaluated == ["p", "a"] * 2
+
+
+def test_a_run_that_is_not_finished_is_said_to_be_so(here, policy, capsys):
+    make_run(here / "a", policy)
+    shutil.rmtree(make_run(here / "b", policy) / "best")
+    assert compare("a", "b", *SIZES) == 0
+    assert "warning: b is not finished: the 3 rounds that it has count" in capsys.readouterr().err
+
+
+def sides(here: Path, policy: Path) -> None:
+    """What the bad input below names."""
+    make_run(here / "run", policy)
+    make_run(here / "seeds" / "seed_0", policy, 0)
+    make_run(here / "other_seeds" / "seed_5", policy, 5)
+    make_run(here / "named_wrong" / "seed_3", policy, 4)
+    shutil.copytree(policy, here / "policy")
+    make_eval(here / "two" / "eval.json", [True, False])
+    make_eval(here / "three" / "eval.json", [True, False, True])
+    make_eval(here / "elsewhere" / "eval.json", [True, False], seed=9_000_000)
+    make_eval(here / "long" / "eval.json", [True, False], horizon=100)
+    make_eval(here / "lift" / "eval.json", [True, False], task="lift")
+    (here / "broken.json").write_text("{")
+    (here / "empty").mkdir()
+    make_run(here / "fresh", policy)
+    (here / "fresh" / "metrics.jsonl").unlink()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["nowhere", "run"], 2, "nowhere does not exist; expected an eval.json, a policy, a run"),
+        (["empty", "run"], 2, "empty holds nothing to compare"),
+        (["broken.json", "two"], 1, "broken.json is not whole JSON"),
+        (["run", "run"], 2, "compared with itself"),
+        (["run"], 2, "RIGHT is missing"),
+        (["fresh", "run"], 1, "fresh has no finished round yet"),
+        (["run", "seeds"], 2, "run is one policy, seeds holds 1 training seeds"),
+        (["seeds", "other_seeds"], 2, "no training seed is shared: seeds has 0, other_seeds 5"),
+        (["named_wrong", "seeds"], 1, "training seed differs"),
+        (["policy", "run", "--at=labels"], 2, "--at=labels: policy is a policy and has no rounds"),
+        (["two", "three", "--at=seconds"], 2, "two is an evaluation and has no rounds"),
+        (["run", "policy", "--at=label"], 2, "did you mean 'labels'?"),
+        (["run", "seeds/seed_0", "--at=labels:50"], 2, "run has no round within 50 labels; its first took 100 labels"),
+        (["run", "seeds/seed_0", "--at=labels:900"], 2, "not every run got that far, one ended at 300 labels"),
+        (["run", "policy", "--checkpoint=first"], 2, "one of best, last"),
+        (["run", "policy", "--eval.n_episodes=0"], 2, "expected at least 1"),
+        (["two", "three"], 1, "two has 2, three 3, of which 2 are the same"),
+        (["two", "elsewhere"], 1, "share no seed"),
+        (["two", "long"], 1, "settings differs"),
+        (["two", "lift"], 1, "task differs: two has reach, lift has lift"),
+        (["three", "run", "--eval.n_episodes=2"], 1, "three has 3, this comparison 2, of which 2 are the same"),
+        (["lift", "run", "--eval.n_episodes=2"], 1, "task differs: lift has lift, this comparison has reach"),
+        (["run", "policy", "--seed=1001"], 2, "seed is 1001"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_input_is_one_line_before_any_episode(words, code, line, here, policy, capsys, evaluated):
+    sides(here, policy)
+    assert compare(*words) == code
+    assert line in error(capsys)
+    assert evaluated == []
+    assert not (here / "runs").is_dir() or not list((here / "runs").iterdir())
+
+
+def test_runs_of_other_environments_are_refused_by_name(here, policy, capsys):
+    make_run(here / "a", policy)
+    make_run(here / "b", policy)
+    config = here / "b" / "config.yaml"
+    config.write_text(config.read_text().replace("tolerance: 0.02", "tolerance: 0.03"))
+    assert compare("a", "b", *SIZES) == 1
+    assert "tolerance differs: a has 0.02, b has 0.03" in error(capsys)
+    assert OPTIONS.env.tolerance == 0.02

@@ -1,0 +1,237 @@
+"""A study runs what is not there, compares all of it, and says in one line what is wrong with its file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.main import main
+from manip_il.cli.study_file import read_plan
+from manip_il.evaluation import runner
+
+from .made_runs import make_policy, make_run
+
+FILE = """
+common:
+  task.type: reach
+  env: {horizon: 8}
+  rounds: 2
+  policy: {width: 16}
+arms:
+  cloning: {method: cloning}
+  dagger:
+training_seeds: 2
+eval: {n_episodes: 2}
+at: labels
+target: 0.6
+"""
+TINY = """
+common:
+  task: {type: reach}
+  env: {horizon: 30}
+  demonstrations: 2
+  rounds: 1
+  episodes_per_round: 2
+  steps: 30
+  policy: {width: 16}
+  validation_episodes: 2
+arms:
+  cloning: {method: cloning}
+  dagger: {}
+training_seeds: 1
+eval: {n_episodes: 4}
+"""
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory) -> Path:
+    return make_policy(tmp_path_factory.mktemp("made") / "policy")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.yaml").write_text(FILE)
+    return tmp_path
+
+
+@pytest.fixture
+def runs(policy, monkeypatch) -> list[DaggerOptions]:
+    """Stands in for `manip-il dagger`; what it was asked for."""
+    asked: list[DaggerOptions] = []
+
+    def run(options: DaggerOptions) -> None:
+        asked.append(options)
+        successes = (0.2, 0.4, 0.6) if options.method == "dagger" else (0.2, 0.2, 0.4)
+        make_run(options.output_dir, policy, options.seed, successes)
+
+    monkeypatch.setattr(DaggerOptions, "run", run)
+    return asked
+
+
+def study(*words: str) -> int:
+    return main(["study", "x.yaml", "--output_dir=s", "--workers=1", *words])
+
+
+def error(capsys) -> str:
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs):
+    assert study() == 0
+    assert [str(options.output_dir) for options in runs] == [
+        "s/cloning/seed_0",
+        "s/dagger/seed_0",
+        "s/cloning/seed_1",
+        "s/dagger/seed_1",
+    ]
+    assert [options.seed for options in runs] == [0, 0, 1, 1]
+    assert [options.method for options in runs[:2]] == ["cloning", "dagger"]
+    assert all(options.env.horizon == 8 and options.policy == {"width": 16} for options in runs)
+    assert all(options.resume and options.workers == 1 for options in runs)
+
+
+def test_the_answer_is_printed_and_written(here, runs, capsys):
+    assert study() == 0
+    out = capsys.readouterr().out
+    assert "No difference shown between dagger and cloning: +0.0 points" in out
+    assert "within 300 labels (the most that every run reached)" in out
+    assert "next: manip-il compare s/dagger s/cloning --at=seconds --output_dir=s_seconds" in out
+    data = json.loads((here / "s" / "study.json").read_text())
+    assert data["baseline"] == "cloning"
+    assert data["rule"] == {"checkpoint": "best", "at": "labels", "limit": 300}
+    first = data["arms"]["dagger"]["training_seeds"][0]
+    assert (first["chosen"]["round"], first["first_at_target"]["labels"], first["n_episodes"]) == (2, 300, 2)
+    assert data["arms"]["cloning"]["training_seeds"][1]["first_at_target"] is None
+    assert "| dagger | 300 | 6 |" in (here / "s" / "table.md").read_text()
+    page = (here / "s" / "report.html").read_text()
+    assert page.count('class="curve"') == 3
+    assert "dagger, training seed 1, collect and fit" in page
+
+
+def test_finished_runs_and_evaluations_are_not_made_again(here, runs, monkeypatch):
+    tested: list[str] = []
+    real = runner.evaluate
+    monkeypatch.setattr(runner, "evaluate", lambda *words, **more: tested.append(words[3]) or real(*words, **more))
+    assert study() == 0
+    assert (len(runs), len(tested)) == (4, 4)
+    (here / "s" / "dagger" / "seed_1" / "report.html").unlink()  # the last that a run writes
+    for path in (here / "s" / "dagger" / "seed_1").iterdir():
+        path.rename(here / path.name)
+    assert study("--resume=true") == 0
+    assert [str(options.output_dir) for options in runs[4:]] == ["s/dagger/seed_1"]
+    assert len(tested) == 4  # its policies came out the same
+    assert study("--resume=true", "--training_seeds=3") == 0
+    assert [str(options.output_dir) for options in runs[5:]] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+    assert tested[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "name"),
+    [
+        ("rounds: 2", "rounds: 3", "common.rounds"),
+        ("dagger:", "dagger: {beta: 'constant:0.5'}", "arms.dagger"),
+        ("n_episodes: 2", "n_episodes: 3", "eval.n_episodes"),
+        ("at: labels", "at: end", "at"),
+        ("training_seeds: 2", "training_seeds: 1", "training_seeds"),
+        ("  cloning: {method: cloning}\n", "", "arms.cloning.method"),
+    ],
+)
+def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs, capsys):
+    assert study() == 0
+    assert before in FILE
+    (here / "x.yaml").write_text(FILE.replace(before, after))
+    capsys.readouterr()
+    assert study("--resume=true") == 1
+    assert f"{name} differs: s/study.yaml has" in error(capsys)
+    assert len(runs) == 4
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("training_seeds:", "trainig_seeds:", "did you mean 'training_seeds'?"),
+        ("rounds: 2", "round: 2", "unknown key in x.yaml: common: 'round' (did you mean 'rounds'?)"),
+        ("method: cloning", "metod: cloning", "x.yaml: arms.cloning: 'metod' (did you mean 'method'?)"),
+        ("method: cloning", "method: clone", "x.yaml: arms.cloning: method: expected one of dagger, cloning, dart"),
+        ("rounds: 2", "rounds: -1", "x.yaml: arm 'cloning': rounds is -1"),
+        ("rounds: 2", "seed: 2", "x.yaml: common: seed is set by the study itself"),
+        ("method: cloning", "output_dir: y", "arms.cloning: output_dir is set by the study itself"),
+        ("dagger:\n", "dagger: 3\n", "arms.dagger: expected a mapping"),
+        ("  dagger:", "  ../dagger:", "named '../dagger', which becomes a folder"),
+        ("  dagger:", "  evaluations:", "and not evaluations"),
+        ("target: 0.6", "target: 60", "target is 60.0; expected a share"),
+        ("target: 0.6", "baseline: clonning", "did you mean 'cloning'?"),
+        ("at: labels", "at: label", "did you mean 'labels'?"),
+        ("training_seeds: 2", "training_seeds: 0", "training_seeds is 0"),
+        ("n_episodes: 2", "n_episodes: 0", "eval.n_episodes is 0"),
+        ("method: cloning", "env.horizon: 9", "horizon differs: arm 'cloning' has 9, arm 'dagger' has 8"),
+        (FILE, "", "arms is empty"),
+        (FILE, "- 1", "expected a mapping"),
+    ],
+)
+def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after, words, here, runs, capsys):
+    assert before in FILE
+    (here / "x.yaml").write_text(FILE.replace(before, after, 1))
+    assert study() in (1, 2)
+    assert words in error(capsys)
+    assert runs == []
+    assert not (here / "s").exists()
+
+
+def test_a_file_that_is_not_there_is_one_line(tmp_path, capsys):
+    assert main(["study", str(tmp_path / "y.yaml")]) == 2
+    assert "cannot read" in error(capsys)
+
+
+def test_the_baseline_is_the_first_arm_unless_named(here):
+    assert read_plan(here / "x.yaml", None).baseline == "cloning"
+    (here / "x.yaml").write_text(FILE + "baseline: dagger\n")
+    assert read_plan(here / "x.yaml", 5).baseline == "dagger"
+    assert read_plan(here / "x.yaml", 5).file.training_seeds == 5
+
+
+@pytest.mark.slow
+def test_a_killed_study_goes_on_to_the_same_answer(tmp_path, capsys):
+    (tmp_path / "x.yaml").write_text(TINY)
+    words = ["study", str(tmp_path / "x.yaml"), "--workers=1"]
+    command = [sys.executable, "-m", "manip_il.cli.main", *words, f"--output_dir={tmp_path / 'cut'}"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    while not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
+        assert process.poll() is None, "it ended before it was killed"
+        time.sleep(0.005)
+    process.kill()
+    process.wait()
+    done = (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes()
+    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
+    assert (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes() == done
+    assert main([*words, f"--output_dir={tmp_path / 'whole'}"]) == 0
+    assert answer(tmp_path / "cut") == answer(tmp_path / "whole")
+    capsys.readouterr()
+    left, right = tmp_path / "cut" / "cloning", tmp_path / "whole" / "dagger"
+    compared = ["compare", str(left), str(right), "--eval.n_episodes=4", "--workers=1", "--at=seconds:9999"]
+    assert main([*compared, f"--output_dir={tmp_path / 'c'}"]) == 2
+    assert "not every run got that far" in error(capsys)
+    assert main([*compared[:-1], f"--output_dir={tmp_path / 'c'}"]) == 0
+    assert json.loads((tmp_path / "c" / "compare.json").read_text())["n_episodes"] == 4
+
+
+def answer(folder: Path):
+    """What a study found, without times and places."""
+    data = json.loads((folder / "study.json").read_text())
+    gone = ("seconds", "validating_seconds", "name", "policy", "evaluation")
+
+    def strip(value):
+        if isinstance(value, dict):
+            return {key: strip(inner) for key, inner in value.items() if key not in gone}
+        return [strip(inner) for inner in value] if isinstance(value, list) else value
+
+    return strip(data)

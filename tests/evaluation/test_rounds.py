@@ -1,0 +1,124 @@
+"""Which round a comparison takes follows from the rule and the validation alone."""
+
+from typing import Any
+
+import pytest
+
+from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.rounds import (
+    Rule,
+    budget,
+    choose,
+    curve_points,
+    first_reaching,
+    history,
+    largest_dip,
+)
+
+SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
+
+
+def records(successes: tuple[float, ...] = SUCCESS, labels: int = 100, seconds: float = 10.0) -> list[dict[str, Any]]:
+    return [
+        {
+            "round": i,
+            "labels": labels * (i + 1),
+            "queries": labels * (i + 1) + 5,
+            "episodes": 3 * (i + 1),
+            "validation_success": success,
+            "validation_episodes": 10,
+            "seconds": {"collect": seconds / 4, "fit": 3 * seconds / 4, "validate": 100.0},
+        }
+        for i, success in enumerate(successes)
+    ]
+
+
+RUN = history(records(), "runs/x")
+
+
+def test_wall_clock_adds_up_without_validating():
+    assert [one.seconds for one in RUN] == [10, 20, 30, 40, 50]
+    assert RUN[-1].validating == 500
+    assert (RUN[2].labels, RUN[2].queries, RUN[2].episodes) == (300, 305, 9)
+    assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
+    assert RUN[1].words == "round 1: 200 labels, 6 episodes, 20.0 s"
+
+
+def test_the_order_of_the_lines_does_not_matter():
+    assert history(records()[::-1], "x") == RUN
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([], "no finished round"),
+        (records()[1:], "no round 0"),
+        ([records()[0], records()[0]], "no round 1"),
+        ([{"step": 100, "loss": 0.1, "round": 0}], "not of manip-il dagger"),
+        ([records()[0] | {"seconds": None}], "not of manip-il dagger"),
+    ],
+)
+def test_lines_that_are_no_runs_are_refused_by_name(lines, words):
+    with pytest.raises(ManipError, match=words) as error:
+        history(lines, "runs/x")
+    assert "runs/x" in str(error.value)
+
+
+def test_best_is_the_later_of_equals_and_last_is_last():
+    assert choose(Rule("best"), RUN, None, "x").round == 3
+    assert choose(Rule("last"), RUN, None, "x").round == 4
+
+
+@pytest.mark.parametrize(
+    ("at", "best", "last"), [("labels:450", 3, 3), ("labels:399", 1, 2), ("episodes:6", 1, 1), ("seconds:20", 1, 1)]
+)
+def test_rounds_count_up_to_the_amount(at: str, best: int, last: int):
+    for checkpoint, expected in (("best", best), ("last", last)):
+        rule = Rule.parse(checkpoint, at)
+        assert choose(rule, RUN, budget(rule, [RUN]), "x").round == expected
+
+
+def test_without_an_amount_it_is_what_every_run_reached():
+    shorter = history(records((0.1, 0.2, 0.3), labels=120, seconds=40), "y")
+    amounts = {at: budget(Rule.parse("last", at), [RUN, shorter]) for at in ("end", "labels", "episodes", "seconds")}
+    assert amounts == {"end": None, "labels": 360, "episodes": 9, "seconds": 50}
+    rule = Rule.parse("last", "seconds")
+    assert [choose(rule, run, 50, "x").round for run in (RUN, shorter)] == [4, 0]
+
+
+def test_an_amount_that_no_round_is_within_or_not_every_run_reached_is_refused():
+    rule = Rule.parse("best", "labels:99")
+    with pytest.raises(UsageError, match=r"runs/x has no round within 99 labels; its first took 100 labels"):
+        choose(rule, RUN, budget(rule, [RUN]), "runs/x")
+    with pytest.raises(UsageError, match="one ended at 500 labels"):
+        budget(Rule.parse("best", "labels:501"), [RUN])
+
+
+@pytest.mark.parametrize("at", ["end:5", "labels:", "labels:-1", "labels:nan", "seconds:many", "seconds:inf"])
+def test_an_amount_that_is_none_is_refused(at: str):
+    with pytest.raises(UsageError, match="labels:5000"):
+        Rule.parse("best", at)
+
+
+def test_an_unknown_way_is_answered_with_the_nearest():
+    with pytest.raises(UsageError, match="did you mean 'labels'"):
+        Rule.parse("best", "lables:3")
+
+
+def test_the_target_is_reached_when_it_first_is():
+    at = first_reaching(RUN, 0.85)
+    assert at is not None
+    assert at.labels == 200
+    assert first_reaching(RUN, 0.95) is None
+
+
+def test_a_dip_is_measured_from_the_best_before():
+    assert largest_dip(RUN) == pytest.approx(0.2)
+    assert largest_dip(RUN[:2]) == 0
+    assert largest_dip(history(records((0.9, 0.1, 0.95)), "x")) == pytest.approx(0.8)
+
+
+def test_the_curve_holds_all_that_a_round_had_cost():
+    point = curve_points(RUN)[2]
+    assert (point.labels, point.episodes, point.seconds, point.name) == (300, 9, 30.0, "round 2")
+    assert point.success == RUN[2].validation
