@@ -216,19 +216,19 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
         command=command_line("dagger", options),
         rows=tuple(rows),
         facts=tuple(facts),
-        curve=learning_curve(results),
+        curve=learning_curve(options.output_dir),
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
         timings=round_timings(options.output_dir),
     )
 
 
-def learning_curve(results: list[RoundResult]) -> LearningCurve:
-    """Validation success over labels, one point a round."""
-    from manip_il.evaluation.report_data import CurvePoint, LearningCurve
+def learning_curve(folder: Path) -> LearningCurve:
+    """Validation success over labels, episodes and wall-clock, one point a round."""
+    from manip_il.evaluation.report_data import LearningCurve
+    from manip_il.evaluation.rounds import curve_points, history
 
-    points = [CurvePoint(r.labels, r.validation.success, f"round {r.round}") for r in results]
-    return LearningCurve(dagger=tuple(points))
+    return LearningCurve(dagger=curve_points(history(read_jsonl(folder / METRICS_FILE), str(folder))))
 
 
 def round_timings(folder: Path) -> dict[str, float]:

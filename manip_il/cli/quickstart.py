@@ -190,7 +190,7 @@ class _Story:
         nominal, disturbed = measured["nominal"], measured["disturbed"]
         rows = [PolicyRow.of(w.name, nominal[w.key], w.labels, disturbed[w.key], w.kind) for w in contestants]
         pairs = [(cloned, dagger), (more, dagger)]
-        curve = learning_curve(results)
+        curve = learning_curve(self.folder / "dagger")
         points = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
         return Report(
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",

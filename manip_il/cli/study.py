@@ -13,12 +13,14 @@ from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, check_same_options, o
 from manip_il.cli.measure import Trial, check_policies, measured, rule_json
 from manip_il.cli.options import to_plain
 from manip_il.cli.progress import say
+from manip_il.cli.shared_start import share_start
 from manip_il.cli.sides import Source, limit_of, run_finished, run_history
 from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
 from manip_il.evaluation.comparison import Arm, write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
 
 if TYPE_CHECKING:
+    from manip_il.cli.dagger import DaggerOptions
     from manip_il.evaluation.study_report import StudyReport
 
 FREE = ("workers", "engine", "output_dir", "file", "training_seeds")  # what the file says is compared by itself
@@ -74,8 +76,13 @@ class StudyOptions:
             if (folder / REPORT_FILE).is_file() and run_finished(folder):  # the report is what a run writes last
                 continue
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
-            options = replace(plan.arms[name], seed=seed, output_dir=folder, resume=True, overwrite=False)
-            replace(options, engine=self.engine, workers=self.workers).run()
+            options = self._options(plan, name, seed)
+            share_start(options, [self._options(plan, other, seed) for other in plan.arms if other != name])
+            options.run()
+
+    def _options(self, plan: Plan, name: str, seed: int) -> DaggerOptions:
+        own = replace(plan.arms[name], seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
+        return replace(own, engine=self.engine, workers=self.workers)
 
     def _test(self, plan: Plan) -> Study:
         from manip_il.cli.stages import Stages
