@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report_data import LearningCurve, Report
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
+METHOD_NAMES = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}
 FREE = ("workers", "engine", "output_dir")
 
 
@@ -197,7 +198,7 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
     from manip_il.evaluation.results import compare_results
 
     best = best_round(results)
-    kind = {"dagger": "DAgger", "cloning": "cloning", "dart": "DART"}[config.method]
+    kind = METHOD_NAMES[config.method]
     names = ["cloning (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
     rows = [
         PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
@@ -216,19 +217,19 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
         command=command_line("dagger", options),
         rows=tuple(rows),
         facts=tuple(facts),
-        curve=learning_curve(options.output_dir),
+        curve=learning_curve(options.output_dir, kind),
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
         timings=round_timings(options.output_dir),
     )
 
 
-def learning_curve(folder: Path) -> LearningCurve:
-    """Validation success over labels, episodes and wall-clock, one point a round."""
+def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
+    """Validation success over labels, episodes and wall-clock, one point a round. name: what made the rounds."""
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.evaluation.rounds import curve_points, history
 
-    return LearningCurve(dagger=curve_points(history(read_jsonl(folder / METRICS_FILE), str(folder))))
+    return LearningCurve(dagger=curve_points(history(read_jsonl(folder / METRICS_FILE), str(folder))), name=name)
 
 
 def round_timings(folder: Path) -> dict[str, float]:

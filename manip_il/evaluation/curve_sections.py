@@ -14,7 +14,7 @@ from manip_il.evaluation.svg import Axis
 def curve(data: LearningCurve) -> str:
     """The learning curve with its legend, and its numbers for those who cannot see it."""
     legend = [
-        ("dagger", "DAgger, one point a round", bool(data.dagger)),
+        ("dagger", f"{data.name}, one point a round", bool(data.dagger)),
         ("cloning", "behaviour cloning", bool(data.cloning)),
         ("expert", f"expert, {data.expert and format_percent(data.expert.rate)}", data.expert is not None),
         ("target", f"target, {data.target and format_percent(data.target)}", data.target is not None),
@@ -46,7 +46,7 @@ def plots(drawn: Sequence[tuple[str, str]]) -> str:
 
 
 def _curve_table(data: LearningCurve) -> str:
-    rows = [(kind, point) for kind, points in (("DAgger", data.dagger), ("cloning", data.cloning)) for point in points]
+    rows = [(kind, point) for kind, points in ((data.name, data.dagger), ("cloning", data.cloning)) for point in points]
     return sections.pairs({_point_name(kind, point): str(point.success) for kind, point in rows})
 
 

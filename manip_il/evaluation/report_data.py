@@ -82,9 +82,9 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """Validation success over what it cost: DAgger's rounds in order, cloning at labels of its own.
+    """Validation success over what it cost: a run's rounds in order, cloning at labels of its own.
 
-    target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a logarithmic axis where labels span a
+    name: what made the rounds. target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a logarithmic axis where labels span a
     factor of 20 or more.
     """
 
@@ -93,6 +93,7 @@ class LearningCurve:
     expert: Proportion | None = None
     log_x: bool | None = None
     target: float | None = None
+    name: str = "DAgger"
 
     @property
     def points(self) -> tuple[CurvePoint, ...]:
