@@ -84,8 +84,8 @@ class CurvePoint:
 class LearningCurve:
     """Validation success over what it cost: a run's rounds in order, cloning at labels of its own.
 
-    name: what made the rounds. target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a logarithmic axis where labels span a
-    factor of 20 or more.
+    name: what made the rounds. target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a
+    logarithmic axis where labels span a factor of 20 or more.
     """
 
     dagger: tuple[CurvePoint, ...]
