@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -70,7 +72,8 @@ def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
     """
     weights = getattr(config, "pretrained_backbone_weights", None)
     try:
-        policy = make_policy(config, ds_meta=meta)
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
+            policy = make_policy(config, ds_meta=meta)
     except (URLError, OSError) as error:
         if not weights or isinstance(error, FileNotFoundError):
             raise
