@@ -18,7 +18,8 @@ from pathlib import Path
 from _machine import describe_machine
 
 from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.loop import DATASET, RoundResult, round_folder, run_dagger
+from manip_il.dagger.loop import RoundResult, run_dagger
+from manip_il.dagger.rounds import DATASET, round_folder
 from manip_il.data.lerobot_io import read_table
 from manip_il.engine.engine import Engine, default_workers
 from manip_il.expert.expert import Expert

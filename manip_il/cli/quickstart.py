@@ -141,7 +141,8 @@ class _Story:
 
     def _contestants(self, results: list[RoundResult]) -> tuple[Contestant, ...]:
         from manip_il.cli.story import Contestant, clone_with_labels
-        from manip_il.dagger.loop import best_round, round_folder
+        from manip_il.dagger.loop import best_round
+        from manip_il.dagger.rounds import round_folder
 
         first, best = results[0], best_round(results)
         round_0 = round_folder(self.folder / "dagger", 0)

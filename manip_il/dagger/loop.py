@@ -6,44 +6,39 @@ where it was: an episode, a fit's last checkpoint, or an evaluation that is ther
 
 from __future__ import annotations
 
-import itertools
-import logging
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from manip_il.dagger.beta import BetaSchedule
-from manip_il.dagger.collect import (
-    MAX_TRIES,
-    check_journals,
-    collect,
-    collect_successes,
-    provenance,
-    record,
-)
 from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.dart import fitted_noise
-from manip_il.dagger.fitting import branch_steps, check_labels, fit_round, resolved_ask, round_fit
-from manip_il.data import schema
+from manip_il.dagger.fitting import check_labels, fit_round, round_fit
+from manip_il.dagger.rounds import (
+    DATASET,
+    collect_round,
+    count_labels,
+    count_queries,
+    datasets,
+    episodes_of,
+    labels_left,
+    member_path,
+    policy_name,
+    round_folder,
+)
 from manip_il.data.atomic import new_folder
-from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.lerobot_io import dataset_info, merge_datasets, read_tables
+from manip_il.data.lerobot_io import dataset_info, merge_datasets
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.errors import NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
-from manip_il.sim.disturb import STANDARD
 
-_LOG = logging.getLogger(__name__)
-BEST, DATASET, POLICY, HELD_OUT = "best", "dataset", "policy", "held_out"
-HELD_OUT_EPISODES = 10  # of the expert's, on which `dart` measures the learner's errors
+BEST = "best"
 
 
 @dataclass(frozen=True)
@@ -104,7 +99,7 @@ def run_dagger(config: DaggerConfig, folder: Path, engine: Engine, watch: Watch 
     for round_ in range(config.rounds + 1):
         result = _run_round(config, folder, engine, watch, round_, results)
         results.append(result)
-        last = round_ == config.rounds or _left(config, result.labels) == 0
+        last = round_ == config.rounds or labels_left(config, result.labels) == 0
         if last:
             _finish(config, folder, results)
         yield result
@@ -117,23 +112,14 @@ def best_round(results: list[RoundResult]) -> RoundResult:
     return max(results, key=lambda result: (result.validation.success.rate, result.round))
 
 
-def round_folder(folder: Path, round_: int) -> Path:
-    """Where a round keeps its journals, dataset, checkpoint and evaluation."""
-    return folder / f"round_{round_:03d}"
-
-
-def datasets(folder: Path, rounds: int) -> list[Path]:
-    """Those of rounds 0 to `rounds`; a round in which nobody was asked has none."""
-    roots = (round_folder(folder, i) / DATASET for i in range(rounds + 1))
-    return [root for root in roots if root.is_dir()]
-
-
 def _run_round(
     config: DaggerConfig, folder: Path, engine: Engine, watch: Watch, round_: int, results: Sequence[RoundResult]
 ) -> RoundResult:
     here, previous = round_folder(folder, round_), results[-1] if results else None
     clock = {"collect": -time.monotonic()}
-    _collect_round(config, folder, engine, watch, round_, previous)
+    watch.on_stage("collect", round_, episodes_of(config, round_))
+    left = labels_left(config, previous.labels if previous else 0)
+    collect_round(config, folder, engine, round_, previous.policy if previous else None, left, watch.on_episode)
     clock["collect"] += time.monotonic()
     clock["fit"] = -time.monotonic()
     policy = _fit_round(config, folder, watch, round_)
@@ -146,80 +132,14 @@ def _run_round(
     return RoundResult(
         round=round_,
         beta=BetaSchedule.parse(config.beta).at(round_) if config.method == "dagger" else 1.0,
-        labels=_labels(datasets(folder, round_)),
-        queries=(previous.queries if previous else 0) + _queries(config, folder, round_),
+        labels=count_labels(datasets(folder, round_)),
+        queries=(previous.queries if previous else 0) + count_queries(config, folder, round_),
         episodes=(previous.episodes if previous else 0) + len(headers),
         rollout_success=sum(header.success for header in headers) / len(headers),
         policy=policy,
         validation=validation,
         seconds={stage: round(seconds, 2) for stage, seconds in clock.items()},
     )
-
-
-def _collect_round(
-    config: DaggerConfig, folder: Path, engine: Engine, watch: Watch, round_: int, previous: RoundResult | None
-) -> None:
-    """Round 0 and `cloning`: successful demonstrations. Later: every rollout, successful or not."""
-    here = round_folder(folder, round_)
-    if (here / DATASET).is_dir():
-        return
-    journals, repo_id = here / "journals", f"local/{config.env.robot}_{config.env.task}_round_{round_}"
-    left = _left(config, previous.labels if previous else 0)
-    count = config.demonstrations if previous is None else config.episodes_per_round
-    watch.on_stage("collect", round_, count)
-    if previous is None or config.method == "cloning":
-        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
-        recording = Recording(repo_id, True, count, provenance(job), labels=left)
-        stream = "demonstrations" if previous is None else f"round/{round_}"
-        seeds = stream_seeds(stream, MAX_TRIES * count, config.seed)
-        episodes = collect_successes(engine, job, seeds, count, journals, watch.on_episode)
-    else:
-        job = _round_job(config, folder, engine, round_, previous.policy)
-        gated = job.labels != "per_state" or job.ask.kind != "every"
-        recording = Recording(repo_id, provenance=provenance(job), only_labelled=gated, labels=left)
-        seeds = stream_seeds(f"round/{round_}", count, config.seed)
-        disturbed = round(config.disturbed_share * count) if config.method == "dagger" else 0
-        episodes = itertools.chain(
-            collect(engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, watch.on_episode),
-            collect(engine, job, seeds[disturbed:], journals, watch.on_episode),
-        )
-    for line in check_journals(journals, job):
-        _LOG.warning("%s", line)
-    try:
-        record(episodes, journals, here / DATASET, job, recording)
-    except NothingToLearnError:
-        _LOG.warning("round %d: %d rollouts, and in none of them was the expert asked", round_, count)
-
-
-def _round_job(config: DaggerConfig, folder: Path, engine: Engine, round_: int, policy: Path) -> RolloutJob:
-    """The rollouts of a round after the demonstrations."""
-    common = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
-    if config.method == "dart":
-        held_out = _held_out(config, folder, engine)
-        return replace(common, driver="noisy_expert", noise=fitted_noise(policy, held_out))
-    beta = BetaSchedule.parse(config.beta).at(round_)
-    return replace(
-        common,
-        driver="mixture" if beta > 0 else "policy",
-        policy=policy,
-        ensemble=tuple(_member(round_folder(folder, round_ - 1), i) for i in range(1, config.ensemble)),
-        beta=beta,
-        labels=config.label,
-        ask=resolved_ask(config),
-        branch_steps=branch_steps(config),
-    )
-
-
-def _held_out(config: DaggerConfig, folder: Path, engine: Engine) -> Path:
-    """Demonstrations that no policy learns from."""
-    root = folder / HELD_OUT / DATASET
-    if not root.is_dir():
-        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
-        journals = folder / HELD_OUT / "journals"
-        seeds = stream_seeds("held_out", HELD_OUT_EPISODES, config.seed)
-        episodes = collect(engine, job, seeds, journals)
-        record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
-    return root
 
 
 def _fit_round(config: DaggerConfig, folder: Path, watch: Watch, round_: int) -> Path:
@@ -230,39 +150,10 @@ def _fit_round(config: DaggerConfig, folder: Path, watch: Watch, round_: int) ->
     for member in range(config.ensemble):
         name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
         watch.on_stage(name, round_, round_fit(config, warm).total_steps)
-        start = _member(before, member) if warm else None
-        into = here / _policy_name(member)
+        start = member_path(before, member) if warm else None
+        into = here / policy_name(member)
         paths.append(fit_round(config, datasets(folder, round_), into, start, watch.on_log, member))
     return paths[0]
-
-
-def _policy_name(member: int) -> str:
-    return POLICY if member == 0 else f"{POLICY}_{member}"
-
-
-def _member(here: Path, member: int) -> Path:
-    """The checkpoint of one of a round's policies."""
-    return here / _policy_name(member) / "checkpoints" / "last" / "pretrained_model"
-
-
-def _left(config: DaggerConfig, labels: int) -> int | None:
-    """Labels that may still be had; None where there is no limit."""
-    return None if config.label_budget is None else max(0, config.label_budget - labels)
-
-
-def _queries(config: DaggerConfig, folder: Path, round_: int) -> int:
-    """How often the expert was asked in a round."""
-    here = round_folder(folder, round_)
-    ask = resolved_ask(config).kind
-    if config.method == "dagger" and round_ > 0 and (config.label != "per_state" or ask not in ("every", "safety")):
-        return _labels([here / DATASET]) if (here / DATASET).is_dir() else 0
-    folders = [here, folder / HELD_OUT] if config.method == "dart" and round_ == 1 else [here]
-    return sum(read_header(path).frames for one in folders for path in list_episodes(one / "journals"))
-
-
-def _labels(roots: Sequence[Path]) -> int:
-    """Sound labels in datasets."""
-    return int(read_tables(roots, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum())
 
 
 def _validate(config: DaggerConfig, here: Path, engine: Engine, watch: Watch, policy: Path, round_: int) -> EvalResult:

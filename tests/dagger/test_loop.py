@@ -13,7 +13,8 @@ import pytest
 from manip_il.dagger import loop
 from manip_il.dagger.config import DaggerConfig
 from manip_il.dagger.fitting import LEARNING_COLUMNS
-from manip_il.dagger.loop import RoundResult, Watch, best_round, datasets, round_folder, run_dagger
+from manip_il.dagger.loop import RoundResult, Watch, best_round, run_dagger
+from manip_il.dagger.rounds import datasets, round_folder
 from manip_il.data.lerobot_io import dataset_info, read_table, read_tables
 from manip_il.engine.engine import Engine
 from manip_il.evaluation.results import EpisodeResult, EvalResult
