@@ -42,9 +42,9 @@ class DaggerConfig:
     round, of which the first drives.
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
-    the best round is chosen; disjoint from the test's by their stream. hold: end a rollout this many steps after
-    success. disturbed_share: of a round's learner rollouts that run under `manip_il.sim.disturb.STANDARD`; 0 is the
-    algorithm in an undisturbed world. cameras: what is pictured in every round.
+    the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
+    many steps after success. disturbed_share: of a round's learner rollouts that run under
+    `manip_il.sim.disturb.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)

@@ -18,7 +18,7 @@ EPISODE = "episode_index"
 def fitted_noise(policy: Path, root: Path) -> tuple[tuple[float, ...], ...]:
     """The covariance (n, n) of learner minus expert over a dataset of the expert's, for the next round's noise.
 
-    Maximum likelihood for a Gaussian with mean zero (section 4.2 of the paper). Best on data that the policy has not
+    Maximum likelihood for a Gaussian with mean zero, as the paper fits it. Best on data that the policy has not
     learnt from, or its errors are taken for smaller than they are. Raises `ManipError` without a sound label.
     """
     from manip_il.learn.policy import LearnedPolicy

@@ -160,7 +160,7 @@ def _validate(config: DaggerConfig, here: Path, engine: Engine, watch: Watch, po
     path = here / FILE_NAME
     if path.is_file():
         return EvalResult.read(path)
-    job = RolloutJob(config.env, "policy", policy=policy, labels="last")
+    job = RolloutJob(config.env, "policy", policy=policy, labels="last", hold=config.hold)  # solved is solved
     seeds = stream_seeds("validation", config.validation_episodes, config.seed)
     result = evaluate(engine, job, seeds, f"DAgger round {round_}", watch.on_episode)
     result.write(path)

@@ -26,7 +26,7 @@ def evaluate(
     name: str,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> EvalResult:
-    """Run `job` to the horizon on every seed; the result's episodes are in the order of `seeds`.
+    """Run `job` on every seed, to the horizon unless it has a `hold`; episodes are in the order of `seeds`.
 
     A seed that kills its worker again and again is left out, and a warning names it. on_episode: sees every episode
     with its states as it ends, to film it, say.
