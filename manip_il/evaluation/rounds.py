@@ -93,6 +93,9 @@ def curve_points(rounds: History) -> tuple[CurvePoint, ...]:
     )
 
 
+ENOUGH = 0.95  # of an amount that runs are compared at: rounds do not end on the dot
+
+
 @dataclass(frozen=True)
 class Rule:
     """Which round of a run is compared; the same for every run, and fixed before any test episode is seen.
@@ -135,12 +138,12 @@ class Rule:
 def budget(rule: Rule, histories: Sequence[History]) -> float | None:
     """How much of `rule.axis` every run may have used: given, or the largest that all reached; None for no limit.
 
-    Raises `UsageError` where not every run reached what is given.
+    Raises `UsageError` where a run ended at less than `ENOUGH` of what is given.
     """
     if rule.axis == END:
         return None
     reached = min(rounds[-1].amount(rule.axis) for rounds in histories)
-    if rule.amount is not None and reached < rule.amount:
+    if rule.amount is not None and reached < ENOUGH * rule.amount:
         raise UsageError(
             f"--at={rule}: not every run got that far, one ended at {format_amount(rule.axis, reached)}; "
             f"--at={rule.axis} takes the most that all reached"
