@@ -27,17 +27,8 @@ from manip_il.learn.policy_config import PolicyFitConfig
 from manip_il.learn.setup import load_samples, set_features, usable_statistics
 from manip_il.learn.sources import LibrarySource, MemorySource
 
-ACT = {
-    "type": "act",
-    "device": "cpu",
-    "chunk_size": 4,
-    "n_action_steps": 2,
-    "dim_model": 16,
-    "n_heads": 2,
-    "dim_feedforward": 16,
-    "n_encoder_layers": 1,
-    "n_vae_encoder_layers": 1,
-}
+from .tiny import ACT
+
 DIFFUSION = {
     "type": "diffusion",
     "device": "cpu",

@@ -20,17 +20,7 @@ from manip_il.learn.order import ShuffledRows, WeightedRows, order_of
 from manip_il.learn.policy_config import PolicyFitConfig
 from manip_il.learn.sources import JoinedFrames
 
-TINY_ACT = {
-    "type": "act",
-    "device": "cpu",
-    "chunk_size": 4,
-    "n_action_steps": 2,
-    "dim_model": 16,
-    "n_heads": 2,
-    "dim_feedforward": 16,
-    "n_encoder_layers": 1,
-    "n_vae_encoder_layers": 1,
-}
+from .tiny import ACT
 
 
 def test_rows_are_drawn_as_often_as_they_weigh():
@@ -71,7 +61,7 @@ def two(tmp_path_factory) -> list[Path]:
 
 
 def trainer(roots, folder: Path, weights=None) -> PolicyTrainer:
-    config = PolicyFitConfig(policy_config(TINY_ACT), steps=4, batch_size=8, save_freq=4, log_freq=2, eval_split=0.0)
+    config = PolicyFitConfig(policy_config(ACT), steps=4, batch_size=8, save_freq=4, log_freq=2, eval_split=0.0)
     meta = CheckpointMeta.of(read_spec(roots[0]))
     return PolicyTrainer(roots, config, folder, meta, weights=weights)
 
