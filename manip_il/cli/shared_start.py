@@ -36,7 +36,7 @@ def share_start(options: DaggerOptions, others: Iterable[DaggerOptions]) -> bool
         return False
     for other in others:
         records = read_jsonl(other.output_dir / METRICS_FILE)
-        if same_start(options, other) and records:
+        if same_start(options, other) and records and (other.output_dir / ROUND_0).is_dir():
             with new_folder(options.output_dir) as folder:
                 shutil.copytree(other.output_dir / ROUND_0, folder / ROUND_0, symlinks=True)
                 atomic_write(folder / METRICS_FILE, json.dumps(records[0]) + "\n")

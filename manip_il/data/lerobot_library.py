@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -65,7 +67,8 @@ def _save(dataset: LeRobotDataset) -> None:
 def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
     """LeRobot's own joining of datasets into `root`, which must not exist; every video stays a file of its own."""
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
-    aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+    with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
+        aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
 
 
 class Metadata(LeRobotDatasetMetadata):

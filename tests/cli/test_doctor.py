@@ -27,6 +27,7 @@ def episode(seed: int, length: int = 6) -> Episode:
         shape = (length, *feature["shape"])
         columns[key] = rng.integers(0, 2, shape).astype(feature["dtype"])
     columns[s.SEED][:], columns[s.SUCCESS][:] = seed, True
+    columns[s.DONE][:, 0] = np.arange(length) == length - 1
     return Episode(seed, columns, True, True)
 
 

@@ -72,6 +72,7 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
         make_run(options.output_dir, policy, options.seed, successes)
 
     monkeypatch.setattr(DaggerOptions, "run", run)
+    monkeypatch.setattr("manip_il.cli.study.share_start", lambda options, others: False)  # made runs begin whole
     return asked
 
 

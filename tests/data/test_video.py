@@ -18,6 +18,7 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data import video
+from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.lerobot_io import (
     VideoConfig,
     camera_keys,
@@ -27,6 +28,7 @@ from manip_il.data.lerobot_io import (
     new_dataset,
     read_episodes,
     read_frames,
+    read_provenance,
     read_spec,
     read_table,
     video_rows,
@@ -268,6 +270,18 @@ def test_names_and_numbers_that_are_not_there_are_refused(root: Path) -> None:
         read_frames(root, FRONT, 3)
 
 
+def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path: Path, root: Path) -> None:
+    info = merge_datasets([root, root], tmp_path / "merged", repo_id="x/y", provenance={"made": "here"})
+    assert (info.episodes, info.frames) == (6, 42)
+    assert not has_errors(examine_folder(tmp_path / "merged"))
+    assert read_spec(tmp_path / "merged") == read_spec(root)
+    assert read_provenance(tmp_path / "merged")["made"] == "here"
+    for camera in (FRONT, WRIST):
+        for episode in range(6):
+            here, there = read_frames(tmp_path / "merged", camera, episode), read_frames(root, camera, episode % 3)
+            np.testing.assert_array_equal(here, there)
+
+
 def test_a_dataset_with_cameras_tells_of_itself(
     tmp_path: Path, root: Path, filmed: list[Episode], two: s.RobotTaskSpec
 ) -> None:
@@ -275,8 +289,6 @@ def test_a_dataset_with_cameras_tells_of_itself(
     assert (dataset_info(root).episodes, dataset_info(root).frames) == (3, 21)
     assert FRONT not in read_table(root)
     assert read_spec(root) == two
-    with pytest.raises(ManipError, match="has cameras"):
-        merge_datasets([root, root], tmp_path / "merged", repo_id="x/y")
     write(filmed, tmp_path / "lift", two)
     (tmp_path / "lift" / layout.OURS).unlink()  # as LeRobot's tools do
     assert (read_spec(tmp_path / "lift").cameras, read_spec(tmp_path / "lift").image_size) == (

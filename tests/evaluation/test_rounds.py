@@ -91,7 +91,8 @@ def test_an_amount_that_no_round_is_within_or_not_every_run_reached_is_refused()
     with pytest.raises(UsageError, match=r"runs/x has no round within 99 labels; its first took 100 labels"):
         choose(rule, RUN, budget(rule, [RUN]), "runs/x")
     with pytest.raises(UsageError, match="one ended at 500 labels"):
-        budget(Rule.parse("best", "labels:501"), [RUN])
+        budget(Rule.parse("best", "labels:527"), [RUN])
+    assert budget(Rule.parse("best", "labels:526"), [RUN]) == 526  # rounds do not end on the dot
 
 
 @pytest.mark.parametrize("at", ["end:5", "labels:", "labels:-1", "labels:nan", "seconds:many", "seconds:inf"])
