@@ -28,7 +28,7 @@ from manip_il.sim import render
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.look import FILM, CameraConfig, Look
 from manip_il.sim.robot import ROBOTS
-from manip_il.sim.scene import CAMERAS
+from manip_il.sim.world import CAMERAS
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # of one expert episode, evenly apart

@@ -13,7 +13,8 @@ from manip_il.expert.skills import CUBE_WIDTH, Geometry, Target, angle_between, 
 from manip_il.mdp import Label, Phase, State
 from manip_il.sim.observe import cube_yaw
 from manip_il.sim.scene import Scene
-from manip_il.sim.task import CUBE_HALF_SIZE, in_reach
+from manip_il.sim.task import in_reach
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 F64 = NDArray[np.float64]
 

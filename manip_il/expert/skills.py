@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError
 from manip_il.mdp import Phase
-from manip_il.sim.task import CUBE_HALF_SIZE
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 F64 = NDArray[np.float64]
 

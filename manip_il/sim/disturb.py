@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
 from manip_il.seeding import rng_for
+from manip_il.sim.conditions import Circumstances
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.task import CUBE_HALF_SIZE, in_reach
+from manip_il.sim.task import in_reach
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 F64 = NDArray[np.float64]
 _MAX_DRAWS = 100
@@ -126,15 +128,16 @@ def _move_object(env: ManipEnv, rng: np.random.Generator, distance: tuple[float,
     if scene.object_q is None or scene.object_v is None:
         return False
     start = data.qpos[scene.object_q : scene.object_q + 7].copy()
+    half = float(scene.model.geom("object").size[2])
     for _ in range(_MAX_DRAWS):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
         pose = start.copy()
         pose[:2] += length * np.array([np.cos(angle), np.sin(angle)])
-        pose[2] = max(pose[2] + height, CUBE_HALF_SIZE)
+        pose[2] = max(pose[2] + height, half)
         if height > 0:
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
-        landing = np.array([*pose[:2], CUBE_HALF_SIZE])
+        landing = np.array([*pose[:2], half])
         if in_reach(scene.robot, landing) and _on_table(env, pose) and _place(env, pose):
             return True
     _place(env, start)
@@ -156,6 +159,15 @@ def _place(env: ManipEnv, pose: F64) -> bool:
     mujoco.mj_forward(scene.model, data)
     cube = scene.model.geom("object").id
     return all(contact.dist > _OVERLAP for contact in data.contact if cube in (contact.geom1, contact.geom2))
+
+
+def disturbance_of(circumstances: Circumstances) -> Disturbance:
+    """The part of an episode's circumstances that knocks its object and makes its actions noisy."""
+    noise = circumstances.number("action_noise")
+    if "knock" not in circumstances.drawn:
+        return Disturbance(noise)
+    distance, step = circumstances.number("knock"), int(circumstances.number("knock_step"))
+    return Disturbance(noise, (distance, distance), (step, step + 1))
 
 
 class Disturber:

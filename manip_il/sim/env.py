@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
-from manip_il.sim.look import CameraConfig, Look
+from manip_il.sim.look import PLAIN, CameraConfig, Look
 from manip_il.sim.observe import environment_state, environment_state_names
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import DT_SIM, STATE_KIND, build_scene
-from manip_il.sim.task import CUBE_HALF_SIZE, draw_start
+from manip_il.sim.task import draw_start
 
 F64 = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         render_mode: str | None = None,
         **settings: Any,
     ):
-        self.look = look or Look()
+        self.look, self.appearance = look or Look(), PLAIN
         self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
         self.scene = build_scene(self.config.robot, self.config.task)
@@ -105,7 +105,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = start.opening / 2
         if scene.object_q is not None:
-            pose = [*start.object_xy, CUBE_HALF_SIZE, np.cos(start.object_yaw / 2), 0, 0, np.sin(start.object_yaw / 2)]
+            height = scene.model.geom("object").size[2]
+            pose = [*start.object_xy, height, np.cos(start.object_yaw / 2), 0, 0, np.sin(start.object_yaw / 2)]
             data.qpos[scene.object_q : scene.object_q + 7] = pose
         self._goal = start.goal
         data.mocap_pos[scene.goal_mocap] = start.goal
@@ -181,7 +182,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras)
+        return pictures(self.config.robot, self.config.task, self.data, cameras, self.appearance)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.sim.scene import CAMERAS
+from manip_il.sim.world import CAMERAS
 
 MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
@@ -64,3 +64,23 @@ class CameraConfig:
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.height, self.width
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How one episode looks different from the model: what a camera sees and physics does not.
+
+    edge: of the cube [m], None for the model's. colour: red, green and blue of the cube, 0 to 1. camera_shift [m] and
+    camera_turn (a rotation vector [deg]): (camera, (x, y, z)), in the camera's own frame. brightness: factor on every
+    lamp; light_turn: of the lamps about the vertical through the world's origin [deg].
+    """
+
+    edge: float | None = None
+    colour: tuple[float, ...] | None = None
+    camera_shift: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    camera_turn: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    brightness: float = 1.0
+    light_turn: float = 0.0
+
+
+PLAIN = Appearance()

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
+from manip_il.sim.dress import Wardrobe
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.look import CameraConfig, Look
+from manip_il.sim.look import PLAIN, Appearance, CameraConfig, Look
 from manip_il.sim.scene import build_scene
 from manip_il.sim.view import view_model
 
@@ -21,14 +22,16 @@ _FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's
 _MAX_GEOMS = 1_000
 
 
-def pictures(robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig) -> dict[str, Picture]:
+def pictures(
+    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, appearance: Appearance = PLAIN
+) -> dict[str, Picture]:
     """What every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    A picture depends on `qpos` and the goal alone: whoever asks, in whatever order, gets the same bytes.
+    A picture depends on `qpos`, the goal and the appearance alone: whoever asks, in any order, gets the same bytes.
     Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(robot, task, cameras.look)
-    renderer.pose(data)
+    renderer.pose(data, appearance)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
@@ -42,6 +45,7 @@ class _Renderer:
 
     def __init__(self, robot: str, task: str, look: Look):
         self._model = view_model(robot, task, look)
+        self._wardrobe = Wardrobe(self._model)
         self._data = mujoco.MjData(self._model)
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
@@ -52,8 +56,9 @@ class _Renderer:
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
             raise RuntimeError("it has no off-screen buffers")
 
-    def pose(self, data: mujoco.MjData) -> None:
-        """Put everything where `data` has it."""
+    def pose(self, data: mujoco.MjData, appearance: Appearance) -> None:
+        """Put everything where `data` has it, and make it look as `appearance` says."""
+        self._wardrobe.wear(appearance)
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.robot import Robot, get_robot
-from manip_il.sim.task import CUBE_HALF_SIZE, Task, get_task
+from manip_il.sim.task import Task, get_task
+from manip_il.sim.world import CUBE_FRICTION, CUBE_HALF_SIZE, CUBE_MASS
 
-CUBE_MASS = 0.1  # [kg]
 DT_SIM = 0.002  # [s]
-CAMERAS = ("front", "wrist")
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 _OBJECT, _GOAL = "object", "goal"
@@ -189,7 +188,7 @@ def _add_cube(spec: mujoco.MjSpec) -> None:
         mass=CUBE_MASS,
         material="cube",
         condim=4,
-        friction=[1.0, 0.02, 0.0001],
+        friction=[CUBE_FRICTION, 0.02, 0.0001],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
         solref=[0.01, 1],
     )

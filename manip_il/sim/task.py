@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.robot import Robot
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 F64 = NDArray[np.float64]
-CUBE_HALF_SIZE = 0.025  # [m]
 
 
 @dataclass(frozen=True)

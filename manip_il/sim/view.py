@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.dress import light_up
 from manip_il.sim.look import Look
 from manip_il.sim.scene import build_scene
 
@@ -116,13 +117,4 @@ def _light(model: mujoco.MjModel, look: Look) -> None:
     quality.offsamples = 0
     if not look.shadows:
         quality.shadowsize = 0
-    lamp = model.vis.headlight
-    for colours in (model.light_ambient, model.light_diffuse, model.light_specular):
-        colours *= look.brightness
-    for colour in (lamp.ambient, lamp.diffuse, lamp.specular):
-        colour *= look.brightness
-    turn = np.deg2rad(look.light_turn)
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    in_world = model.light_bodyid == 0
-    for vectors in (model.light_pos, model.light_dir):
-        vectors[in_world] = vectors[in_world] @ rotation.T
+    light_up(model, look.brightness, look.light_turn)

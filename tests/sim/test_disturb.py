@@ -19,7 +19,8 @@ from manip_il.sim.disturb import (
     set_fingers,
 )
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.task import CUBE_HALF_SIZE, in_reach
+from manip_il.sim.task import in_reach
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 ROBOTS = ("panda", "fetch")
 SEED = 5_000_000

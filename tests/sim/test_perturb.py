@@ -13,7 +13,8 @@ from manip_il.mdp import Phase
 from manip_il.sim.disturb import Disturbance
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.perturb import DROP, JOLT, KINDS, SHIFT, Perturbation, Perturber, kinds_for
-from manip_il.sim.task import CUBE_HALF_SIZE, TASKS
+from manip_il.sim.task import TASKS
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 SEED, MOMENT = 5_000_000, 7
 CHANGES = [name for name, kind in KINDS.items() if kind.change is not None]

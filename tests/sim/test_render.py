@@ -16,7 +16,7 @@ from manip_il.sim import render
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend
 from manip_il.sim.look import CameraConfig, Look
-from manip_il.sim.scene import CAMERAS
+from manip_il.sim.world import CAMERAS
 
 ROBOTS = ("panda", "fetch")
 SEED = 5_000_000

@@ -8,8 +8,8 @@ import pytest
 
 from manip_il.mdp import Phase
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import CUBE_MASS, arm_model, build_scene
-from manip_il.sim.task import CUBE_HALF_SIZE
+from manip_il.sim.scene import arm_model, build_scene
+from manip_il.sim.world import CUBE_HALF_SIZE, CUBE_MASS
 
 ROBOTS = ("panda", "fetch")
 SEED = 5_000_000

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from manip_il.errors import UnknownName
 from manip_il.seeding import rng_for
 from manip_il.sim.robot import ROBOTS, get_robot
-from manip_il.sim.task import CUBE_HALF_SIZE, TASKS, Start, draw_start, get_task, in_reach
+from manip_il.sim.task import TASKS, Start, draw_start, get_task, in_reach
+from manip_il.sim.world import CUBE_HALF_SIZE
 
 seeds = st.integers(0, 2**40)
 robots, tasks = st.sampled_from(sorted(ROBOTS)), st.sampled_from(sorted(TASKS))

@@ -9,8 +9,9 @@ import pytest
 from manip_il.sim import render, view
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.look import Look
-from manip_il.sim.scene import CAMERAS, build_scene
+from manip_il.sim.scene import build_scene
 from manip_il.sim.view import cluster, view_model
+from manip_il.sim.world import CAMERAS
 
 ROBOTS = ("panda", "fetch")
 

@@ -1,0 +1,200 @@
+"""Conditions of an evaluation: ranges from which each episode's circumstances are drawn by its seed alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.seeding import rng_for
+from manip_il.sim.look import PLAIN, Appearance
+from manip_il.sim.world import CAMERAS, CUBE_HALF_SIZE
+
+F64 = NDArray[np.float64]
+Range = tuple[float, float]
+CUBE_EDGE = 2 * CUBE_HALF_SIZE  # [m]
+# What a value may be at most and at least; outside, a range is a slip of the pen and not an experiment.
+_BOUNDS: dict[str, Range] = {
+    "action_noise": (0, 1),
+    "knock": (0, 0.3),
+    "knock_step": (0, 10_000),
+    "joint_noise": (0, 1),
+    "position_noise": (0, 1),
+    "delay": (0, 100),
+    "mass": (0.001, 10),
+    "size": (0.01, 0.09),
+    "friction": (0.01, 10),
+    "colour": (0, 1),
+    "camera_shift": (0, 1),
+    "camera_turn": (0, 90),
+    "brightness": (0.1, 3),
+    "light_turn": (-180, 180),
+}
+_WHOLE = ("knock_step", "delay")
+_OBJECT = ("knock", "mass", "size", "friction", "colour")  # what a task without an object has not
+_VIEW = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # what only cameras see
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Ranges (low, high), both ends included; one that is not given leaves the world as it is.
+
+    action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
+    knock: the object is moved by so much once [m], at a control step of knock_step. joint_noise [rad], position_noise
+    [m]: standard deviations of Gaussian noise on the joints that a policy is shown and on where it is told the object
+    is. delay: control steps by which it sees everything late. mass [kg], size (edge [m]) and sliding friction of the
+    cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a drawn
+    direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+
+    Raises `UsageError` for a range that is empty or out of bounds.
+    """
+
+    name: str = "nominal"
+    action_noise: Range | None = None
+    knock: Range | None = None
+    knock_step: Range = (5, 24)
+    joint_noise: Range | None = None
+    position_noise: Range | None = None
+    delay: Range | None = None
+    mass: Range | None = None
+    size: Range | None = None
+    friction: Range | None = None
+    colour: Range | None = None
+    camera_shift: Range | None = None
+    camera_turn: Range | None = None
+    brightness: Range | None = None
+    light_turn: Range | None = None
+
+    def __post_init__(self) -> None:
+        for name in _BOUNDS:
+            given = getattr(self, name)
+            if given is not None:
+                _require_range(f"{self.name}: {name}", given, _BOUNDS[name], whole=name in _WHOLE)
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """Name -> range of everything that is drawn, in the order of the fields."""
+        given = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "name"}
+        return {
+            name: range_
+            for name, range_ in given.items()
+            if range_ is not None and (name != "knock_step" or self.knock is not None)
+        }
+
+    def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
+        """The condition without what a task without an object, or a policy without cameras, does not notice.
+
+        None where nothing of it is left.
+        """
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else _VIEW)}
+        kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
+        if self.ranges and not kept.keys() - {"knock_step"}:
+            return None
+        return Condition(self.name, **kept)
+
+    def to_json(self) -> dict[str, Any]:
+        """Name and ranges as plain JSON values."""
+        return {"name": self.name} | {name: list(range_) for name, range_ in self.ranges.items()}
+
+    @classmethod
+    def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
+        """Ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
+        for key in tree:
+            if key not in _BOUNDS:
+                raise UnknownName(f"key in {name}:", str(key), _BOUNDS)
+        return cls(name, **{key: _as_range(f"{name}: {key}", value) for key, value in tree.items()})
+
+    def __str__(self) -> str:
+        said = ", ".join(f"{name} {_words(range_)}" for name, range_ in self.ranges.items())
+        return f"{self.name} ({said})" if said else self.name
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What was drawn for one episode. `drawn` holds every value by the name of its range; see `Condition` for units.
+
+    camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own frame [m], [deg].
+    """
+
+    condition: str
+    drawn: Mapping[str, Any]
+
+    def number(self, name: str, default: float = 0.0) -> float:
+        """A drawn number, or what holds without it."""
+        return float(self.drawn.get(name, default))
+
+    @property
+    def appearance(self) -> Appearance:
+        """How the world looks to the cameras."""
+        if not self.drawn.keys() & {*_VIEW, "size"}:
+            return PLAIN
+        shift, turn = self.drawn.get("camera_shift", {}), self.drawn.get("camera_turn", {})
+        colour = self.drawn.get("colour")
+        return Appearance(
+            edge=self.number("size", CUBE_EDGE),
+            colour=None if colour is None else tuple(colour),
+            camera_shift=tuple((name, tuple(shift[name])) for name in CAMERAS if name in shift),
+            camera_turn=tuple((name, tuple(turn[name])) for name in CAMERAS if name in turn),
+            brightness=self.number("brightness", 1.0),
+            light_turn=self.number("light_turn"),
+        )
+
+
+def changes_object(named: Mapping[str, Any]) -> bool:
+    """Whether ranges, or what was drawn from them, make the object another than the model's."""
+    return not named.keys().isdisjoint(("mass", "size", "friction"))
+
+
+def draw(conditions: Sequence[Condition], seed: int) -> Circumstances:
+    """The circumstances of a seed: conditions take turns, each value has a random stream of its own.
+
+    So a range that is changed leaves the other draws as they were.
+    """
+    condition = conditions[seed % len(conditions)]
+    return Circumstances(
+        condition.name,
+        {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in condition.ranges.items()},
+    )
+
+
+def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
+    if name in _WHOLE:
+        return int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
+    if name == "colour":
+        return [float(value) for value in rng.uniform(*range_, 3)]
+    if name in ("camera_shift", "camera_turn"):
+        return {camera: _vector(rng, range_) for camera in CAMERAS}
+    return float(rng.uniform(*range_))
+
+
+def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
+    """A vector of a drawn length in a direction drawn evenly."""
+    direction = rng.normal(size=3)
+    return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
+
+
+def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:
+    low, high = given
+    if not bounds[0] <= low <= high <= bounds[1]:
+        raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {bounds[0]} to {bounds[1]}")
+    if whole and (low % 1 or high % 1):
+        raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers of control steps")
+
+
+def _as_range(what: str, value: Any) -> Range:
+    ends = value if isinstance(value, list) else [value, value]
+    if len(ends) != 2 or not all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends):
+        raise UsageError(f"{what} is {value!r}; expected a number, or [low, high]")
+    return float(ends[0]), float(ends[1])
+
+
+def _words(range_: Range) -> str:
+    low, high = range_
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+NOMINAL = Condition()
