@@ -1,12 +1,13 @@
 """How sure a success rate is, and whether one policy beats another on the same seeds.
 
-Standard library only: intervals by the score method, tests by the exact binomial.
+Standard library only: intervals by the score method, or by a betting argument where one looks again and again; tests
+by the exact binomial.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -17,20 +18,24 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Proportion:
-    """`successes` of `n` trials with Wilson's interval; prints as `98.7 % [97.8, 99.3]`."""
+    """`successes` of `n` trials with Wilson's interval; prints as `98.7 % [97.8, 99.3]`.
+
+    sequential: `n` depended on what was seen so far, so the interval is one that holds at any time one looks.
+    """
 
     successes: int
     n: int
     confidence: float = CONFIDENCE
+    sequential: bool = False
 
     def __post_init__(self) -> None:
         _require_counts(self.successes, self.n)
         _require_confidence(self.confidence)
 
     @classmethod
-    def of(cls, outcomes: Sequence[bool], confidence: float = CONFIDENCE) -> Proportion:
+    def of(cls, outcomes: Sequence[bool], confidence: float = CONFIDENCE, sequential: bool = False) -> Proportion:
         """The proportion of true values."""
-        return cls(sum(map(bool, outcomes)), len(outcomes), confidence)
+        return cls(sum(map(bool, outcomes)), len(outcomes), confidence, sequential)
 
     @property
     def rate(self) -> float:
@@ -39,8 +44,9 @@ class Proportion:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's (low, high)."""
-        return wilson_interval(self.successes, self.n, self.confidence)
+        """Wilson's (low, high), or that of a confidence sequence."""
+        method = confidence_sequence if self.sequential else wilson_interval
+        return method(self.successes, self.n, self.confidence)
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -131,6 +137,31 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> t
     return low, high
 
 
+def confidence_sequence(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """(low, high) of a binomial proportion that holds at every `n` at once, however one decides when to stop.
+
+    A rate p is left out once the likelihood of what was seen, averaged over rates drawn from Beta(1/2, 1/2), is
+    1 / (1 - confidence) times that of p: under the true rate this ratio is a martingale of mean 1, so with probability
+    `confidence` it never gets there (Ville 1939; Robbins 1970, Ann. Math. Stat. 41, 1397-1409). Wider than Wilson's,
+    which holds for an `n` that was fixed before. Raises `UsageError` as `wilson_interval` does.
+    """
+    _require_counts(successes, n)
+    _require_confidence(confidence)
+    failures = n - successes
+    mixture = _log_beta(successes + 0.5, failures + 0.5) - _log_beta(0.5, 0.5)
+
+    def inside(p: float) -> bool:
+        log_likelihood = (successes * math.log(p) if successes else 0.0) + (
+            failures * math.log1p(-p) if failures else 0.0
+        )
+        return mixture - log_likelihood < -math.log1p(-confidence)
+
+    rate = successes / n
+    low = 0.0 if successes == 0 else _edge(inside, rate, 0.0)
+    high = 1.0 if failures == 0 else _edge(inside, rate, 1.0)
+    return low, high
+
+
 def mcnemar_exact(a: Sequence[bool], b: Sequence[bool]) -> float:
     """Two-sided p that `a` and `b`, paired outcomes on the same seeds, have one success rate.
 
@@ -199,6 +230,20 @@ def compare_paired(
 def format_p(p: float) -> str:
     """`p = 0.031`, or `p < 0.001` where more digits would say nothing."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.3f}"
+
+
+def _edge(inside: Callable[[float], bool], within: float, outside: float) -> float:
+    """Where `inside` ends on the way from a point within to one outside; the point outside never counts as within."""
+    # The rate itself can be 0 or 1, where there is no logarithm: its neighbour is always within.
+    within = min(max(within, 1e-12), 1 - 1e-12)
+    for _ in range(60):  # halves the error each time: to the last bit
+        middle = (within + outside) / 2
+        within, outside = (middle, outside) if inside(middle) else (within, middle)
+    return (within + outside) / 2
+
+
+def _log_beta(a: float, b: float) -> float:
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 def _corrected_phi(both: int, only_first: int, only_second: int, neither: int) -> float:

@@ -1,6 +1,7 @@
 """Intervals and tests agree with published tables and keep their defining properties."""
 
 import math
+import random
 
 import pytest
 from hypothesis import given
@@ -10,6 +11,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.statistics import (
     Proportion,
     compare_paired,
+    confidence_sequence,
     format_p,
     mcnemar_exact,
     mcnemar_exact_counts,
@@ -161,3 +163,51 @@ def test_unpaired_lengths_are_refused_with_both():
 def test_p_values_read_well():
     assert format_p(0.03125) == "p = 0.031"
     assert format_p(1e-9) == "p < 0.001"
+
+
+def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
+    rng = random.Random(0)
+    for p in (0.6, 0.97):
+        missed = {True: 0, False: 0}
+        for _ in range(200):
+            successes, wrong = 0, {True: False, False: False}
+            for n in range(1, 1_501):
+                successes += rng.random() < p
+                if n % 50 == 0:
+                    for sequential in (True, False):
+                        low, high = Proportion(successes, n, sequential=sequential).interval
+                        wrong[sequential] |= not low <= p <= high
+            for sequential in (True, False):
+                missed[sequential] += wrong[sequential]
+        assert missed[True] <= 10  # 5 % of 200
+        assert missed[False] > 30  # peeking costs so much
+
+
+@pytest.mark.parametrize("n", [1, 10, 1_000])
+def test_a_confidence_sequence_contains_the_rate_and_wilsons_interval_nearly(n):
+    for successes in {0, n // 2, n - 1, n}:
+        low, high = confidence_sequence(successes, n)
+        assert 0 <= low <= successes / n <= high <= 1
+        ours, theirs = high - low, wilson_interval(successes, n)
+        assert ours > 0.9 * (theirs[1] - theirs[0])
+    assert confidence_sequence(0, n)[0] == 0.0
+    assert confidence_sequence(n, n)[1] == 1.0
+
+
+def test_a_confidence_sequence_is_symmetric_and_narrows():
+    for successes, n in ((3, 10), (99, 100), (0, 7)):
+        low, high = confidence_sequence(successes, n)
+        assert confidence_sequence(n - successes, n) == pytest.approx((1 - high, 1 - low), abs=1e-9)
+    widths = [high - low for low, high in (confidence_sequence(9 * k, 10 * k) for k in (1, 10, 100, 1_000))]
+    assert widths == sorted(widths, reverse=True)
+
+
+def test_the_edge_of_a_confidence_sequence_is_where_the_bet_reaches_twenty():
+    successes, n = 45, 50
+    grid = [(i + 0.5) / 20_000 for i in range(20_000)]
+    # The mixture by a sum over rates in place of the beta function: another way to the same ratio.
+    prior = [1 / math.sqrt(p * (1 - p)) for p in grid]
+    likelihood = [p**successes * (1 - p) ** (n - successes) for p in grid]
+    mixture = sum(w * x for w, x in zip(prior, likelihood, strict=True)) / sum(prior)
+    for edge in confidence_sequence(successes, n):
+        assert mixture / (edge**successes * (1 - edge) ** (n - successes)) == pytest.approx(20, rel=0.01)
