@@ -33,7 +33,7 @@ from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_io import dataset_info, merge_datasets
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
@@ -82,7 +82,7 @@ class Watch:
     """What a caller sees of a run as it goes. Raising in any of them ends the run; what is on disk stays."""
 
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
-    on_episode: Callable[[Episode], None] = lambda episode: None
+    on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
     on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
 
 

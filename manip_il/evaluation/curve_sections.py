@@ -6,9 +6,17 @@ from collections.abc import Sequence
 from html import escape
 
 from manip_il.evaluation import sections
-from manip_il.evaluation.curve_charts import curve_axes, learning_curve
-from manip_il.evaluation.report_data import COSTS, Cost, CurvePoint, LearningCurve, format_amount, format_percent
-from manip_il.evaluation.svg import Axis
+from manip_il.evaluation.curve_charts import SHAPES, across, curve_axes, learning_curve, study_curve, success_axis
+from manip_il.evaluation.report_data import (
+    COSTS,
+    ArmCurve,
+    Cost,
+    CurvePoint,
+    LearningCurve,
+    format_amount,
+    format_percent,
+)
+from manip_il.evaluation.svg import Axis, element
 
 
 def curve(data: LearningCurve) -> str:
@@ -32,6 +40,25 @@ def curve(data: LearningCurve) -> str:
     )
 
 
+def arm_curves(arms: Sequence[tuple[ArmCurve, str]], target: float | None = None) -> str:
+    """Learning curves of several arms, each with the CSS class of its colour, over every cost that all know."""
+    points = [point for arm, _ in arms for point in arm.points]
+    costs: list[Cost] = [cost for cost in COSTS if all(point.amount(cost) is not None for point in points)]
+    drawn = [
+        (study_curve(arms, cost, target), across(cost, [point.amount(cost) or 0 for point in points]).words)
+        for cost in costs
+    ]
+    keys = [f"<li>{_arm_key(index, kind)}{escape(arm.name)}</li>" for index, (arm, kind) in enumerate(arms)]
+    if target is not None:
+        keys.append(f'<li><i class="key target"></i>target, {format_percent(target)}</li>')
+    y = success_axis([point.success for point in points], target)
+    several = any(len(arm.runs) > 1 for arm, _ in arms)
+    words = "Validation success by round, the mean over training seeds; thin lines are the seeds."
+    single = "Validation success by round; bars are 95 % intervals."
+    note = curve_note(words if several else single, y, timed="seconds" in costs)
+    return f'{note}<ul class="legend">{"".join(keys)}</ul>{plots(drawn)}'
+
+
 def curve_note(words: str, y: Axis, timed: bool) -> str:
     """What a curve shows, and where its axes begin and end."""
     cut = f" The axis of success starts at {y.low:.0f} %." if y.low > 0 else ""
@@ -43,6 +70,11 @@ def plots(drawn: Sequence[tuple[str, str]]) -> str:
     """Charts with the words under their axes: the first as wide as the page, the others side by side."""
     each = [f'<div class="plot">{chart}<p class="x-title">{escape(words)}</p></div>' for chart, words in drawn]
     return f'<div class="plots">{"".join(each)}</div>'
+
+
+def _arm_key(index: int, kind: str) -> str:
+    shape = element("g", SHAPES[index % len(SHAPES)], class_=f"series {kind}")
+    return element("svg", shape, class_="key-mark", viewBox="-8 -8 16 16", aria_hidden="true")
 
 
 def _curve_table(data: LearningCurve) -> str:

@@ -24,7 +24,7 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Paths
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import FILM, CameraConfig
+from manip_il.sim.look import FILM, PLAIN, Appearance, CameraConfig
 
 AFTER_SUCCESS = 1.0  # what a film shows once the task is solved [s]
 Frames = Sequence[NDArray[np.uint8]]
@@ -41,13 +41,17 @@ def film(
     camera: str = "front",
     size: tuple[int, int] = (240, 320),
     every: int = 1,
+    appearance: Appearance = PLAIN,
 ) -> list[NDArray[np.uint8]]:
     """One picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
+
+    appearance: how the episode's world looked.
 
     Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
     """
     states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz) : every]
-    return list(render_states(env_config, CameraConfig((camera,), *size, FILM), states)[schema.IMAGES + camera])
+    seen = render_states(env_config, CameraConfig((camera,), *size, FILM), states, appearance)
+    return list(seen[schema.IMAGES + camera])
 
 
 def shown_steps(episode: Episode, fps: int) -> int:

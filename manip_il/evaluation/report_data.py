@@ -120,11 +120,12 @@ class ArmCurve:
 
 @dataclass(frozen=True)
 class Strip:
-    """One episode of one policy as pictures: (time [s], PNG bytes) in order."""
+    """One episode of one policy as pictures: (time [s], PNG bytes) in order. success: None where nothing says."""
 
     policy: str
     frames: tuple[tuple[float, bytes], ...]
     caption: str = ""
+    success: bool | None = None
 
     def __post_init__(self) -> None:
         for seconds, picture in self.frames:
@@ -136,11 +137,12 @@ class Strip:
 
 @dataclass(frozen=True)
 class Film:
-    """One episode, or several in a row, of one policy as an MP4 (H.264)."""
+    """One episode, or several in a row, of one policy as an MP4 (H.264). success: None where nothing says."""
 
     policy: str
     mp4: bytes
     caption: str = ""
+    success: bool | None = None
 
     def __post_init__(self) -> None:
         if self.mp4[4:8] != b"ftyp":
@@ -151,7 +153,8 @@ class Film:
 class Paths:
     """Where hand and object went in one episode: the picture that needs no renderer.
 
-    hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m]; dt: between rows [s].
+    hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m]; dt: between rows [s]. success: None where
+    nothing says.
     """
 
     policy: str
@@ -160,6 +163,7 @@ class Paths:
     goal: F64
     dt: float = 0.0
     caption: str = ""
+    success: bool | None = None
 
     def __post_init__(self) -> None:
         shapes = {"hand": np.shape(self.hand), "obj": np.shape(self.obj), "goal": np.shape(self.goal)}

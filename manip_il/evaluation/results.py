@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.evaluation.statistics import CONFIDENCE, PairedComparison, Proportion, compare_paired
+from manip_il.sim.conditions import NOMINAL, Condition
+
+if TYPE_CHECKING:
+    from manip_il.sim.env import EnvConfig
 
 FILE_NAME = "eval.json"
+_HZ, _STEPS = 20, 5  # of files that do not say them
+WILSON = "Wilson's score interval"
+ANYTIME = "confidence sequence: holds whenever one stops"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +66,70 @@ class EpisodeResult:
 
 @dataclass(frozen=True, slots=True)
 class EvalSettings:
-    """What two evaluations must share to be compared.
+    """What two evaluations must share to be compared, and what running an episode again needs.
 
-    horizon: control steps. tolerance: distance to the goal that counts as there [m].
-    disturbance: in words, `none` where the episode runs undisturbed.
+    horizon, success_steps: control steps. tolerance: distance to the goal that counts as there [m]. suite: the name of
+    the conditions that episodes meet in turn.
     """
 
     horizon: int
     tolerance: float
-    disturbance: str = "none"
+    control_hz: int = _HZ
+    success_steps: int = _STEPS
+    suite: str = NOMINAL.name
+    conditions: tuple[Condition, ...] = (NOMINAL,)
+
+    @classmethod
+    def of(cls, env: EnvConfig, suite: str = NOMINAL.name, conditions: tuple[Condition, ...] = ()) -> EvalSettings:
+        """Of episodes in `env` under `conditions`."""
+        return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions or (NOMINAL,))
+
+    def env(self, robot: str, task: str) -> EnvConfig:
+        """The environment that was evaluated in."""
+        from manip_il.sim.env import EnvConfig  # here, as whoever only reads results needs no simulator
+
+        return EnvConfig(robot, task, self.control_hz, self.tolerance, self.success_steps, self.horizon)
+
+    @property
+    def disturbance(self) -> str:
+        """Conditions in words, `none` where there are no others than the nominal one."""
+        return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
+
+    def __str__(self) -> str:
+        rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
+        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}"
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        return {"horizon": self.horizon, "tolerance": self.tolerance, "disturbance": self.disturbance}
+        return {
+            "horizon": self.horizon,
+            "tolerance": self.tolerance,
+            "control_hz": self.control_hz,
+            "success_steps": self.success_steps,
+            "suite": self.suite,
+            "conditions": [condition.to_json() for condition in self.conditions],
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
+        """The inverse of `to_json`."""
+        named = [dict(one) for one in data.get("conditions", [NOMINAL.to_json()])]
+        return cls(
+            horizon=_whole(data["horizon"]),
+            tolerance=float(data["tolerance"]),
+            control_hz=_whole(data.get("control_hz", _HZ)),
+            success_steps=_whole(data.get("success_steps", _STEPS)),
+            suite=str(data.get("suite", NOMINAL.name)),
+            conditions=tuple(Condition.from_mapping(str(one.pop("name")), one) for one in named),
+        )
 
 
 @dataclass(frozen=True)
 class EvalResult:
     """One policy on one robot and task: every episode, and what follows from them.
+
+    policy_sha256: of its files, empty where it has none. until_width: the width of the interval at which the evaluation
+    was to stop, None where the number of episodes was fixed before; intervals then hold at any stop.
 
     Raises `ManipError` on construction where there is no episode or a seed comes twice.
     """
@@ -88,6 +141,8 @@ class EvalResult:
     episodes: tuple[EpisodeResult, ...]
     settings: EvalSettings
     confidence: float = CONFIDENCE
+    policy_sha256: str = ""
+    until_width: float | None = None
 
     def __post_init__(self) -> None:
         if not self.episodes:
@@ -102,12 +157,24 @@ class EvalResult:
     @property
     def success(self) -> Proportion:
         """Episodes that succeeded at some time."""
-        return Proportion.of([episode.success for episode in self.episodes], self.confidence)
+        return self._proportion([episode.success for episode in self.episodes])
 
     @property
     def success_at_end(self) -> Proportion:
         """Episodes that stood at the goal when they ended."""
-        return Proportion.of([episode.success_at_end for episode in self.episodes], self.confidence)
+        return self._proportion([episode.success_at_end for episode in self.episodes])
+
+    @property
+    def by_condition(self) -> dict[str, Proportion]:
+        """Success under each condition that an episode met, in the settings' order; none where nothing says it."""
+        met: dict[str, list[bool]] = {condition.name: [] for condition in self.settings.conditions}
+        for episode in self.episodes:
+            if "condition" in episode.detail:
+                met.setdefault(str(episode.detail["condition"]), []).append(episode.success)
+        return {name: self._proportion(outcomes) for name, outcomes in met.items() if outcomes}
+
+    def _proportion(self, outcomes: Sequence[bool]) -> Proportion:
+        return Proportion.of(outcomes, self.confidence, self.until_width is not None)
 
     @property
     def steps_to_success(self) -> float | None:
@@ -128,9 +195,16 @@ class EvalResult:
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
             "confidence": self.confidence,
+            "interval_method": WILSON if self.until_width is None else ANYTIME,
             "n_episodes": len(self.episodes),
             "success_at_end_rate": self.success_at_end.rate,
+            "until_width": self.until_width,
+            "by_condition": {
+                name: {"success_rate": one.rate, "interval": list(one.interval), "n_episodes": one.n}
+                for name, one in self.by_condition.items()
+            },
             "policy": self.policy,
+            "policy_sha256": self.policy_sha256,
             "robot": self.robot,
             "task": self.task,
             "fingerprint": dict(self.fingerprint),
@@ -141,19 +215,17 @@ class EvalResult:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalResult:
         """The inverse of `to_json`: rates and interval are worked out anew from the episodes."""
-        settings = data["settings"]
+        width = data.get("until_width")
         return cls(
             policy=str(data["policy"]),
             robot=str(data["robot"]),
             task=str(data["task"]),
             fingerprint=dict(data["fingerprint"]),
             episodes=tuple(EpisodeResult.from_json(episode) for episode in data["episodes"]),
-            settings=EvalSettings(
-                horizon=_whole(settings["horizon"]),
-                tolerance=float(settings["tolerance"]),
-                disturbance=str(settings.get("disturbance", "none")),
-            ),
+            settings=EvalSettings.from_json(data["settings"]),
             confidence=float(data.get("confidence", CONFIDENCE)),
+            policy_sha256=str(data.get("policy_sha256", "")),
+            until_width=None if width is None else float(width),
         )
 
     def write(self, path: Path) -> None:
@@ -174,7 +246,7 @@ class EvalResult:
             result = cls.from_json(data)
         except KeyError as error:
             raise ManipError(f"{path}: key {error} is missing; expected an {FILE_NAME}") from error
-        except (TypeError, ValueError, AttributeError) as error:
+        except (TypeError, ValueError, AttributeError, UsageError) as error:
             raise ManipError(f"{path}: not an {FILE_NAME}: {error}") from error
         stated = data.get("n_episodes", len(result.episodes))
         if stated != len(result.episodes):

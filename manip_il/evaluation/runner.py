@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from manip_il.data import schema
-from manip_il.engine.describe import env_fingerprint
+from manip_il.engine.describe import env_fingerprint, policy_sha256
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.sight import drawn_cameras
+from manip_il.engine.where import places
+from manip_il.errors import UsageError
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.statistics import Proportion
 from manip_il.mdp import Episode, Phase
-from manip_il.sim.disturb import Disturbance
+from manip_il.sim.conditions import NOMINAL, draw
 
 _LOG = logging.getLogger(__name__)
+LOOK_EVERY = 100  # episodes after which an evaluation asks whether its interval is narrow enough
+OnResult = Callable[[EpisodeResult], None]
 
 
 def evaluate(
@@ -24,19 +29,33 @@ def evaluate(
     job: RolloutJob,
     seeds: Sequence[int],
     name: str,
-    on_episode: Callable[[Episode], None] | None = None,
+    on_result: OnResult | None = None,
+    *,
+    suite: str = NOMINAL.name,
+    done: Mapping[int, EpisodeResult] | None = None,
+    until_width: float | None = None,
 ) -> EvalResult:
     """Run `job` on every seed, to the horizon unless it has a `hold`; episodes are in the order of `seeds`.
 
-    A seed that kills its worker again and again is left out, and a warning names it. on_episode: sees every episode
-    with its states as it ends, to film it, say.
+    suite: what the job's conditions are called. done: results by seed that are there already. until_width: stop once
+    the interval, of high less low, is as narrow; the question is put after every `LOOK_EVERY` seeds in their order, so
+    that the answer depends on no worker. A seed that kills its worker again and again is left out, and a warning names
+    it. on_result: sees every result as its episode ends. Raises `UsageError` for a width that is not within 0 and 1.
     """
+    if until_width is not None and not 0 < until_width < 1:
+        raise UsageError(f"until_width is {until_width}; expected between 0 and 1, such as 0.02 for 2 points")
     results: dict[int, EpisodeResult] = {}
-    for episode in engine.run(job, seeds):
-        results[episode.seed] = episode_result(episode)
-        if on_episode is not None:
-            on_episode(episode)
-    if lost := [seed for seed in seeds if seed not in results]:
+    before = done or {}
+    for part in _parts(seeds, until_width):
+        results |= {seed: before[seed] for seed in part if seed in before}
+        for episode in engine.run(job, [seed for seed in part if seed not in before]):
+            results[episode.seed] = episode_result(job, episode)
+            if on_result is not None:
+                on_result(results[episode.seed])
+        if until_width is not None and _width(list(results.values())) <= until_width:
+            break
+    asked = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
+    if lost := [seed for seed in asked if seed not in results]:
         _LOG.warning("left out of the evaluation, as each killed its worker again and again: seeds %s", lost)
     return EvalResult(
         policy=name,
@@ -44,14 +63,19 @@ def evaluate(
         task=job.env.task,
         fingerprint=env_fingerprint(job.env, drawn_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
-        settings=EvalSettings(job.env.horizon, job.env.tolerance, describe_disturbance(job.disturbance)),
+        settings=EvalSettings.of(job.env, suite, job.conditions),
+        policy_sha256=policy_sha256(job.policy) if job.policy is not None else "",
+        until_width=until_width,
     )
 
 
-def episode_result(episode: Episode) -> EpisodeResult:
+def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     """What an evaluation keeps of an episode."""
     solved = episode.columns[schema.SUCCESS].ravel()
     first = int(np.argmax(solved)) + 1 if solved.any() else None
+    states = episode.columns[schema.SIM_STATE]
+    start, end = (places(job.env.robot, job.env.task, states[row]) for row in (0, -1))
+    met = draw(job.conditions or (NOMINAL,), episode.seed)
     return EpisodeResult(
         seed=episode.seed,
         success=episode.success,
@@ -59,16 +83,23 @@ def episode_result(episode: Episode) -> EpisodeResult:
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
         phase_at_end=Phase(int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])).name.lower(),
-        detail={"steps_to_success": first},
+        detail={
+            "steps_to_success": first,
+            "condition": met.condition,
+            "drawn": dict(met.drawn),
+            "goal": start.pop("goal"),
+            "start": start,
+            "end": {name: at for name, at in end.items() if name != "goal"},
+        },
     )
 
 
-def describe_disturbance(disturbance: Disturbance) -> str:
-    """In words, for tables and for `eval.json`."""
-    parts: list[str] = []
-    if disturbance.knock is not None:
-        low, high = (100 * distance for distance in disturbance.knock)
-        parts.append(f"object knocked {low:.0f} to {high:.0f} cm once")
-    if disturbance.action_noise:
-        parts.append(f"{disturbance.action_noise:.0%} action noise")
-    return ", ".join(parts) or "none"
+def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence[int]]:
+    """All seeds at once, or so many as are run between two looks at the interval."""
+    size = len(seeds) if until_width is None else LOOK_EVERY
+    return (seeds[i : i + size] for i in range(0, len(seeds), max(1, size)))
+
+
+def _width(results: Sequence[EpisodeResult]) -> float:
+    low, high = Proportion.of([result.success for result in results], sequential=True).interval
+    return high - low

@@ -14,6 +14,7 @@ from manip_il.evaluation.path_charts import side_view, top_view
 from manip_il.evaluation.report_data import (
     Film,
     Paths,
+    PolicyRow,
     Report,
     Strip,
     flatten,
@@ -64,6 +65,34 @@ class Told(Protocol):
         ...
 
 
+class Pictured(Protocol):
+    """What shows episodes."""
+
+    @property
+    def films(self) -> Sequence[Film]:
+        """In the order of the page."""
+        ...
+
+    @property
+    def strips(self) -> Sequence[Strip]:
+        """In the order of the page."""
+        ...
+
+    @property
+    def paths(self) -> Sequence[Paths]:
+        """In the order of the page."""
+        ...
+
+    @property
+    def pictures_note(self) -> str:
+        """What is to be said about them."""
+        ...
+
+
+# Failures first: they are what one can act on.
+OUTCOMES: tuple[tuple[bool | None, str], ...] = ((None, ""), (False, "Failures"), (True, "Successes"))
+
+
 def header(report: Told) -> str:
     """The verdict comes first; then what else can be said in a sentence."""
     facts = "".join(f"<li>{prose(fact)}</li>" for fact in report.facts)
@@ -78,21 +107,27 @@ def results(report: Report) -> str:
     drawn = [(row.name, success_bar(row), row.success.rate) for row in report.rows]
     return section(
         "Results",
-        _table(report),
+        policy_table(report.rows),
         bars(drawn),
         _how_measured(report),
     )
 
 
-def pictures(report: Report) -> str:
-    """Films, picture strips, or where there are none, paths; by policy in the order of the table."""
-    films = "".join(map(_film, report.films))
-    rest = "".join([*map(_strip, report.strips), *map(_paths, report.paths)])
-    if not films and not rest and not report.pictures_note:
+def pictures(report: Pictured) -> str:
+    """Films, picture strips, or where there are none, paths: by outcome where it is known, else in their order."""
+    groups = [_pictures_of(report, success, heading) for success, heading in OUTCOMES]
+    if not any(groups) and not report.pictures_note:
         return ""
     note = f'<p class="note">{prose(report.pictures_note)}</p>' if report.pictures_note else ""
-    groups = [f'<div class="{kind}">{part}</div>' for kind, part in (("films", films), ("stacked", rest)) if part]
     return section("How it looks", note, *groups)
+
+
+def _pictures_of(report: Pictured, success: bool | None, heading: str) -> str:
+    films = "".join(_film(film) for film in report.films if film.success is success)
+    strips = [_strip(strip) for strip in report.strips if strip.success is success]
+    rest = "".join([*strips, *(_paths(paths) for paths in report.paths if paths.success is success)])
+    groups = [f'<div class="{kind}">{part}</div>' for kind, part in (("films", films), ("stacked", rest)) if part]
+    return (f"<h3>{heading}</h3>" if heading and groups else "") + "".join(groups)
 
 
 def making(report: Told) -> str:
@@ -109,25 +144,26 @@ def making(report: Told) -> str:
     )
 
 
-def _table(report: Report) -> str:
-    confidence = f"{100 * report.rows[0].success.confidence:g} %"
+def policy_table(rows: Sequence[PolicyRow], named: str = "Policy") -> str:
+    """A line each, without the columns that no row fills. named: what a row is."""
+    confidence = f"{100 * rows[0].success.confidence:g} %"
     columns: list[tuple[str, list[str]]] = [
-        ("Expert labels", [NOT_MEASURED if r.labels is None else f"{r.labels:,}" for r in report.rows]),
-        (f"Success [{confidence} interval]", [_proportion(r.success) for r in report.rows]),
-        ("Success at end", [_proportion(r.success_at_end) for r in report.rows]),
+        ("Expert labels", [NOT_MEASURED if r.labels is None else f"{r.labels:,}" for r in rows]),
+        (f"Success [{confidence} interval]", [_proportion(r.success) for r in rows]),
+        ("Success at end", [_proportion(r.success_at_end) for r in rows]),
         (
             "Steps to success",
-            [NOT_MEASURED if r.steps_to_success is None else f"{r.steps_to_success:.1f}" for r in report.rows],
+            [NOT_MEASURED if r.steps_to_success is None else f"{r.steps_to_success:.1f}" for r in rows],
         ),
-        ("Success, disturbed", [_proportion(r.disturbed) for r in report.rows]),
+        ("Success, disturbed", [_proportion(r.disturbed) for r in rows]),
     ]
     columns = [column for column in columns if any(cell != NOT_MEASURED for cell in column[1])]
-    head = "".join(f'<th scope="col" role="columnheader">{escape(name)}</th>' for name in ["Policy", *dict(columns)])
+    head = "".join(f'<th scope="col" role="columnheader">{escape(name)}</th>' for name in [named, *dict(columns)])
     body = "".join(
         f'<tr role="row"><th scope="row" role="rowheader"><i class="key {row.kind}"></i>{escape(row.name)}</th>'
         + "".join(f'<td role="cell" data-label="{escape(name)}">{cells[i]}</td>' for name, cells in columns)
         + "</tr>"
-        for i, row in enumerate(report.rows)
+        for i, row in enumerate(rows)
     )
     # Roles are spelt out because a narrow page shows rows as cards, which would undo the table's own.
     return (

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, compare_results
-from manip_il.evaluation.statistics import wilson_interval
+from manip_il.evaluation.statistics import confidence_sequence, wilson_interval
+from manip_il.sim.conditions import Condition
 
 SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
 
@@ -31,10 +32,16 @@ def test_the_keys_are_the_contracts():
     data = result([True, True, False]).to_json()
     assert set(data) == {
         *("success_rate", "interval", "confidence", "n_episodes", "policy", "robot", "task", "fingerprint"),
-        *("episodes", "success_at_end_rate", "settings"),
+        *("episodes", "success_at_end_rate", "settings", "interval_method", "until_width", "by_condition"),
+        "policy_sha256",
     }
     assert set(data["episodes"][0]) == {"seed", "success", "success_at_end", "steps", "return", "phase_at_end"}
-    assert data["settings"] == {"horizon": 150, "tolerance": 0.02, "disturbance": "none"}
+    assert data["settings"] == {
+        **{"horizon": 150, "tolerance": 0.02, "control_hz": 20, "success_steps": 5},
+        **{"suite": "nominal", "conditions": [{"name": "nominal"}]},
+    }
+    assert data["by_condition"] == {}  # nothing says which it met
+    assert (data["interval_method"], data["until_width"]) == ("Wilson's score interval", None)
     assert data["success_rate"] == 2 / 3
     assert data["interval"] == list(wilson_interval(2, 3))
     assert data["n_episodes"] == 3
@@ -53,6 +60,30 @@ def test_json_keeps_every_bit(outcomes: list[bool], ret: float):
     made = result(outcomes)
     made = replace(made, episodes=tuple(replace(e, ret=ret, detail={"push": [ret]}) for e in made.episodes))
     assert EvalResult.from_json(json.loads(json.dumps(made.to_json()))) == made
+
+
+def test_success_is_told_by_the_condition_that_an_episode_met():
+    made = result([True, False, True, True])
+    named = tuple(replace(one, detail={"condition": "ab"[i % 2]}) for i, one in enumerate(made.episodes))
+    conditions = tuple(Condition(name, mass=(0.1, 0.2)) for name in "ba")
+    suite = replace(made, episodes=named, settings=replace(SETTINGS, suite="mine", conditions=conditions))
+    assert {name: (one.successes, one.n) for name, one in suite.by_condition.items()} == {"b": (1, 2), "a": (2, 2)}
+    assert list(suite.by_condition) == ["b", "a"]
+    assert EvalResult.from_json(json.loads(json.dumps(suite.to_json()))) == suite
+    assert "mass 0.1 to 0.2" in suite.settings.disturbance
+
+
+def test_an_evaluation_that_stopped_by_its_width_says_so_and_keeps_its_wider_interval():
+    fixed, stopped = result([True] * 9 + [False]), result([True] * 9 + [False], until_width=0.6)
+    assert stopped.to_json()["interval"] == list(confidence_sequence(9, 10))
+    assert stopped.success.interval[0] < fixed.success.interval[0]
+    assert EvalResult.from_json(json.loads(json.dumps(stopped.to_json()))) == stopped
+
+
+def test_a_file_from_before_there_were_conditions_is_a_nominal_one():
+    data = json.loads(json.dumps(result([True]).to_json()))
+    data["settings"] = {"horizon": 150, "tolerance": 0.02, "disturbance": "none"}
+    assert EvalResult.from_json(data).settings == SETTINGS
 
 
 def test_failures_are_counted_by_phase():
@@ -128,4 +159,4 @@ def test_unlike_results_are_not_compared():
     with pytest.raises(MismatchError, match="task differs: mlp has pick, act has push"):
         compare_results(result([True]), result([True], policy="act", task="push"))
     with pytest.raises(MismatchError, match="settings"):
-        compare_results(result([True]), result([True], settings=replace(SETTINGS, disturbance="push")))
+        compare_results(result([True]), result([True], settings=replace(SETTINGS, suite="knocked")))

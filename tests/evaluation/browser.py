@@ -1,0 +1,61 @@
+"""A headless Chromium that opens a file as people would, and what it notices meanwhile."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+HEIGHT = 900
+
+
+@dataclass
+class Opened:
+    """A page that is open. told: what its console said; asked: every address that it wanted but itself and `data:`."""
+
+    page: Page
+    told: list[str] = field(default_factory=list[str])
+    asked: list[str] = field(default_factory=list[str])
+
+    def ask(self, script: str, argument: object = None) -> Any:
+        """The value of an expression, or of a function of `argument`, in the page."""
+        return self.page.evaluate(script, argument)
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """One Chromium of the machine; `AssertionError` says what to install where there is none."""
+    found = next(filter(None, map(shutil.which, NAMES)), None)
+    assert found, f"no Chromium ({', '.join(NAMES)}) on the PATH; .ci/browser installs Debian's where it is run as root"
+    with sync_playwright() as playwright:
+        # Its sandbox cannot be had as root, nor in most containers; the pages are our own.
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "dark"] = "light") -> Iterator[Opened]:
+    """`path` in a window of this width [px], without a network."""
+    context = browser.new_context(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True)
+    page = context.new_page()
+    seen, own = Opened(page), path.resolve().as_uri()
+    page.on("console", lambda message: seen.told.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: seen.told.append(str(error)))
+    page.on("request", lambda request: _note(seen.asked, request.url, own))
+    page.goto(own)
+    try:
+        yield seen
+    finally:
+        context.close()
+
+
+def _note(asked: list[str], url: str, own: str) -> None:
+    if url != own and not url.startswith("data:"):
+        asked.append(url)

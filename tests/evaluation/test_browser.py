@@ -1,0 +1,219 @@
+"""Reports in a real headless Chromium: quiet, whole without a network, playing, and fitting wide and narrow windows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from manip_il.evaluation.compare_report import CompareReport, compare_page
+from manip_il.evaluation.eval_report import EvalReport, eval_page
+from manip_il.evaluation.failure_map import map_marks
+from manip_il.evaluation.film import encode_png
+from manip_il.evaluation.paired_map import paired_marks
+from manip_il.evaluation.report import PolicyRow, Report, Strip, render_report, write_page
+from manip_il.evaluation.report_data import CurvePoint, LearningCurve
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.statistics import Proportion
+
+from .browser import HEIGHT, Opened, chromium, opened
+from .made_evals import far_corner, made_comparison, made_eval, small_film
+
+pytestmark = pytest.mark.slow
+
+WINDOWS: tuple[tuple[int, Literal["light", "dark"]], ...] = (
+    (1280, "light"),
+    (1280, "dark"),
+    (390, "light"),
+    (390, "dark"),
+)
+CURVE = LearningCurve(
+    tuple(CurvePoint(400 * i, Proportion(9 * i, 40), f"round {i}", 20 * i, 60.0 * i) for i in (1, 2, 3, 4)), target=0.9
+)
+RESULT = made_eval("runs/a_policy_with_a_name_that_is_rather_long/round_004/policy/pretrained_model", n=200)
+COMPARISON = made_comparison(far_corner, lambda number, _: number % 37 == 0, seeds=2)
+PLAY = """async (video) => {
+    await video.play();
+    for (let tries = 0; tries < 100 && video.currentTime < 0.2; tries++) await new Promise(go => setTimeout(go, 50));
+    video.pause();
+    return {at: video.currentTime, duration: video.duration, width: video.videoWidth, error: video.error};
+}"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A page, and what it must show. films: their outcomes in the order of the page, None where none is told."""
+
+    html: str
+    verdict: str
+    films: tuple[bool | None, ...]
+    captions: tuple[str, ...]
+
+
+def eval_case() -> Case:
+    outcomes = (True, False, False, True)
+    films = tuple(small_film(number, success) for number, success in enumerate(outcomes))
+    report = EvalReport(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
+    ordered = [film for film in films if not film.success] + [film for film in films if film.success]
+    return Case(eval_page(report), report.verdict, tuple(f.success for f in ordered), tuple(f.caption for f in ordered))
+
+
+def compare_case() -> Case:
+    films = (small_film(0, False), small_film(1, True))
+    report = CompareReport(COMPARISON, "manip-il compare a b", films=films)
+    return Case(compare_page(report), report.verdict, (False, True), tuple(film.caption for film in films))
+
+
+def quickstart_case() -> Case:
+    films = tuple(small_film(number, None) for number in range(3))
+    picture = encode_png(np.full((48, 64, 3), 90, dtype=np.uint8))
+    report = Report(
+        "panda pick_place",
+        "DAgger solves 95.0 % of 200 unseen starts.",
+        "manip-il quickstart",
+        (PolicyRow.of("DAgger", RESULT, 4000), PolicyRow.of("cloning", RESULT, 4000, RESULT, "cloning")),
+        curve=CURVE,
+        films=films,
+        strips=(Strip("DAgger", tuple((0.1 * i, picture) for i in range(6))),),
+        timings={"training": 65.0},
+    )
+    return Case(render_report(report), report.verdict, (None,) * 3, tuple(film.caption for film in films))
+
+
+CASES = {"eval": eval_case, "compare": compare_case, "quickstart": quickstart_case}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]()
+
+
+@pytest.fixture(scope="module")
+def file(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_page(path, case.html)
+    return path
+
+
+@pytest.mark.parametrize(("width", "scheme"), WINDOWS)
+def test_it_opens_quietly_and_fits_the_window(
+    browser: Browser, case: Case, file: Path, width: int, scheme: Literal["light", "dark"]
+):
+    with opened(browser, file, width, scheme) as seen:
+        seen.ask("document.querySelectorAll('details').forEach(one => one.open = true)")
+        wide, room = seen.ask("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        assert wide <= room == width
+        assert too_wide(seen) == []
+        assert first_words(seen) == case.verdict
+        paper, ink = seen.ask(
+            "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
+        )
+        assert (brightness(paper) > brightness(ink)) == (scheme == "light")
+        assert (seen.told, seen.asked) == ([], [])
+
+
+def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path):
+    with opened(browser, file, 1280) as seen:
+        films = seen.page.query_selector_all("video")
+        assert len(films) == len(case.films)
+        for film, success, caption in zip(films, case.films, case.captions, strict=True):
+            assert film.is_visible()
+            played = film.evaluate(PLAY)
+            assert played["error"] is None
+            assert played["duration"] == pytest.approx(1.0, abs=0.1)
+            assert played["at"] >= 0.2
+            assert played["width"] == 64
+            assert caption in film.evaluate("film => film.closest('figure').innerText")
+            heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
+            assert success is None or heading == ("Successes" if success else "Failures")
+        assert (seen.told, seen.asked) == ([], [])
+
+
+def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, case: Case, tmp_path: Path):
+    slipped_in = case.html.replace("</main>", "<script>document.title = 'slipped in'</script></main>")
+    assert slipped_in != case.html
+    write_page(tmp_path / "report.html", slipped_in)
+    with opened(browser, tmp_path / "report.html", 1280) as seen:
+        assert seen.page.title() != "slipped in"
+        assert any("Content Security Policy" in told for told in seen.told)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path: Path, width: int):
+    write_page(tmp_path / "report.html", eval_case().html)
+    with opened(browser, tmp_path / "report.html", width) as seen:
+        for index in range(2):
+            assert marks_in(seen, index) == counted(RESULT)
+
+
+def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
+    write_page(tmp_path / "report.html", compare_case().html)
+    with opened(browser, tmp_path / "report.html", 1280) as seen:
+        for arm, marks in enumerate(paired_marks(COMPARISON)):
+            expected = {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
+            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == expected
+        assert marks_in(seen, 0)["failed"] > 0 == marks_in(seen, 2)["failed"]
+
+
+def counted(result: EvalResult) -> dict[str, int]:
+    marks = map_marks(result)
+    return {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
+
+
+def marks_in(seen: Opened, index: int) -> dict[str, int]:
+    """How many marks of each kind one map has, all of them inside its frame and seen."""
+    return seen.ask(
+        """(index) => {
+            const map = document.querySelectorAll('svg.map')[index], frame = map.getBoundingClientRect();
+            const inside = (mark) => {
+                const box = mark.querySelector('circle').getBoundingClientRect();
+                return box.width > 2 && box.left >= frame.left && box.right <= frame.right
+                    && box.top >= frame.top && box.bottom <= frame.bottom;
+            };
+            const count = (kind) => [...map.querySelectorAll('.mark-' + kind)].filter(inside).length;
+            return {failed: count('failed'), shared: count('shared'), solved: count('solved')};
+        }""",
+        index,
+    )
+
+
+def first_words(seen: Opened) -> str:
+    """The first heading's words, which must stand in the first window without scrolling."""
+    words, bottom = seen.ask(
+        """() => {
+            const first = document.querySelector('h1, h2, h3, table, svg, video');
+            return [first.innerText, first.getBoundingClientRect().top];
+        }"""
+    )
+    assert bottom < HEIGHT / 4
+    return str(words).replace("\N{NO-BREAK SPACE}", " ")
+
+
+def too_wide(seen: Opened) -> list[str]:
+    """Words that stick out of the page's column."""
+    return seen.ask(
+        """() => {
+            const main = document.querySelector('main').getBoundingClientRect();
+            const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, svg.map, .bar-line';
+            return [...document.querySelectorAll(parts)]
+                .filter(one => one.getBoundingClientRect().right > main.right + 1 && one.offsetParent !== null
+                    && !one.closest('thead'))
+                .map(one => one.tagName + ': ' + one.textContent.slice(0, 60));
+        }"""
+    )
+
+
+def brightness(colour: str) -> int:
+    """Of `rgb(1, 2, 3)`."""
+    return sum(int(part) for part in colour.removeprefix("rgb(").removesuffix(")").split(","))

@@ -1,0 +1,190 @@
+"""An evaluation's outcomes belong to their seeds, and it stops where it says it does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from manip_il.cli.suites import suite_conditions
+from manip_il.engine.describe import env_spec
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.errors import UsageError
+from manip_il.evaluation import runner
+from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.evaluation.runner import episode_result, evaluate
+from manip_il.seeding import stream_seeds
+from manip_il.sim.conditions import NOMINAL, Condition, draw
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.varied import VariedEnv
+
+from ..learn.tiny_policies import write_checkpoint
+
+SEEDS = stream_seeds("certificate", 12)
+ENV = EnvConfig("fetch", horizon=12)
+ALL = suite_conditions("all", "pick_place", sees=False)
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory):
+    """A policy of chunks, whose memory could leak from one episode into another."""
+    return write_checkpoint(tmp_path_factory.mktemp("act"), "act", env_spec(ENV))
+
+
+@pytest.fixture(scope="module")
+def mlp(tmp_path_factory):
+    """A policy of one call for all episodes, fitted a little so that its actions differ from state to state."""
+    from manip_il.learn.mlp import MLPConfig
+    from manip_il.learn.train import TrainConfig, fit
+
+    episodes = list(run_job(RolloutJob(EnvConfig("fetch"), "expert", hold=3), stream_seeds("demonstrations", 3)))
+    table = {key: np.concatenate([episode.columns[key] for episode in episodes]) for key in episodes[0].columns}
+    table["episode_index"] = np.repeat(np.arange(3), [len(episode) for episode in episodes])
+    config = TrainConfig(steps=60, batch_size=64, policy=MLPConfig(width=64))
+    return fit(table, config, tmp_path_factory.mktemp("policy"), spec=env_spec(EnvConfig("fetch")))
+
+
+def job_of(policy, **changes) -> RolloutJob:
+    return RolloutJob(ENV, "policy", policy=policy, labels="last", **changes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["act", "mlp"])
+def test_outcomes_depend_on_no_batch_and_no_worker(kind, request):
+    policy = request.getfixturevalue(kind)
+    job = replace(job_of(policy, conditions=ALL), env=replace(ENV, horizon=20))
+    seeds = stream_seeds("test", 52)
+    expected = evaluate(Engine(1), replace(job, batch=1), seeds, "it")
+    assert len({episode.detail["end"]["hand"][0] for episode in expected.episodes}) > 40
+    with Engine(2) as two:
+        for batch in (8, 50):
+            for engine in (Engine(1), two):
+                assert evaluate(engine, replace(job, batch=batch), seeds, "it") == expected
+    backwards = evaluate(Engine(1), job, seeds[::-1], "it")
+    assert backwards.episodes[::-1] == expected.episodes
+
+
+def test_physics_does_not_depend_on_the_batch_to_the_bit(act):
+    def written(batch: int) -> dict[int, bytes]:
+        job = job_of(act, conditions=ALL, batch=batch)
+        return {episode.seed: episode.columns["sim_state"].tobytes() for episode in run_job(job, SEEDS)}
+
+    assert written(1) == written(5) == written(12)
+
+
+def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
+    together = {one.seed: one for one in evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it").episodes}
+    nominal = {one.seed: one for one in evaluate(Engine(1), job_of(act), SEEDS, "it").episodes}
+    same = [seed for seed in SEEDS if together[seed].detail["end"] == nominal[seed].detail["end"]]
+    assert same == [seed for seed in SEEDS if draw(ALL, seed).condition == NOMINAL.name]
+    assert len(same) == 3
+
+
+def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
+    result = evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it", suite="all")
+    env = VariedEnv(ALL, config=ENV)
+    for episode in result.episodes:
+        env.start(episode.seed)
+        assert episode.detail["drawn"] == dict(env.circumstances.drawn)
+        assert episode.detail["condition"] == env.circumstances.condition
+    assert {episode.detail["condition"] for episode in result.episodes} == {"nominal", "knocked", "sensing", "object"}
+    assert result.settings.suite == "all"
+    assert result.settings.conditions == ALL
+
+
+def test_places_are_the_true_ones_of_first_and_last_state():
+    job = RolloutJob(
+        EnvConfig("fetch"), "expert", labels="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),)
+    )
+    [episode] = run_job(job, SEEDS[:1])
+    result = episode_result(job, episode)
+    env = ManipEnv(config=EnvConfig("fetch"))
+    env.start(SEEDS[0])
+    assert env.scene.object_q is not None
+    assert result.detail["start"]["object"] == pytest.approx(
+        env.data.qpos[env.scene.object_q : env.scene.object_q + 3], abs=1e-4
+    )
+    assert result.detail["start"]["hand"] == pytest.approx(env.data.site_xpos[env.scene.ee_site], abs=1e-4)
+    assert result.success
+    assert np.linalg.norm(np.subtract(result.detail["end"]["object"], result.detail["goal"])) < 0.02
+    [shown] = episode.columns["observation.environment_state"][:1]
+    assert np.abs(shown[12:15] - result.detail["start"]["object"]).max() > 0.01  # it was told another place
+
+
+def test_a_task_without_an_object_has_no_place_of_one(act):
+    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), "expert", labels="last")
+    [one] = evaluate(Engine(1), job, SEEDS[:1], "expert").episodes
+    assert set(one.detail["start"]) == {"hand"}
+
+
+class Coins(Engine):
+    """Its episodes are their seeds, in reverse; `asked` is what was to be run."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.asked: list[list[int]] = []
+
+    def run(self, job, seeds, keep=None):  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.asked.append(list(seeds))
+        return (SimpleNamespace(seed=seed) for seed in reversed(seeds))
+
+
+@pytest.fixture
+def coins(monkeypatch):
+    """Engines whose episodes come out as a list says."""
+
+    def make(outcomes: list[bool]) -> Coins:
+        monkeypatch.setattr(runner, "episode_result", lambda job, one: result(one.seed, outcomes[one.seed]))
+        return Coins()
+
+    return make
+
+
+def result(seed: int, success: bool) -> EpisodeResult:
+    return EpisodeResult(seed, success, success, 10, float(success))
+
+
+def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
+    engine = coins([seed % 50 != 7 for seed in range(10_000)])
+    job = RolloutJob(ENV, "random", labels="last")
+    found = evaluate(engine, job, range(10_000), "coin", until_width=0.05)
+    low, high = found.success.interval
+    assert high - low <= 0.05
+    assert len(found.episodes) % runner.LOOK_EVERY == 0
+    shorter = EvalResult(
+        "coin", "fetch", "pick_place", {}, found.episodes[: -runner.LOOK_EVERY], found.settings, until_width=0.05
+    )
+    assert shorter.success.interval[1] - shorter.success.interval[0] > 0.05
+    assert [episode.seed for episode in found.episodes] == list(range(len(found.episodes)))
+    assert max(map(max, engine.asked)) == len(found.episodes) - 1  # nothing beyond it was run
+
+
+def test_until_width_gives_up_at_the_last_seed(coins):
+    found = evaluate(
+        coins([True] * 150), RolloutJob(ENV, "random", labels="last"), range(150), "coin", until_width=0.001
+    )
+    assert len(found.episodes) == 150
+    assert found.to_json()["interval_method"].startswith("confidence sequence")
+
+
+def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
+    outcomes = [seed % 9 != 0 for seed in range(1_000)]
+    job = RolloutJob(ENV, "random", labels="last")
+    for width in (None, 0.1):
+        whole = evaluate(coins(outcomes), job, range(1_000), "coin", until_width=width)
+        engine = coins(outcomes)
+        done = {seed: result(seed, outcomes[seed]) for seed in range(0, 1_000, 3)}
+        seen: list[EpisodeResult] = []
+        resumed = evaluate(engine, job, range(1_000), "coin", seen.append, done=done, until_width=width)
+        assert resumed == whole
+        assert not {one.seed for one in seen} & set(done)
+        assert sorted(one.seed for one in seen) == sorted(seed for asked in engine.asked for seed in asked)
+
+
+@pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
+def test_a_width_that_cannot_be_is_refused(width, coins):
+    with pytest.raises(UsageError, match="expected between 0 and 1"):
+        evaluate(coins([True]), RolloutJob(ENV, "random", labels="last"), range(1), "coin", until_width=width)
