@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.evaluate import MaybeRobotGroup, MaybeTaskGroup, check_policy
 from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import (
     DEFAULT_HZ,
@@ -15,10 +14,13 @@ from manip_il.cli.groups import (
     ENGINE_HELP,
     WORKERS_HELP,
     EnvGroup,
+    MaybeRobotGroup,
+    MaybeTaskGroup,
     find_policy,
     option,
     save_options,
 )
+from manip_il.cli.policy_check import check_policy
 from manip_il.cli.progress import progress, say
 from manip_il.errors import FolderExistsError, UsageError
 

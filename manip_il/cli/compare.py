@@ -9,13 +9,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli.evaluate import MaybeRobotGroup, MaybeTaskGroup
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, EnvGroup, check_same_options, option, save_options, warn
+from manip_il.cli.groups import (
+    ENGINE_HELP,
+    WORKERS_HELP,
+    EnvGroup,
+    MaybeRobotGroup,
+    MaybeTaskGroup,
+    check_same_options,
+    command_line,
+    option,
+    save_options,
+    warn,
+)
 from manip_il.cli.measure import TEST_EPISODES, Trial, check_policies, measured, rule_json
-from manip_il.cli.options import options_of
+from manip_il.cli.options import options_of, to_plain
 from manip_il.cli.progress import say
 from manip_il.cli.sides import Side, Source, common_env, limit_of, matched, read_side
+from manip_il.cli.suites import SUITE_HELP
 from manip_il.errors import UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, Measured, require_same_episodes, write_json
 from manip_il.evaluation.results import EvalResult
@@ -25,6 +36,7 @@ if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
     from manip_il.engine.engine import Engine
 
+REPORT_FILE = "report.html"
 FREE = ("workers", "engine", "output_dir")
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes or seconds (up to what every run reached; seconds of "
@@ -37,7 +49,6 @@ class TrialGroup:
     """`--eval.*`: what both sides are tested on."""
 
     n_episodes: int = option(TEST_EPISODES, "test episodes, the same for both sides")
-    disturbance: Literal["none", "standard"] = option("none", "standard: the object is knocked, actions are noisy")
 
 
 @dataclass
@@ -45,7 +56,7 @@ class CompareOptions:
     """Compare two policies, runs, or folders of several training seeds, on the same test seeds.
 
     Each side is an eval.json, a policy, a run of manip-il dagger, or a folder with such things named seed_0, seed_1
-    and so on. Two eval.json are compared as they are; all else is evaluated first. Writes compare.json.
+    and so on. Two eval.json are compared as they are; all else is evaluated first. Writes compare.json and report.html.
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
@@ -54,6 +65,7 @@ class CompareOptions:
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
     at: str = option("end", AT_HELP)
     eval: TrialGroup = field(default_factory=TrialGroup)
+    suite: str = option("nominal", SUITE_HELP)
     robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
     task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
@@ -89,6 +101,7 @@ class CompareOptions:
         comparison = Comparison(left_arm, right_arm)
         content = comparison.to_json() | {"rule": rule_json(rule, limit), **_test_json(comparison)}
         write_json(self.output_dir / FILE_NAME, content)
+        self._report(comparison, rule, limit)
         self._say(comparison, rule, limit)
 
     def _trial(self, sources: Sequence[Source], rule: Rule, limit: float | None) -> Trial | None:
@@ -101,10 +114,11 @@ class CompareOptions:
         if len(results) == len(sources):
             return None
         env = common_env(sources, self.env, self.robot.type, self.task.type)
-        trial = Trial(env, stream_seeds("test", self.eval.n_episodes, self.seed), self.eval.disturbance)
+        policies = {source.name: source.chosen(rule, limit)[0] for source in sources if source.result is None}
+        seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
+        trial = Trial.of(env, seeds, self.suite, policies.values())
         for source in results:
             trial.check_result(source.name, _result(source))
-        policies = {source.name: source.chosen(rule, limit)[0] for source in sources if source.result is None}
         check_policies(trial, policies, self.output_dir, self.engine)
         return trial
 
@@ -129,6 +143,19 @@ class CompareOptions:
             return Measured(source.name, _result(source), source.path, source.training_seed)
         return measured(source, rule, limit, trial, self.output_dir, engine, stages)
 
+    def _report(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
+        from manip_il.evaluation.compare_report import CompareReport, compare_page
+        from manip_il.evaluation.comparison_table import comparison_facts
+        from manip_il.evaluation.report import write_page
+
+        report = CompareReport(
+            comparison,
+            command=command_line("compare", self),
+            more_facts=tuple(comparison_facts(comparison, rule, limit)),
+            config=to_plain(self),
+        )
+        write_page(self.output_dir / REPORT_FILE, compare_page(report))
+
     def _say(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
         from manip_il.evaluation.comparison_table import comparison_facts, comparison_table
         from manip_il.evaluation.tables import print_table
@@ -138,22 +165,23 @@ class CompareOptions:
             say(line)
         say(comparison.verdict)
         say(f"result: {self.output_dir / FILE_NAME}")
+        say(f"report: {self.output_dir / REPORT_FILE}")
         say(f"next: {self._next(comparison)}")
 
     def _next(self, comparison: Comparison) -> str:
         policies = [member.policy for arm in (comparison.left, comparison.right) for member in arm.members]
         if None in policies:
             return "manip-il study --help  (does it hold for other training seeds?)"
-        if self.eval.disturbance == "none":
+        if self.suite == "nominal":
             return self._disturbed()
         loser = comparison.left if comparison.difference > 0 else comparison.right
         folder = f"--output_dir={self.output_dir}_films"
         return shlex.join(["manip-il", "eval", f"--policy.path={loser.members[0].policy}", "--eval.films=3", folder])
 
     def _disturbed(self) -> str:
-        """This comparison once more, under the disturbance."""
-        places = {"left", "right", "eval.disturbance", "output_dir", "resume", "overwrite"}
-        words = ["manip-il", "compare", str(self.left), str(self.right), "--eval.disturbance=standard"]
+        """This comparison once more, in a rougher world."""
+        places = {"left", "right", "suite", "output_dir", "resume", "overwrite"}
+        words = ["manip-il", "compare", str(self.left), str(self.right), "--suite=disturbed"]
         words += [f"--output_dir={self.output_dir}_disturbed"]
         for known in options_of(type(self)):
             value = functools.reduce(getattr, known.name.split("."), self)

@@ -1,12 +1,13 @@
-"""`manip-il eval`: success on unseen seeds, with its interval."""
+"""`manip-il eval`: how often a policy succeeds on seeds that nothing was chosen on."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+import shlex
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli.folders import atomic_write, prepare_output
+from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import (
     DEFAULT_HZ,
     DEFAULT_ROBOT,
@@ -14,23 +15,33 @@ from manip_il.cli.groups import (
     ENGINE_HELP,
     WORKERS_HELP,
     EnvGroup,
+    MaybeRobotGroup,
+    MaybeTaskGroup,
+    check_same_options,
+    command_line,
     find_policy,
     option,
     save_options,
-    warn,
 )
+from manip_il.cli.kept_episodes import KeptEpisodes
+from manip_il.cli.options import to_plain
+from manip_il.cli.policy_check import check_policy, looks
 from manip_il.cli.progress import say
-from manip_il.errors import FolderExistsError, RenderError, UsageError
+from manip_il.cli.suites import SUITE_HELP, suite_conditions
+from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 if TYPE_CHECKING:
+    from manip_il.cli.shown import Shown
+    from manip_il.cli.stages import Stages
+    from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
     from manip_il.evaluation.results import EvalResult
     from manip_il.learn.checkpoint import CheckpointMeta
-    from manip_il.mdp import Episode, Observation
     from manip_il.sim.env import EnvConfig
-    from manip_il.sim.look import CameraConfig
 
-FILMS = "films"
+REPORT_FILE = "report.html"
+EPISODES, MOST_EPISODES = 100, 10_000
+FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size")
 
 
 @dataclass
@@ -42,32 +53,21 @@ class WhoGroup:
 
 
 @dataclass
-class MaybeRobotGroup:
-    """`--robot.*` where a checkpoint may say it."""
-
-    type: str | None = option(None, f"panda or fetch; by default the policy's, else {DEFAULT_ROBOT}")
-
-
-@dataclass
-class MaybeTaskGroup:
-    """`--task.*` where a checkpoint may say it."""
-
-    type: str | None = option(None, f"reach, lift or pick_place; by default the policy's, else {DEFAULT_TASK}")
-
-
-@dataclass
 class EvalGroup:
     """`--eval.*`: what is run."""
 
-    n_episodes: int = option(100, "episodes, each on a seed of its own")
-    disturbance: Literal["none", "standard"] = option("none", "standard: the object is knocked, actions are noisy")
+    n_episodes: int | None = option(
+        None, f"episodes, each on a seed of its own; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
+    )
+    first: int = option(0, "which seed of the stream is the first one: for one part of a larger evaluation")
+    batch_size: int = option(25, "episodes in lockstep that share a call of the policy; changes no outcome")
     stream: Literal["test", "validation"] = option("test", "seeds: test is what nothing was chosen on")
-    films: int = option(0, "film this many episodes, the first ones")
+    films: int = option(2, "film so many failures, and as many successes")
 
 
 @dataclass
 class EvalOptions:
-    """Measure a policy's success on unseen seeds; writes eval.json."""
+    """Measure a policy's success on unseen seeds; writes eval.json and report.html."""
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     policy: WhoGroup = field(default_factory=WhoGroup)
@@ -75,182 +75,174 @@ class EvalOptions:
     task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
+    suite: str = option("nominal", SUITE_HELP)
+    until_width: float | None = option(None, "stop once the interval is so narrow: 0.02 for 2 points")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
     output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
+    resume: bool = option(False, "go on with an evaluation that was stopped, or with more episodes")
     overwrite: bool = option(False, "replace an evaluation that is there")
 
     def run(self) -> None:
-        """Run the episodes, write `eval.json`, print the table."""
-        if (self.policy.path is None) == (self.policy.type is None):
-            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
-        if self.eval.n_episodes < 1 or self.eval.films < 0:
-            raise UsageError(
-                f"--eval.n_episodes is {self.eval.n_episodes}, --eval.films {self.eval.films}; "
-                "expected at least 1 and at least 0"
-            )
-        job = self._job()
+        """Run the episodes, write `eval.json` and `report.html`, print the table."""
+        self._check()
+        seeds = self._seeds()
+        job = self._job(len(seeds))
+        from manip_il.cli.stages import Stages
+        from manip_il.engine.engine import Engine
         from manip_il.evaluation.results import FILE_NAME
 
-        try:
-            prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
-        except FolderExistsError:
-            raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
-        save_options(self.output_dir, self)
-        result, filmed = self._evaluate(job)
-        result.write(self.output_dir / FILE_NAME)
-        self._say(result)
-        if filmed:
-            _write_films(filmed, job.env, self.output_dir / FILMS)
+        engine = Engine(self.workers, self.engine)
+        self._prepare()
+        kept = KeptEpisodes.open(self.output_dir, job, self.suite, str(self.output_dir))
+        with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
+            result = self._evaluate(job, seeds, engine, kept, stages)
+            result.write(self.output_dir / FILE_NAME)
+            self._say(result)
+            shown = self._show(job, result, engine, stages)
+        self._report(result, shown)
         say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"next: {self._next()}")
+        say(f"report: {self.output_dir / REPORT_FILE}")
+        say(f"next: {self._next(result)}")
 
-    def _job(self) -> RolloutJob:
-        if self.policy.path is None:
-            env = self._env(None)
-            from manip_il.engine.jobs import RolloutJob
+    def _check(self) -> None:
+        if (self.policy.path is None) == (self.policy.type is None):
+            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
+        for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("batch_size", 1)):
+            value = getattr(self.eval, name)
+            if value is not None and value < lowest:
+                raise UsageError(f"--eval.{name} is {value}; expected at least {lowest}")
+        if self.until_width is not None and not 0 < self.until_width < 1:
+            raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
 
-            driver, path = self.policy.type, None
+    def _seeds(self) -> range:
+        from manip_il.seeding import stream_seeds
+
+        most = EPISODES if self.until_width is None else MOST_EPISODES
+        count = self.eval.n_episodes or most
+        return stream_seeds(self.eval.stream, self.eval.first + count, self.seed)[self.eval.first :]
+
+    def _job(self, episodes: int) -> RolloutJob:
+        from manip_il.engine.jobs import RolloutJob
+
+        path = None if self.policy.path is None else find_policy(self.policy.path)
+        self._check_memory(path, episodes)
+        if path is None:
+            env, driver, cameras = self._env(None), self.policy.type, None
         else:
-            from manip_il.engine.jobs import RolloutJob
             from manip_il.learn.checkpoint import read_meta
 
-            driver, path = "policy", find_policy(self.policy.path)
+            driver = "policy"
             meta = read_meta(path)
             env = self._env(meta)
             cameras = check_policy(path, meta, env, draw=self.engine == "local")
             if cameras is not None:
-                say(_looks(cameras, path))
-        from manip_il.sim.disturb import NONE, STANDARD
+                say(looks(cameras, path))
+        conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
+        job = RolloutJob(env, driver or "random", policy=path, labels="last", conditions=conditions)
+        return replace(job, batch=self.eval.batch_size)
 
-        disturbance = STANDARD if self.eval.disturbance == "standard" else NONE
-        return RolloutJob(env, driver or "random", policy=path, labels="last", disturbance=disturbance)
+    def _check_memory(self, policy: Path | None, episodes: int) -> None:
+        """Before anything large is loaded; on a cluster memory is its own affair."""
+        from manip_il.engine.engine import default_workers
+        from manip_il.engine.memory import check_memory
+
+        if self.engine != "local":
+            return
+        workers = min(self.workers or default_workers(), episodes)
+        if policy is None:
+            check_memory(workers, cameras=False, learned=False)
+            return
+        from manip_il.engine.sight import policy_cameras
+
+        weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
+        check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)
 
     def _env(self, meta: CheckpointMeta | None) -> EnvConfig:
         robot = self.robot.type or (meta.robot if meta else DEFAULT_ROBOT)
         task = self.task.type or (meta.task if meta else DEFAULT_TASK)
         return self.env.config(robot, task, meta.fps if meta else DEFAULT_HZ)
 
-    def _evaluate(self, job: RolloutJob) -> tuple[EvalResult, list[Episode]]:
-        from manip_il.cli.progress import progress
-        from manip_il.engine.engine import Engine
+    def _prepare(self) -> None:
+        """Make the folder, before the first episode."""
+        try:
+            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+            if self.resume:
+                check_same_options(self.output_dir, self, FREE, may_grow="eval.n_episodes")
+            save_options(self.output_dir, self)
+        except FolderExistsError:
+            raise UsageError(
+                f"{self.output_dir} exists already; go on with it by --resume=true, or replace it by --overwrite=true"
+            ) from None
+        except OSError as error:
+            raise ManipError(
+                f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
+                'container run as the user whose folder it is: docker run --user "$(id -u):$(id -g)"'
+            ) from error
+
+    def _evaluate(
+        self, job: RolloutJob, seeds: range, engine: Engine, kept: KeptEpisodes, stages: Stages
+    ) -> EvalResult:
+        from manip_il.evaluation.results import EpisodeResult
         from manip_il.evaluation.runner import evaluate
-        from manip_il.seeding import stream_seeds
 
-        seeds = stream_seeds(self.eval.stream, self.eval.n_episodes, self.seed)
-        filmed: dict[int, Episode] = {}
-        solved = 0
-        with (
-            progress(len(seeds), f"evaluate {self._name()}") as bar,
-            Engine(self.workers, self.engine) as engine,
-        ):
+        done = kept.results(seeds)
+        stages.start(f"evaluate {self._name()}", len(seeds) - len(done))
 
-            def seen(episode: Episode) -> None:
-                nonlocal solved
-                solved += episode.success
-                bar.advance(solved=solved)
-                if episode.seed < seeds[0] + self.eval.films:
-                    filmed[episode.seed] = episode
+        def keep(result: EpisodeResult) -> None:
+            kept.add(result)
+            stages.episode(result)
 
-            result = evaluate(engine, job, seeds, self._name(), seen)
-        return result, [filmed[seed] for seed in sorted(filmed)]
+        result = evaluate(
+            engine, job, seeds, self._name(), keep, suite=self.suite, done=done, until_width=self.until_width
+        )
+        stages.close()
+        return result
+
+    def _show(self, job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages) -> Shown:
+        from manip_il.cli.shown import show
+
+        return show(job, result, engine, stages, self.eval.films, self.output_dir)
+
+    def _report(self, result: EvalResult, shown: Shown) -> None:
+        from manip_il.cli.shown import run_curve
+        from manip_il.evaluation.eval_report import EvalReport, eval_page
+        from manip_il.evaluation.report import write_page
+
+        report = EvalReport(
+            result,
+            command=command_line("eval", self),
+            config=to_plain(self),
+            films=shown.films,
+            paths=shown.paths,
+            pictures_note=shown.note,
+            curve=run_curve(self.policy.path),
+        )
+        write_page(self.output_dir / REPORT_FILE, eval_page(report))
 
     def _name(self) -> str:
         return str(self.policy.type or self.policy.path)
 
     def _say(self, result: EvalResult) -> None:
-        from manip_il.evaluation.report_data import PolicyRow
-        from manip_il.evaluation.terminal import print_results
+        from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
+        from manip_il.evaluation.tables import print_table
 
-        kind = {"expert": "expert", "random": "baseline"}.get(self.policy.type or "", "dagger")
-        print_results([PolicyRow.of(self._name(), result, kind=kind)])  # pyright: ignore[reportArgumentType]
-        if result.failures:
-            failures = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
-            say(f"failures by the phase that they ended in: {failures}")
+        print_table(evaluation_table(result))
+        for line in evaluation_lines(result):
+            say(line)
+        if self.until_width is not None:
+            low, high = result.success.interval
+            reached = high - low <= self.until_width
+            say(
+                f"stopped after {len(result.episodes):,} episodes: the interval is {100 * (high - low):.2f} points wide"
+                + ("" if reached else f", not {100 * self.until_width:g} yet; give more --eval.n_episodes")
+            )
 
-    def _next(self) -> str:
-        who = f"--policy.path={self.policy.path}" if self.policy.path else f"--policy.type={self.policy.type}"
-        if self.eval.disturbance == "none":
-            return f"manip-il eval {who} --eval.disturbance=standard --output_dir={self.output_dir}_disturbed"
-        return f"manip-il eval {who} --eval.films=3 --output_dir={self.output_dir}_filmed"
-
-
-def check_policy(path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True) -> CameraConfig | None:
-    """The cameras that the policy looks at, None for none; warns where it was trained on something else than `env`.
-
-    draw: make its first pictures here, to see that they can be made. Raises `MismatchError` unless the policy can drive
-    `env`, `RenderError` where there is no OpenGL for its pictures, and what `LearnedPolicy.load` raises.
-    """
-    from manip_il.engine.describe import env_spec
-    from manip_il.engine.sight import policy_cameras
-    from manip_il.learn.checkpoint import check_fits
-    from manip_il.learn.policy import LearnedPolicy
-    from manip_il.learn.pretrained import check_interface, read_interface
-
-    cameras = policy_cameras(path)
-    spec = env_spec(env, cameras)
-    if meta is not None:
-        check_fits(meta, spec)
-    check_interface(read_interface(path), spec)
-    warn(_differences(path, meta, env, cameras))
-    policy = LearnedPolicy.load(path, task=spec.instruction)
-    # One action now says what else would not fit before a worker does.
-    seen = _first_sight(env, cameras, draw)
-    images = {camera: picture[None] for camera, picture in seen.images.items()}
-    policy.act(seen.state[None], seen.environment_state[None], images)
-    return cameras
-
-
-def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
-    from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.engine.describe import env_fingerprint
-
-    if meta is None:
-        lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
-        return [*lines, f"nor in what light its pictures were made: {cameras.look} is assumed"] if cameras else lines
-    lines = [f"task differs: {path} has {meta.task}, the environment has {env.task}"] if meta.task != env.task else []
-    theirs = dict(meta.fingerprint)
-    if cameras is None:
-        theirs.pop("cameras_sha256", None)  # it sees none
-    return lines + compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
-
-
-def _first_sight(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
-    import numpy as np
-
-    from manip_il.sim.env import ManipEnv
-
-    if cameras is None or not draw:
-        world = ManipEnv(config=env)
-    else:
-        world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
-    world.start(0)
-    seen = world.observe()
-    if cameras is not None and not draw:
-        return replace(seen, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
-    return seen
-
-
-def _looks(cameras: CameraConfig, path: Path) -> str:
-    from manip_il.learn.observation import observation_of
-    from manip_il.learn.pretrained import read_interface
-
-    observation = observation_of(read_interface(path).columns)
-    lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
-    size = f"{cameras.height} x {cameras.width} pixels"
-    return f"observation {observation!r}: the policy looks at {', '.join(cameras.names)}, {size}, {lights}"
-
-
-def _write_films(episodes: list[Episode], env: EnvConfig, folder: Path) -> None:
-    from manip_il.evaluation.film import encode_mp4, film
-
-    try:
-        for episode in episodes:
-            outcome = "success" if episode.success else "failure"
-            frames = film(episode, env)
-            atomic_write(folder / f"seed_{episode.seed}_{outcome}.mp4", encode_mp4(frames, env.control_hz))
-    except RenderError as error:
-        warn([f"no films: {error}"])
-        return
-    say(f"films: {folder}")
+    def _next(self, result: EvalResult) -> str:
+        failed = [index for index, episode in enumerate(result.episodes) if not episode.success]
+        if self.suite == "nominal" and not failed:
+            words: dict[str, Any] = {"suite": "all", "output_dir": Path(f"{self.output_dir}_all")}
+            return command_line("eval", replace(self, **words))
+        path = self.output_dir / "eval.json"
+        return shlex.join(["manip-il", "replay", str(path), "--episode", str((failed or [0])[0]), "--video=replay.mp4"])

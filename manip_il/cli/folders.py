@@ -12,6 +12,8 @@ from typing import Any
 from manip_il.cli.options import CONFIG_HEADER
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
+_MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a folder
+
 
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
@@ -113,6 +115,10 @@ def _json_object(path: Path) -> dict[str, Any]:
 
 
 def _delete(folder: Path) -> None:
+    if folder.is_mount():  # in a container: it can be emptied, not renamed; what marks it as ours goes last
+        for path in sorted(folder.iterdir(), key=lambda path: path.name in _MARKS):
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+        return
     # Renamed first: a kill on the way leaves no folder that has lost its mark but not its files.
     doomed = folder.with_name(f".{folder.name}.deleting.{os.getpid()}")
     folder.rename(doomed)

@@ -48,6 +48,20 @@ class TaskGroup:
 
 
 @dataclass
+class MaybeRobotGroup:
+    """`--robot.*` where a checkpoint may say it."""
+
+    type: str | None = option(None, f"panda or fetch; by default the policy's, else {DEFAULT_ROBOT}")
+
+
+@dataclass
+class MaybeTaskGroup:
+    """`--task.*` where a checkpoint may say it."""
+
+    type: str | None = option(None, f"reach, lift or pick_place; by default the policy's, else {DEFAULT_TASK}")
+
+
+@dataclass
 class EnvGroup:
     """`--env.*`: what makes an environment beside robot and task. Defaults are `EnvConfig`'s."""
 
@@ -140,7 +154,9 @@ def command_line(name: str, options: Any) -> str:
     words = ["manip-il", name]
     for known in options_of(type(options)):
         value = _value(options, known.name)
-        if known.is_open:
+        if known.positional:
+            words += map(str, value if isinstance(value, list) else [value])
+        elif known.is_open:
             words += [f"--{known.name}.{inner}={_yaml(one)}" for inner, one in value.items()]
         elif (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
             words.append(_word(known.name, value))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from manip_il.cli.suites import suite_conditions
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.comparison import Measured
@@ -18,50 +20,50 @@ if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
     from manip_il.evaluation.rounds import Rule
+    from manip_il.sim.conditions import Condition
     from manip_il.sim.env import EnvConfig
 
 FOLDER = "evaluations"
 TEST_EPISODES = 500
-TOLD_TO_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 
 
 @dataclass(frozen=True)
 class Trial:
-    """In which environment, on which seeds and under which disturbance policies are measured."""
+    """In which environment, on which seeds and under which conditions policies are measured."""
 
     env: EnvConfig
     seeds: range
-    disturbance: Literal["none", "standard"] = "none"
+    suite: str = "nominal"
+    conditions: tuple[Condition, ...] = ()
+
+    @classmethod
+    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path]) -> Trial:
+        """Under a suite's conditions: those of cameras are left out where none of the policies looks at one."""
+        from manip_il.engine.sight import policy_cameras
+
+        sees = any(policy_cameras(policy) is not None for policy in policies)
+        return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees))
 
     def job(self, policy: Path) -> RolloutJob:
         """The rollouts of one policy."""
         from manip_il.engine.jobs import RolloutJob
-        from manip_il.sim.disturb import NONE, STANDARD
 
-        disturbance = STANDARD if self.disturbance == "standard" else NONE
-        return RolloutJob(self.env, "policy", policy=policy, labels="last", disturbance=disturbance)
+        return RolloutJob(self.env, "policy", policy=policy, labels="last", conditions=self.conditions)
 
     def file(self, folder: Path, policy: Path) -> Path:
         """Where the evaluation of `policy` lies: named after its files, the environment and the episodes.
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
-        from manip_il.engine.describe import env_fingerprint
+        from manip_il.engine.describe import env_fingerprint, policy_sha256
 
-        digest = hashlib.sha256()
-        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), self.disturbance)
-        digest.update(canonical_json(made_of).encode())
-        for path in sorted(policy.iterdir()):
-            if path.is_file() and path.name not in TOLD_TO_PEOPLE:
-                digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-        return folder / FOLDER / f"{digest.hexdigest()[:16]}.json"
+        conditions = [condition.to_json() for condition in self.conditions]
+        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), conditions, policy_sha256(policy))
+        return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
 
     def check_result(self, name: str, result: EvalResult) -> None:
         """Raise `MismatchError` or `ManipError` unless an evaluation from elsewhere is this test's."""
-        from manip_il.evaluation.runner import describe_disturbance
-
-        disturbance = describe_disturbance(self.job(Path()).disturbance)
-        settings = EvalSettings(self.env.horizon, self.env.tolerance, disturbance)
+        settings = EvalSettings.of(self.env, self.suite, self.conditions)
         wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
         for what, value in wanted.items():
             if getattr(result, what) != value:
@@ -76,7 +78,7 @@ class Trial:
 
 def check_policies(trial: Trial, policies: dict[str, Path], folder: Path, engine: str) -> None:
     """Raise, before any episode runs, where one of the policies (name -> folder) cannot be measured by `trial`."""
-    from manip_il.cli.evaluate import check_policy
+    from manip_il.cli.policy_check import check_policy
     from manip_il.learn.checkpoint import read_meta
 
     for name, policy in policies.items():
@@ -96,7 +98,7 @@ def measure(
     file = trial.file(folder, policy)
     if not file.is_file():
         stages.start(f"test {name}", len(trial.seeds))
-        result = evaluate(engine, trial.job(policy), trial.seeds, name, stages.episode)
+        result = evaluate(engine, trial.job(policy), trial.seeds, name, stages.episode, suite=trial.suite)
         stages.close()
         if len(result.episodes) < len(trial.seeds):
             raise ManipError(f"{name} has {len(result.episodes)} of {len(trial.seeds)} test episodes, as workers died")

@@ -42,7 +42,9 @@ class Option:
         """How the user writes it."""
         if self.is_open:
             return f"--{self.name}.NAME"
-        return self.name.upper() if self.positional else f"--{self.name}"
+        if self.positional:
+            return f"{self.name.upper()}..." if typing.get_origin(self.type) is list else self.name.upper()
+        return f"--{self.name}"
 
     @property
     def is_open(self) -> bool:
@@ -136,10 +138,12 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
         if not word.startswith("--"):
             if not places:
                 raise UsageError(f"unexpected {word!r}; options are written --name=value{_did_you_mean(word, known)}")
-            option = places.pop(0)
-            given[option.name] = _Given(word, option.label, True)
+            option = places[0] if typing.get_origin(places[0].type) is list else places.pop(0)
+            _place(word, option, given)
             continue
         name, equals, value = word[2:].partition("=")
+        if name not in known and name.replace("-", "_") in known:  # as other programs write it
+            name = name.replace("-", "_")
         if group := _open_group(name, known):
             if not equals and (not rest or rest[0].startswith("--")):
                 raise UsageError(f"--{name} has no value; expected --{name}=VALUE")
@@ -154,6 +158,15 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
         else:
             given[name] = _Given(value, f"--{name}", True)
     return given, config_paths
+
+
+def _place(word: str, option: Option, given: dict[str, _Given]) -> None:
+    """Give an option without a name its value; a list takes every word that is left."""
+    if typing.get_origin(option.type) is not list:
+        given[option.name] = _Given(word, option.label, True)
+        return
+    before = given[option.name].value if option.name in given else []
+    given[option.name] = _Given([*before, word], option.label, False)
 
 
 def _open_group(name: str, known: Mapping[str, Option]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from manip_il.cli.interrupt import Interrupted, StopRequest
 from manip_il.cli.progress import Progress, progress
@@ -12,7 +12,15 @@ from manip_il.errors import ManipError, UsageError
 
 if TYPE_CHECKING:
     from manip_il.dagger.loop import Watch
-    from manip_il.mdp import Episode
+
+
+class Ended(Protocol):
+    """An episode that has ended, or its result."""
+
+    @property
+    def success(self) -> bool:
+        """At some time."""
+        ...
 
 
 class Stages:
@@ -52,7 +60,7 @@ class Stages:
         self._open.close()
         self._bar = None
 
-    def episode(self, episode: Episode) -> None:
+    def episode(self, episode: Ended) -> None:
         """One more episode has ended."""
         self._done += 1
         self._solved += episode.success

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from manip_il.cli.suites import suite_conditions
 from manip_il.dagger.collect import MAX_TRIES, collect_successes, provenance, record
 from manip_il.dagger.fitting import LEARNING_COLUMNS, fit_table, round_fit
 from manip_il.data import schema
@@ -25,7 +26,6 @@ from manip_il.evaluation.report_data import Film, Kind, Paths, Strip
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.evaluation.runner import evaluate
 from manip_il.seeding import stream_seeds
-from manip_il.sim.disturb import NONE, STANDARD, Disturbance
 
 if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from manip_il.sim.env import EnvConfig
 
 FILM_EVERY = 2  # control steps a film's frame: a software renderer takes a tenth of a second for each
-DISTURBANCES: dict[str, Disturbance] = {"nominal": NONE, "disturbed": STANDARD}
+SUITES = {"nominal": "nominal", "disturbed": "knocked"}  # by the folder of the evaluations
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,11 @@ class Contestant:
     policy: Path | None = None
     labels: int | None = None
 
-    def job(self, env: EnvConfig, disturbance: Disturbance = NONE) -> RolloutJob:
+    def job(self, env: EnvConfig, suite: str = "nominal") -> RolloutJob:
         """Its rollouts."""
         driver: Literal["expert", "policy"] = "expert" if self.policy is None else "policy"
-        return RolloutJob(env, driver, policy=self.policy, labels="last", disturbance=disturbance)
+        conditions = suite_conditions(suite, env.task, sees=False)
+        return RolloutJob(env, driver, policy=self.policy, labels="last", conditions=conditions)
 
 
 def clone_with_labels(
@@ -78,7 +79,7 @@ def clone_with_labels(
 def measure(
     contestants: Sequence[Contestant], env: EnvConfig, seeds: range, folder: Path, engine: Engine, stages: Stages
 ) -> dict[str, EvalResult]:
-    """Key -> evaluation on the same seeds, under the disturbance that `folder` is named after.
+    """Key -> evaluation on the same seeds, in the suite that `folder` stands for.
 
     What an earlier run has written is read instead.
     """
@@ -87,8 +88,8 @@ def measure(
         path = folder / f"{who.key}.json"
         if not path.is_file():
             stages.start(f"{folder.name}: {who.name}", len(seeds))
-            job = who.job(env, DISTURBANCES.get(folder.name, NONE))
-            evaluate(engine, job, seeds, who.name, stages.episode).write(path)
+            suite = SUITES.get(folder.name, "nominal")
+            evaluate(engine, who.job(env, suite), seeds, who.name, stages.episode, suite=suite).write(path)
             stages.close()
         results[who.key] = EvalResult.read(path)
     return results

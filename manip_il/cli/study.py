@@ -89,11 +89,12 @@ class StudyOptions:
         from manip_il.engine.engine import Engine
         from manip_il.seeding import stream_seeds
 
-        trial = Trial(plan.env, stream_seeds("test", plan.file.eval.n_episodes, 0), plan.file.eval.disturbance)
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]
         limit = limit_of(plan.rule, everything)
         policies = {source.name: source.chosen(plan.rule, limit)[0] for source in everything}
+        seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
+        trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values())
         check_policies(trial, policies, self.output_dir, self.engine)
         kept = f"every finished run and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:

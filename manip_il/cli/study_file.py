@@ -32,13 +32,15 @@ ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 class StudyFile:
     """What a study's YAML file may hold.
 
-    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs.
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. suite: as
+    `manip-il eval --suite=`, for the test.
     """
 
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
     training_seeds: int = 3
     eval: TrialGroup = field(default_factory=TrialGroup)
+    suite: str = "nominal"
     checkpoint: Literal["best", "last"] = "best"
     at: str = "end"
     baseline: str | None = option(None, "the arm that others are compared with; by default the first")

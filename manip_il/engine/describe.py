@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
@@ -14,6 +15,7 @@ from manip_il.sim.look import CameraConfig
 from manip_il.sim.observe import environment_state_names
 from manip_il.sim.scene import build_scene
 
+_TOLD_TO_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 _STATE_EXTRAS = 6  # goal, step, streak, ever: what State.to_vector adds to the physics state
 
 
@@ -38,6 +40,15 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
     """Versions, and hashes of the compiled model and of the environment's settings; with cameras, of theirs too."""
     look = {"cameras_sha256": hashlib.sha256(canonical_json(cameras).encode()).hexdigest()} if cameras else {}
     return {**_fingerprint(config), **look}
+
+
+def policy_sha256(policy: Path) -> str:
+    """Of everything in a policy's folder that decides how it acts: the same wherever it lies and whatever its name."""
+    digest = hashlib.sha256()
+    for path in sorted(policy.iterdir()):
+        if path.is_file() and path.name not in _TOLD_TO_PEOPLE:
+            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 @cache

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Literal, Protocol
 
-from manip_il.engine.jobs import LOCKSTEP, RolloutJob, run_job
+from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
@@ -192,7 +192,7 @@ def _store(event: Event) -> None:
 
 def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:
     """One seed a task; where a learner drives, a lockstep batch, smaller where that would leave a worker idle."""
-    size = 1 if job.policy is None else max(1, min(LOCKSTEP, -(-len(seeds) // workers)))
+    size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(Task(job, tuple(seeds[i : i + size]), keep) for i in range(0, len(seeds), size))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal, cast
 
@@ -17,14 +17,17 @@ from manip_il.errors import UsageError
 from manip_il.expert.expert import Expert
 from manip_il.mdp import Actor, Episode, Transition
 from manip_il.rollout import Environment, Intruder, Rules, rollout
-from manip_il.sim.disturb import Disturbance, Disturber
+from manip_il.sim.conditions import Condition, changes_object, draw
+from manip_il.sim.disturb import Disturbance, Disturber, disturbance_of
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig
 from manip_il.sim.perturb import Perturbation, Perturber
 from manip_il.sim.scene import build_scene
+from manip_il.sim.varied import VariedEnv
 
 Labels = Literal["per_state", "takeover", "branch", "last"]
 LOCKSTEP = 25  # environments that share one call of the policy
+OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 26 MB for the Panda
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,10 @@ class RolloutJob:
     first one on it drives to the end, for which it has a horizon of its own. `branch`: in a copy of the simulator it
     drives `branch_steps` ahead. `last`: none of this, but the label of the last state, for its phase.
 
-    perturbation: what happens once, in place of a disturbance.
+    perturbation: what happens once, in place of a disturbance. conditions: what an evaluation's episodes meet, in turn
+    by their seeds, in place of both.
+
+    batch: episodes that share one call of the policy, at most; it changes no outcome.
 
     cameras: what is pictured in every step and kept; None for nothing. A policy that looks at cameras is shown them
     all the same.
@@ -58,6 +64,8 @@ class RolloutJob:
     branch_steps: int = 1
     disturbance: Disturbance = field(default_factory=Disturbance)
     perturbation: Perturbation | None = None
+    conditions: tuple[Condition, ...] = ()
+    batch: int = LOCKSTEP
     round: int = 0
     cameras: CameraConfig | None = None
 
@@ -72,17 +80,20 @@ class RolloutJob:
             raise UsageError("ask=ensemble needs other policies to disagree with")
         if self.perturbation is not None and self.disturbance != Disturbance():
             raise UsageError("a rollout has a disturbance or a perturbation, not both")
+        if self.conditions and (self.perturbation is not None or self.disturbance != Disturbance()):
+            raise UsageError("a rollout has conditions, or a disturbance or perturbation, not both")
+        if self.batch < 1:
+            raise UsageError(f"batch is {self.batch}; expected at least 1")
         if self.branch_steps < 1:
             raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
 
 
 def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     """Yield one episode a seed, in the order in which they end."""
-    side_by_side = LOCKSTEP if job.policy is not None else 1  # alone, an environment has the processor's cache
     if not seeds:
         return
     cameras = drawn_cameras(job)
-    envs = [_environment(job.env, cameras) for _ in range(min(side_by_side, len(seeds)))]
+    envs = [_environment(job.env, cameras, job.conditions) for _ in range(min(side_by_side(job), len(seeds)))]
     expert = _expert(job.env.robot, job.env.task)
     driver = choose_driver(job, envs[0])
     transitions = rollout(envs, seeds, driver, _rules(job), expert, _intrude(job))
@@ -93,6 +104,14 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     )
     for frames in group_rollouts(transitions):
         yield _finish(job, frames, expert, brancher)
+
+
+def side_by_side(job: RolloutJob) -> int:
+    """Environments of a job that run in lockstep in one process."""
+    if job.policy is None:
+        return 1  # alone, an environment has the processor's cache
+    own_models = any(changes_object(condition.ranges) for condition in job.conditions)
+    return min(job.batch, OWN_MODELS) if own_models else job.batch
 
 
 def _rules(job: RolloutJob) -> Rules:
@@ -127,10 +146,11 @@ def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]
     return [*frames[:last], replace(frames[last], done=True), *rest]
 
 
-def _environment(env: EnvConfig, cameras: CameraConfig | None) -> ManipEnv:
+def _environment(env: EnvConfig, cameras: CameraConfig | None, conditions: tuple[Condition, ...] = ()) -> ManipEnv:
+    make = partial(VariedEnv, conditions) if any(condition.ranges for condition in conditions) else ManipEnv
     if cameras is None:
-        return ManipEnv(config=env)
-    return ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+        return make(config=env)
+    return make(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
 
 
 def _without_pictures(transition: Transition) -> Transition:
@@ -143,10 +163,14 @@ def _expert(robot: str, task: str) -> Expert:
 
 
 def _intrude(job: RolloutJob):
-    if job.disturbance == Disturbance() and job.perturbation is None:
+    disturbing = any({"knock", "action_noise"} & condition.ranges.keys() for condition in job.conditions)
+    if job.disturbance == Disturbance() and job.perturbation is None and not disturbing:
         return None
 
-    def make(env: Environment, seed: int) -> Intruder:
+    def make(env: Environment, seed: int) -> Intruder | None:
+        if disturbing:
+            asked = disturbance_of(draw(job.conditions, seed))
+            return None if asked == Disturbance() else Disturber(cast(ManipEnv, env), asked, seed)
         if job.perturbation is not None:
             return Perturber(cast(ManipEnv, env), job.perturbation, seed)
         return Disturber(cast(ManipEnv, env), job.disturbance, seed)

@@ -34,7 +34,7 @@ from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig
+from manip_il.sim.look import PLAIN, Appearance, CameraConfig
 from manip_il.sim.robot import ROBOTS
 from manip_il.sim.task import TASKS
 
@@ -138,12 +138,15 @@ def render_episodes(
         pool.shutdown(cancel_futures=True)
 
 
-def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Pictures:
+def render_states(
+    env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], appearance: Appearance = PLAIN
+) -> Pictures:
     """Pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
 
-    The bytes are those that an environment with these cameras gave when it was in these states.
+    The bytes are those that an environment with these cameras gave when it was in these states and looked so.
     """
     world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+    world.appearance = appearance
     pictures = {
         schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
     }

@@ -34,9 +34,9 @@ def evaluated(monkeypatch) -> list[str]:
     names: list[str] = []
     real = runner.evaluate
 
-    def counted(engine, job, seeds, name, *rest):
+    def counted(engine, job, seeds, name, *rest, **named):
         names.append(name)
-        return real(engine, job, seeds, name, *rest)
+        return real(engine, job, seeds, name, *rest, **named)
 
     monkeypatch.setattr(runner, "evaluate", counted)
     return names
@@ -82,7 +82,7 @@ def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
     out = capsys.readouterr().out
     assert "within 240 labels" in out
     assert f"No difference shown between b and a: {'+0.0 points'}" in out
-    assert "compare a b --eval.disturbance=standard --output_dir=runs/compare_disturbed --checkpoint=last" in out
+    assert "compare a b --suite=disturbed --output_dir=runs/compare_disturbed --checkpoint=last" in out
     assert compare("a", "b", *SIZES, "--overwrite=true") == 0
     pair = result()["training_seeds"][0]
     assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]

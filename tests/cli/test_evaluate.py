@@ -23,7 +23,7 @@ DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
 
 
 def evaluate(policy: Path, folder: Path, *words: str) -> int:
-    sizes = ["--eval.n_episodes=2", "--env.horizon=8", "--workers=1"]
+    sizes = ["--eval.n_episodes=2", "--env.horizon=8", "--workers=1", "--eval.films=0"]
     return main(["eval", f"--policy.path={policy}", *sizes, f"--output_dir={folder}", *words])
 
 

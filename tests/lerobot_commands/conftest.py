@@ -17,7 +17,7 @@ from manip_il.cli.main import main
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.evaluation.results import EpisodeResult
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.runner import episode_result
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
@@ -93,7 +93,12 @@ class Trial:
         """By this project's own evaluation."""
         with Engine(workers=1) as engine:
             job = RolloutJob(self.env, "policy", policy, cameras=self.cameras)
-            return evaluate(engine, job, self.seeds, "it", on_episode).episodes
+            found: dict[int, EpisodeResult] = {}
+            for episode in engine.run(job, self.seeds):
+                found[episode.seed] = episode_result(job, episode)
+                if on_episode is not None:
+                    on_episode(episode)
+            return tuple(found[seed] for seed in self.seeds)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,143 @@
+"""Evaluation of a state-based policy: control steps a second against raw physics, and episodes against lerobot-eval.
+
+python benchmarks/eval_speed.py [--quick]
+
+The first limit is `mj_step` replaying the same controls from the same starts and nothing else, on one core, by turns in
+the same run; the median ratio over the repeats counts. The peer is the whole command `lerobot-eval`, with films off, on
+the same checkpoint and seeds, in the faster of its two ways (environments in its own process, or in processes of their
+own), against the whole command `manip-il eval`; both may use every core. Outcomes must be the same, seed by seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from _machine import describe_machine
+
+from manip_il.engine.describe import env_spec
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.evaluation.results import EvalResult
+from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.train import TrainConfig, fit
+from manip_il.mdp import Episode
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.robot import ROBOTS
+
+BIN = Path(sys.executable).parent
+TASK = "pick_place"
+BATCHES = (5, 10, 25)  # of lerobot-eval, whose right one is for its user to find
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    quick = parser.parse_args().quick
+    print(describe_machine())
+    with tempfile.TemporaryDirectory() as folder:
+        policies = {robot: fitted(robot, Path(folder) / robot, 50 if quick else 2_000) for robot in ROBOTS}
+        print("robot  control steps/s  raw physics, control steps/s  share of raw (median, all repeats)")
+        for robot, policy in policies.items():
+            measured = np.array([against_physics(robot, policy, 5 if quick else 50) for _ in range(2 if quick else 7)])
+            ours, raw = np.median(measured, axis=0)
+            shares = measured[:, 0] / measured[:, 1]
+            spread = f"{shares.min():.2f} to {shares.max():.2f}"
+            print(f"{robot:5s}  {ours:15,.0f}  {raw:28,.0f}  {np.median(shares):.2f} ({spread})")
+        print("whole commands, panda          seconds  episodes/s")
+        against_lerobot(policies["panda"], Path(folder), 10 if quick else 200)
+    return 0
+
+
+def fitted(robot: str, folder: Path, steps: int) -> Path:
+    """A policy cloned from a few demonstrations: it moves and grasps, so physics is that of a real evaluation."""
+    config = EnvConfig(robot, TASK)
+    demos = list(run_job(RolloutJob(config, "expert", hold=5), stream_seeds("demonstrations", 30)))
+    table = {key: np.concatenate([episode.columns[key] for episode in demos]) for key in demos[0].columns}
+    table["episode_index"] = np.repeat(np.arange(len(demos)), [len(episode) for episode in demos])
+    return fit(table, TrainConfig(steps=steps, policy=MLPConfig()), folder, spec=env_spec(config))
+
+
+def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
+    """Control steps a second on one core, ours and raw, over the same episodes."""
+    job = RolloutJob(EnvConfig(robot, TASK), "policy", policy=policy, labels="last")
+    started = time.perf_counter()
+    found = list(run_job(job, stream_seeds("test", episodes)))
+    ours = time.perf_counter() - started
+    steps = sum(map(len, found))
+    return steps / ours, steps / sum(replay_seconds(job.env, episode) for episode in found)
+
+
+def replay_seconds(config: EnvConfig, episode: Episode) -> float:
+    env = ManipEnv(config=config)
+    env.start(episode.seed)
+    scene, data = env.scene, env.data
+    low, high = np.vstack([scene.arm_range, [0, scene.robot.max_opening]]).T
+    controls = np.zeros((len(episode), scene.model.nu))
+    actions = np.clip(episode.columns["executed_action"].astype(np.float64), low, high)
+    controls[:, scene.arm_ctrl], controls[:, scene.finger_ctrl] = actions[:, :-1], actions[:, -1:] / 2
+    started = time.perf_counter()
+    for control in controls:
+        data.ctrl[:] = control
+        mujoco.mj_step(scene.model, data, config.physics_steps)
+    return time.perf_counter() - started
+
+
+def against_lerobot(policy: Path, folder: Path, episodes: int) -> None:
+    ours, result = seconds(ours_words(policy, folder / "ours", episodes)), EvalResult.read(folder / "ours")
+    print(f"manip-il eval                  {ours:7.1f}  {episodes / ours:10.1f}")
+    best = float("inf")
+    for batch in BATCHES:
+        for asynchronous in (False, True):
+            out = folder / f"theirs_{batch}_{asynchronous}"
+            taken = seconds(lerobot_words(policy, out, episodes, batch, asynchronous))
+            best = min(best, taken)
+            name = f"lerobot-eval, {batch:2d} {'processes' if asynchronous else 'in one'}"
+            print(f"{name:29s}  {taken:7.1f}  {episodes / taken:10.1f}")
+            metrics = json.loads((out / "eval_info.json").read_text())["per_task"][0]["metrics"]
+            same = sum(a == b.success for a, b in zip(metrics["successes"], result.episodes, strict=False))
+            if same < min(len(metrics["successes"]), episodes):
+                print(f"  {same} of {episodes} outcomes are the same")
+    print(f"ours is {best / ours:.1f} x as fast as lerobot-eval at its best; {result.success} success")
+
+
+def ours_words(policy: Path, out: Path, episodes: int) -> list[str]:
+    return ["manip-il", "eval", f"--policy.path={policy}", f"--eval.n_episodes={episodes}", "--eval.films=0"] + [
+        f"--output_dir={out}"
+    ]
+
+
+def lerobot_words(policy: Path, out: Path, episodes: int, batch: int, asynchronous: bool) -> list[str]:
+    seed = stream_seeds("test", 1)[0]
+    env = [
+        "discover_packages_path=manip_il.lerobot_plugin",
+        "type=manip_il",
+        "task=PandaPickPlace-v0",
+        "render_mode=none",
+    ]
+    evaluation = [f"n_episodes={episodes}", f"batch_size={batch}", f"use_async_envs={str(asynchronous).lower()}"]
+    words = ["lerobot-eval", f"--policy.path={policy}", f"--seed={seed}", f"--output_dir={out}"]
+    return words + [f"--env.{word}" for word in env] + [f"--eval.{word}" for word in evaluation]
+
+
+def seconds(words: list[str]) -> float:
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": ""}
+    started = time.perf_counter()
+    done = subprocess.run(
+        [str(BIN / words[0]), *words[1:]], capture_output=True, text=True, env=environment, check=False
+    )
+    if done.returncode:
+        raise SystemExit(f"{' '.join(words)} failed:\n{(done.stdout + done.stderr)[-3000:]}")
+    return time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""`manip-il health`: whether this machine or container can evaluate, in one line."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli.groups import DEFAULT_ROBOT, DEFAULT_TASK
+from manip_il.cli.progress import say
+from manip_il.errors import ManipError, RenderError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from manip_il.sim.render import Picture
+
+_CAMERAS = ("front", "wrist")
+_FRAMES = 20  # timed after the first one, which also loads the scene
+_BACKENDS = ("egl", "osmesa", "glfw")  # the last one needs a display
+_FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
+
+
+@dataclass
+class HealthOptions:
+    """Draw one frame of the default scene, and check what else an evaluation needs.
+
+    Prints what there is to work with; where something is missing, says what and ends with exit code 1.
+    """
+
+    example: ClassVar[str] = "manip-il health"
+
+    def run(self) -> None:
+        """Check everything, the most frequent trouble first."""
+        check_backend(os.environ.get("MUJOCO_GL"))
+        check_temporary_folder()
+        check_shared_memory()
+        drawing = _draw()
+        from manip_il.engine.engine import default_workers
+        from manip_il.engine.memory import available_memory
+
+        # How little is free is no fault: a health check runs beside the evaluation that has taken the rest.
+        free = available_memory()
+        memory = "memory unknown" if free is None else f"{free / 1e9:.1f} GB of memory free"
+        say(f"healthy: {drawing}; {describe_torch()}; {memory}; cores {default_workers()}")
+
+
+def check_backend(backend: str | None) -> None:
+    """Raise `RenderError` for a MUJOCO_GL that mujoco cannot draw pictures off screen with."""
+    if backend is None:
+        raise RenderError("MUJOCO_GL is not set, and neither EGL nor OSMesa is installed; " + _install())
+    if backend.lower() not in _BACKENDS:
+        raise RenderError(f"MUJOCO_GL is {backend!r}; expected egl or osmesa, or unset it")
+
+
+def check_temporary_folder() -> None:
+    """Raise `ManipError` where no temporary file can be made."""
+    try:
+        with tempfile.TemporaryFile() as file:
+            file.write(b"x")
+    except OSError as error:
+        raise ManipError(
+            f"no temporary file can be made ({error.strerror}); make /tmp writable (docker run --tmpfs /tmp), "
+            "or set TMPDIR"
+        ) from error
+    home = Path(tempfile.gettempdir())
+    if home == Path.cwd():  # Python's last resort, where none of the usual places is writable
+        raise ManipError(f"temporary files would go into {home}; make /tmp writable (docker run --tmpfs /tmp)")
+
+
+def check_shared_memory() -> None:
+    """Raise `ManipError` where processes cannot share a lock, which lies in /dev/shm."""
+    try:
+        multiprocessing.get_context("spawn").Lock()
+    except (OSError, ImportError) as error:
+        raise ManipError(f"processes cannot share a lock ({error}); make /dev/shm writable") from error
+
+
+def check_pictures(pictures: Mapping[str, Picture]) -> None:
+    """Raise `RenderError` for a picture that shows nothing: a driver may draw without an error, and draw nothing."""
+    for camera, picture in pictures.items():
+        colours = len({tuple(pixel) for pixel in picture.reshape(-1, 3).tolist()})
+        if colours < _FEWEST_COLOURS:
+            raise RenderError(
+                f"camera {camera} sees {colours} colour{'s' if colours > 1 else ''}, expected a scene: OpenGL works "
+                f"but draws nothing ({_renderer()}); try MUJOCO_GL=osmesa, or another driver"
+            )
+
+
+def _draw() -> str:
+    """Draw and time the default scene; what draws, and how fast."""
+    from manip_il.sim.env import ManipEnv
+    from manip_il.sim.look import CameraConfig
+    from manip_il.sim.render import pictures
+
+    world, cameras = ManipEnv(), CameraConfig(_CAMERAS)
+    world.start(0)
+
+    def draw() -> Mapping[str, Picture]:
+        return pictures(DEFAULT_ROBOT, DEFAULT_TASK, world.data, cameras)
+
+    check_pictures(draw())
+    begin = time.perf_counter()
+    for _ in range(_FRAMES):
+        draw()
+    each = (time.perf_counter() - begin) / (_FRAMES * len(_CAMERAS))
+    return f"{_renderer()}, {1e3 * each:.1f} ms a picture of {cameras.height} x {cameras.width}"
+
+
+def _renderer() -> str:
+    """Vendor and renderer of the current OpenGL context."""
+    from OpenGL import GL
+
+    words = (GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER))
+    return " ".join(word.decode(errors="replace") if word else "unknown" for word in words)
+
+
+def describe_torch() -> str:
+    """Torch's version, and how many graphics cards CUDA's driver sees; `ManipError` where torch is missing.
+
+    Torch itself is not imported: it would double the memory of a health check.
+    """
+    try:
+        version = metadata.version("torch")
+    except metadata.PackageNotFoundError as error:
+        raise ManipError("torch is not installed; `make setup`, or build the image again") from error
+    return f"torch {version}, graphics cards for CUDA {_cuda_devices()}"
+
+
+def _cuda_devices() -> int:
+    """How many graphics cards CUDA's driver sees; 0 without a driver."""
+    count = ctypes.c_int(0)
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return 0
+    return count.value if driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 else 0
+
+
+def _install() -> str:
+    from manip_il.sim.gl import PACKAGES
+
+    return f"on Debian: apt-get install -y {PACKAGES}"

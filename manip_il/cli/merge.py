@@ -1,0 +1,66 @@
+"""`manip-il merge`: the parts of one evaluation, run on several machines, as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli.folders import prepare_output
+from manip_il.cli.groups import command_line, option, save_options, warn
+from manip_il.cli.options import to_plain
+from manip_il.cli.progress import say
+from manip_il.errors import FolderExistsError, UsageError
+
+if TYPE_CHECKING:
+    from manip_il.evaluation.results import EvalResult
+
+REPORT_FILE = "report.html"
+
+
+@dataclass
+class MergeOptions:
+    """Merge evaluations of one policy on different seeds, as a cluster of containers makes them, into one eval.json.
+
+    Refused where policy, robot, task or settings differ, or a seed was run twice.
+    """
+
+    example: ClassVar[str] = "manip-il merge out/0 out/1 out/2 --output_dir=out/all"
+    files: list[Path] = field(metadata={"help": "two or more eval.json, or their folders", "positional": True})
+    output_dir: Path = field(default=Path("runs/merged"), metadata={"help": "folder of the merged eval.json"})
+    overwrite: bool = option(False, "replace a merged evaluation that is there")
+
+    def run(self) -> None:
+        """Read all, merge, write, print the table."""
+        from manip_il.data.fingerprint import compare_fingerprints
+        from manip_il.evaluation.eval_report import EvalReport, eval_page
+        from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
+        from manip_il.evaluation.merged import merge_results
+        from manip_il.evaluation.report import write_page
+        from manip_il.evaluation.results import FILE_NAME, EvalResult
+        from manip_il.evaluation.tables import print_table
+
+        if len(self.files) < 2:
+            raise UsageError(f"{self.files[0]} alone; expected two or more evaluations to merge")
+        parts: dict[str, EvalResult] = {}
+        for path in self.files:
+            if str(path) in parts:
+                raise UsageError(f"{path} is given twice; expected every evaluation once")
+            parts[str(path)] = EvalResult.read(path)
+        merged = merge_results(parts)
+        (first, one), *others = parts.items()
+        for name, other in others:
+            warn(compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
+        try:
+            prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
+        except FolderExistsError:
+            raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
+        save_options(self.output_dir, self)
+        merged.write(self.output_dir / FILE_NAME)
+        report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))
+        write_page(self.output_dir / REPORT_FILE, eval_page(report))
+        print_table(evaluation_table(merged))
+        for line in evaluation_lines(merged):
+            say(line)
+        say(f"result: {self.output_dir / FILE_NAME}")
+        say(f"report: {self.output_dir / REPORT_FILE}")

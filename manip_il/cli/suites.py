@@ -1,0 +1,73 @@
+"""`--suite=`: which conditions an evaluation deals its episodes among."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import manip_il
+from manip_il.errors import ManipError, UnknownName, UsageError
+
+if TYPE_CHECKING:
+    from manip_il.sim.conditions import Condition
+
+SUITES = {
+    "nominal": ("nominal",),
+    "disturbed": ("knocked", "sensing"),
+    "randomised": ("object", "view"),
+    "all": ("nominal", "knocked", "sensing", "object", "view"),
+}
+CONDITIONS = SUITES["all"]
+SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
+
+
+def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, ...]:
+    """The conditions of a suite, in the order in which seeds take turns.
+
+    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera.
+    Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where nothing is left.
+    """
+    from manip_il.sim.task import get_task
+
+    has_object = get_task(task).has_object
+    asked = [_read(name) for name in SUITES.get(suite, (suite,))]
+    left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
+    if not left:
+        blind = "" if sees else " and a policy that looks at no camera"
+        raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
+    return tuple(left)
+
+
+def _read(name: str) -> Condition:
+    if name in CONDITIONS:
+        return read_condition(_folder() / f"{name}.yaml")
+    if name.endswith((".yaml", ".yml")):
+        return read_condition(Path(name))
+    raise UnknownName("suite", name, [*SUITES, *CONDITIONS[1:]])
+
+
+def read_condition(path: Path) -> Condition:
+    """A YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
+    import yaml
+
+    from manip_il.sim.conditions import Condition
+
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}; expected a YAML of ranges") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
+    return Condition.from_mapping(path.stem, tree or {})
+
+
+def _folder() -> Path:
+    """Of the suites' files: in a checkout beside the package, else where an installation puts data."""
+    places = (Path(manip_il.__file__).parents[1] / "configs", Path(sys.prefix) / "share" / "manip_il")
+    for place in places:
+        if (place / "suites" / "nominal.yaml").is_file():
+            return place / "suites"
+    raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")

@@ -1,0 +1,337 @@
+"""Suites, stopping by width, parts and their merge, resuming, and replaying one line of eval.json."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.kept_episodes import FILE_NAME as KEPT
+from manip_il.cli.main import main
+from manip_il.cli.suites import CONDITIONS, SUITES, suite_conditions
+from manip_il.data import schema
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.errors import UsageError
+from manip_il.evaluation.results import EvalResult
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.sim.conditions import NOMINAL, draw
+from manip_il.sim.disturb import STANDARD
+from manip_il.sim.env import EnvConfig
+
+from ..learn.tiny_policies import write_checkpoint
+from .made_runs import mark
+
+ENV = EnvConfig("fetch", "pick_place", horizon=10)
+SMALL = ["--robot.type=fetch", "--env.horizon=10", "--workers=1", "--eval.films=0"]
+REACH = ["--policy.type=expert", "--task.type=reach", *SMALL]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def act(tmp_path_factory) -> Path:
+    spec = env_spec(ENV)
+    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
+    return write_checkpoint(tmp_path_factory.mktemp("act"), "act", spec, meta=meta)
+
+
+def evaluate(folder: str, *words: str) -> int:
+    return main(["eval", *words, f"--output_dir={folder}"])
+
+
+def error(capsys) -> str:
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
+    for suite in SUITES:
+        assert suite_conditions(suite, "pick_place", sees=True)
+    assert {name for names in SUITES.values() for name in names} == set(CONDITIONS)
+    assert suite_conditions("nominal", "reach", sees=False) == (NOMINAL,)
+    names = [one.name for one in suite_conditions("all", "pick_place", sees=True)]
+    assert names == ["nominal", "knocked", "sensing", "object", "view"]
+    assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == names[:-1]
+    assert [one.name for one in suite_conditions("all", "reach", sees=False)] == names[:-2]
+
+
+def test_knocked_is_the_disturbance_that_dagger_collects_under():
+    [knocked] = suite_conditions("knocked", "pick_place", sees=False)
+    assert knocked.knock == STANDARD.knock
+    assert knocked.action_noise == (STANDARD.action_noise, STANDARD.action_noise)
+    first, beyond = STANDARD.knock_steps
+    assert knocked.knock_step == (first, beyond - 1)
+
+
+def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
+    from manip_il.cli import suites
+
+    expected = suite_conditions("all", "pick_place", sees=True)
+    folder = tmp_path / "share" / "manip_il" / "suites"
+    folder.mkdir(parents=True)
+    for name in CONDITIONS:
+        (folder / f"{name}.yaml").write_bytes((Path("configs/suites") / f"{name}.yaml").read_bytes())
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(suites.manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
+    assert suite_conditions("all", "pick_place", sees=True) == expected
+
+
+def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
+    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=8", *SMALL) == 0
+    data = json.loads(Path("e/eval.json").read_text())
+    assert {name: one["n_episodes"] for name, one in data["by_condition"].items()} == {
+        "nominal": 2,
+        "knocked": 2,
+        "sensing": 2,
+        "object": 2,
+    }
+    conditions = suite_conditions("all", "pick_place", sees=False)
+    for episode in data["episodes"]:
+        assert episode["drawn"] == dict(draw(conditions, episode["seed"]).drawn)
+    assert data["settings"]["suite"] == "all"
+    out = capsys.readouterr().out
+    for name in data["by_condition"]:
+        assert f"|  {name} " in out
+    assert Path("e/report.html").read_text().count("<video") == 0
+
+
+def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys):
+    Path("heavy.yaml").write_text("mass: [0.4, 0.5]\n")
+    words = [f"--policy.path={act}", "--eval.n_episodes=2", *SMALL]
+    assert evaluate("e", *words, "--suite=heavy.yaml") == 0
+    for episode in EvalResult.read(Path("e")).episodes:
+        assert episode.detail["condition"] == "heavy"
+        assert 0.4 <= episode.detail["drawn"]["mass"] <= 0.5
+    capsys.readouterr()
+    for text, what in (
+        ("mass: [0.5, 0.4]", "heavy: mass is [0.5, 0.4]; expected low <= high"),
+        ("mas: 1", "did you mean 'mass'?"),
+        ("- 1", "holds list; expected a mapping of names to ranges"),
+        ("mass: [", "is not YAML"),
+        ("brightness: [0.5, 2]", "changes nothing for pick_place and a policy that looks at no camera"),
+    ):
+        Path("heavy.yaml").write_text(text)
+        assert evaluate("f", *words, "--suite=heavy.yaml") == 2
+        assert what in error(capsys)
+    assert evaluate("f", *words, "--suite=none.yaml") == 2
+    assert "cannot read none.yaml" in error(capsys)
+    assert evaluate("f", *words, "--suite=nominall") == 2
+    assert "did you mean 'nominal'?" in error(capsys)
+    assert not Path("f").exists()
+
+
+def test_until_width_takes_a_hyphen_too_and_stops_early(here, capsys):
+    words = ["--policy.type=random", "--task.type=reach", *SMALL, "--env.horizon=5", "--eval.n_episodes=300"]
+    assert evaluate("e", *words, "--until-width=0.1") == 0
+    assert "stopped after 100 episodes" in capsys.readouterr().out
+    result = EvalResult.read(Path("e"))
+    assert (len(result.episodes), result.until_width) == (100, 0.1)
+    low, high = result.success.interval
+    assert high - low <= 0.1
+    assert evaluate("f", *words, "--until_width=2") == 2
+    assert "--until_width is 2.0; expected between 0 and 1" in error(capsys)
+
+
+def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys):
+    assert evaluate("whole", *REACH, "--eval.n_episodes=5") == 0
+    assert evaluate("a", *REACH, "--eval.n_episodes=3") == 0
+    assert evaluate("b", *REACH, "--eval.n_episodes=2", "--eval.first=3") == 0
+    assert main(["merge", "b/eval.json", "a", "--output_dir=ab"]) == 0
+    assert EvalResult.read(Path("ab")) == EvalResult.read(Path("whole"))
+    assert Path("ab/report.html").is_file()
+    capsys.readouterr()
+    assert main(["merge", "a", "whole", "--output_dir=c"]) == 1
+    assert "seed 4000000 is in a and in whole" in error(capsys)
+    assert main(["merge", "a", "b", "--output_dir=ab"]) == 2
+    assert "--overwrite=true" in error(capsys)
+    assert main(["merge", "a"]) == 2
+    assert "two or more" in error(capsys)
+    assert main(["merge", "a", "a"]) == 2
+    assert "given twice" in error(capsys)
+    assert main(["merge"]) == 2
+    assert "FILES" in error(capsys)
+    assert not Path("c").exists()
+
+
+def test_a_resumed_evaluation_is_the_whole_one(here, capsys):
+    assert evaluate("whole", *REACH, "--eval.n_episodes=4") == 0
+    assert evaluate("e", *REACH, "--eval.n_episodes=4") == 0
+    kept = Path("e") / KEPT
+    lines = kept.read_bytes().splitlines(keepends=True)
+    kept.write_bytes(b"".join(lines[:3]) + lines[3][:20])  # two whole episodes and a torn one
+    Path("e/eval.json").unlink()
+    assert evaluate("e", *REACH, "--eval.n_episodes=4", "--resume=true") == 0
+    assert Path("e/eval.json").read_bytes() == Path("whole/eval.json").read_bytes()
+    assert evaluate("e", *REACH, "--eval.n_episodes=6", "--resume=true") == 0  # and more of them
+    assert [one.seed for one in EvalResult.read(Path("e")).episodes] == list(range(4_000_000, 4_000_006))
+    capsys.readouterr()
+    assert evaluate("e", *REACH, "--eval.n_episodes=6", "--suite=sensing", "--resume=true") == 1
+    assert "--suite differs" in error(capsys)
+    assert evaluate("e", *REACH, "--eval.n_episodes=4") == 2
+    assert "--resume=true" in error(capsys)
+
+
+def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys):
+    act = write_checkpoint(here / "act", "act", env_spec(ENV))
+    words = [f"--policy.path={act}", *SMALL, "--eval.n_episodes=1"]
+    assert evaluate("e", *words) == 0
+    (act / "model.safetensors").write_bytes((act / "model.safetensors").read_bytes()[:-4] + b"\0\0\1\0")
+    capsys.readouterr()
+    assert evaluate("e", *words, "--resume=true") == 1
+    assert "policy_sha256 (e was begun with another; --overwrite=true starts anew) differs" in error(capsys)
+
+
+@pytest.mark.slow
+def test_a_killed_evaluation_keeps_what_was_done_and_goes_on(here):
+    words = ["eval", "--policy.type=expert", "--robot.type=fetch", "--eval.n_episodes=30", "--workers=2"]
+    words += ["--eval.films=0", "--suite=knocked"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "manip_il.cli.main", *words, "--output_dir=cut"], start_new_session=True
+    )
+    kept = here / "cut" / KEPT
+    for _ in range(1_200):
+        if kept.is_file() and kept.read_bytes().count(b"\n") > 5:
+            break
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    before = kept.read_bytes().count(b"\n")
+    assert 5 < before < 31
+    assert not (here / "cut" / "eval.json").exists()
+    assert main([*words, "--output_dir=cut", "--resume=true"]) == 0
+    assert kept.read_bytes().count(b"\n") == 31
+    assert main([*words, "--output_dir=whole"]) == 0
+    assert (here / "cut" / "eval.json").read_bytes() == (here / "whole" / "eval.json").read_bytes()
+
+
+def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(here, capsys, monkeypatch):
+    monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
+    Path("file").touch()
+    for folder in ("/proc/nothing/here", "file/below"):
+        assert evaluate(folder, *REACH, "--eval.n_episodes=1") == 1
+        assert f"{folder} cannot be written to" in error(capsys)
+
+
+def test_too_little_memory_is_said_before_the_first_episode(here, capsys, monkeypatch):
+    monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
+    monkeypatch.setattr("manip_il.engine.memory.needed_memory", lambda *_, **__: 10**15)
+    assert evaluate("e", *REACH, "--eval.n_episodes=1") == 1
+    assert "memory" in error(capsys)
+    assert not Path("e").exists()
+
+
+def test_a_mounted_folder_is_emptied_where_another_would_be_replaced(here, capsys, monkeypatch):
+    assert evaluate("e", *REACH, "--eval.n_episodes=2") == 0
+    Path("e/more").mkdir()
+    Path("e/more/file").touch()
+    monkeypatch.setattr(Path, "is_mount", lambda self: self.name == "e")
+    inode = Path("e").stat().st_ino
+    assert evaluate("e", *REACH, "--eval.n_episodes=1", "--overwrite=true") == 0
+    assert Path("e").stat().st_ino == inode
+    assert not Path("e/more").exists()
+    assert len(EvalResult.read(Path("e")).episodes) == 1
+
+
+@pytest.mark.parametrize("suite", ["all", "nominal"])
+def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys):
+    assert evaluate("e", f"--policy.path={act}", f"--suite={suite}", "--eval.n_episodes=4", *SMALL) == 0
+    result = EvalResult.read(Path("e"))
+    for index, episode in enumerate(result.episodes):
+        capsys.readouterr()
+        assert main(["replay", "e/eval.json", "--episode", str(index)]) == 0
+        out, err = capsys.readouterr()
+        assert f"seed {episode.seed}, {episode.detail['condition']}: failure" in out
+        assert "the same as in e/eval.json" in out
+        assert "warning" not in err
+
+
+def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys):
+    assert evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
+    path = Path("e/eval.json")
+    data = json.loads(path.read_text())
+    data["episodes"][0] |= {"success": True, "return": 3.0}
+    data["episodes"][1]["drawn"]["delay"] = 77
+    path.write_text(json.dumps(data))
+    capsys.readouterr()
+    assert main(["replay", "e", "--episode=0"]) == 1
+    line = error(capsys)
+    assert "success was True, is False" in line
+    assert "return was 3.0, is 0.0" in line
+    assert main(["replay", "e", "--episode=1"]) == 1
+    assert "what is drawn for the episode differs" in error(capsys)
+    for index in (-1, 2):
+        assert main(["replay", "e", f"--episode={index}"]) == 2
+        assert "has episodes 0 to 1" in error(capsys)
+
+
+def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys):
+    act = write_checkpoint(here / "act", "act", env_spec(ENV))
+    assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
+    act.rename(here / "moved")
+    capsys.readouterr()
+    assert main(["replay", "e", "--episode=0"]) == 2
+    assert "e is about act, which is not here" in error(capsys)
+    assert main(["replay", "e", "--episode=0", "--policy.path=moved"]) == 0
+    assert "files differ" not in capsys.readouterr().err
+    other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)
+    assert main(["replay", "e", "--episode=0", f"--policy.path={other}"]) in (0, 1)
+    assert "is not the policy of e: its files differ" in capsys.readouterr().err
+
+
+@pytest.mark.gl
+def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
+    expert = ["--policy.type=expert", "--task.type=reach", "--robot.type=fetch", "--workers=1", "--eval.n_episodes=2"]
+    assert evaluate("good", *expert, "--env.horizon=30", "--eval.films=1") == 0
+    assert [path.name for path in Path("good/films").iterdir()] == ["seed_4000000_success.mp4"]
+    words = [f"--policy.path={act}", "--suite=object", "--eval.n_episodes=3", *SMALL]
+    assert evaluate("bad", *words, "--eval.films=2") == 0
+    names = sorted(path.name for path in Path("bad/films").iterdir())
+    assert names == ["seed_4000000_failure.mp4", "seed_4000001_failure.mp4"]
+    assert Path("bad/report.html").read_text().count("<video") == 2
+    assert main(["replay", "bad", "--episode=1", "--video", "deep/one.mp4"]) == 0
+    assert Path("deep/one.mp4").read_bytes() == (Path("bad/films") / names[1]).read_bytes()
+
+
+def test_without_opengl_the_report_shows_paths(act, here, capsys, monkeypatch):
+    from manip_il.errors import RenderError
+
+    def no_pictures(*_):
+        raise RenderError("no OpenGL here")
+
+    monkeypatch.setattr("manip_il.sim.env.pictures", no_pictures)
+    assert evaluate("e", f"--policy.path={act}", "--eval.n_episodes=1", *SMALL, "--eval.films=1") == 0
+    assert "no OpenGL here" in capsys.readouterr().err
+    page = Path("e/report.html").read_text()
+    assert "no OpenGL here" in page
+    assert 'class="paths"' in page
+    assert not Path("e/films").exists()
+    assert schema.SIM_STATE not in page
+
+
+def test_a_run_is_measured_with_its_learning_curve(here):
+    from .made_runs import make_policy, make_run
+
+    run = make_run(here / "run", make_policy(here / "policy"))
+    mark(run / "best" / "pretrained_model", "best")
+    words = ["--eval.n_episodes=1", "--workers=1", "--eval.films=0", "--env.horizon=8"]
+    assert evaluate("e", "--policy.path=run", *words) == 0
+    assert "round 2" in Path("e/report.html").read_text()
+
+
+def test_wrong_numbers_are_refused(here, capsys):
+    for word in ("--eval.n_episodes=0", "--eval.films=-1", "--eval.first=-1", "--eval.batch_size=0"):
+        assert evaluate("e", *REACH, word) == 2
+        assert word.partition("=")[0] in error(capsys)
+    with pytest.raises(UsageError, match="changes nothing for reach"):
+        suite_conditions("object", "reach", sees=True)

@@ -1,0 +1,112 @@
+"""`manip-il health` says in one line what there is, or what is missing."""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+import subprocess
+import sys
+import tempfile
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from manip_il.cli import health
+from manip_il.cli.main import main
+from manip_il.errors import ManipError, RenderError
+
+
+def error(capsys) -> str:
+    """The one line that went wrong."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    [line] = captured.err.splitlines()
+    return line
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No pictures: what is looked at comes before or after them."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr(health, "_draw", lambda: "a picture")
+
+
+@pytest.mark.gl
+def test_a_healthy_machine_says_what_it_has(capsys):
+    assert main(["health"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    [line] = out.splitlines()
+    assert re.match(r"healthy: \S.*, \d+\.\d ms a picture of 128 x 128; torch 2\.\d+", line)
+    assert re.search(r"graphics cards for CUDA \d+; .*memory.*; cores [1-9]", line)
+
+
+def test_torch_is_not_imported_to_say_its_version():
+    code = "import sys; from manip_il.cli.health import describe_torch; print(describe_torch()); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    described, modules = done.stdout.splitlines()
+    assert re.match(r"torch 2\.\d+\.\d+", described)
+    assert "torch" not in modules.split()
+
+
+@pytest.mark.parametrize("backend", ["nonsense", "", "disable"])
+def test_a_wrong_backend_is_named_with_the_right_ones(backend, monkeypatch, capsys):
+    monkeypatch.setenv("MUJOCO_GL", backend)
+    assert main(["health"]) == 1
+    assert f"MUJOCO_GL is {backend!r}; expected egl or osmesa" in error(capsys)
+
+
+def test_without_any_backend_the_packages_are_named():
+    with pytest.raises(RenderError, match=r"neither EGL nor OSMesa is installed.*libegl1"):
+        health.check_backend(None)
+
+
+def test_opengl_that_fails_is_one_line(monkeypatch, capsys):
+    def fail(*_):
+        raise RenderError("no off-screen OpenGL here")
+
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr("manip_il.sim.render.pictures", fail)
+    assert main(["health"]) == 1
+    assert "no off-screen OpenGL here" in error(capsys)
+
+
+def test_pictures_of_one_colour_are_no_pictures(monkeypatch):
+    monkeypatch.setattr(health, "_renderer", lambda: "some driver")
+    scene = np.random.default_rng(0).integers(0, 255, (8, 8, 3), dtype=np.uint8)
+    health.check_pictures({"front": scene})
+    with pytest.raises(RenderError, match=r"camera wrist sees 1 colour, .*some driver"):
+        health.check_pictures({"front": scene, "wrist": np.zeros((8, 8, 3), dtype=np.uint8)})
+
+
+def test_nowhere_to_write_is_said(undrawn, monkeypatch, capsys):
+    def fail(*_):
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
+    assert main(["health"]) == 1
+    assert "no temporary file can be made (No usable temporary directory found); make /tmp writable" in error(capsys)
+
+
+def test_temporary_files_that_end_up_in_the_current_folder_are_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(ManipError, match="temporary files would go into"):
+        health.check_temporary_folder()
+
+
+def test_processes_that_cannot_share_a_lock_are_said(undrawn, monkeypatch, capsys):
+    def fail():
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: SimpleNamespace(Lock=fail))
+    assert main(["health"]) == 1
+    assert "/dev/shm writable" in error(capsys)
+
+
+def test_little_free_memory_is_told_but_no_fault(undrawn, monkeypatch, capsys):
+    """Beside a large evaluation little is free, and the container is well."""
+    monkeypatch.setattr("manip_il.engine.memory.available_memory", lambda: 10**8)
+    assert main(["health"]) == 0
+    assert "0.1 GB of memory free" in capsys.readouterr().out
