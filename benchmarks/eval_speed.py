@@ -35,7 +35,7 @@ from manip_il.sim.robot import ROBOTS
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"
-BATCHES = (5, 10, 25)  # of lerobot-eval, whose right one is for its user to find
+BATCHES = (10, 50)  # of lerobot-eval, whose right one is for its user to find
 
 
 def main() -> int:

@@ -123,6 +123,7 @@ class DaggerOptions:
 
         kept = f"every finished episode and round, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+            engine.warm_up(learned=True)
             results = run_rounds(config, self.output_dir, engine, stages)
         write_report(self.output_dir / REPORT_FILE, _report(self, config, results))
         best = self.output_dir / "best" / "pretrained_model"

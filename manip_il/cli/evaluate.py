@@ -60,6 +60,7 @@ class EvalGroup:
         None, f"episodes, each on a seed of its own; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
     )
     first: int = option(0, "which seed of the stream is the first one: for one part of a larger evaluation")
+    hold: int | None = option(10, "control steps after success at which an episode ends; null: at the horizon")
     batch_size: int = option(25, "episodes in lockstep that share a call of the policy; changes no outcome")
     stream: Literal["test", "validation"] = option("test", "seeds: test is what nothing was chosen on")
     films: int = option(2, "film so many failures, and as many successes")
@@ -88,12 +89,12 @@ class EvalOptions:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
         self._check()
         seeds = self._seeds()
-        job = self._job(len(seeds))
         from manip_il.cli.stages import Stages
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.results import FILE_NAME
 
         engine = Engine(self.workers, self.engine)
+        job = self._job(engine, len(seeds))
         self._prepare()
         kept = KeptEpisodes.open(self.output_dir, job, self.suite, str(self.output_dir))
         with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
@@ -109,7 +110,7 @@ class EvalOptions:
     def _check(self) -> None:
         if (self.policy.path is None) == (self.policy.type is None):
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
-        for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("batch_size", 1)):
+        for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("hold", 0), ("batch_size", 1)):
             value = getattr(self.eval, name)
             if value is not None and value < lowest:
                 raise UsageError(f"--eval.{name} is {value}; expected at least {lowest}")
@@ -123,11 +124,13 @@ class EvalOptions:
         count = self.eval.n_episodes or most
         return stream_seeds(self.eval.stream, self.eval.first + count, self.seed)[self.eval.first :]
 
-    def _job(self, episodes: int) -> RolloutJob:
+    def _job(self, engine: Engine, episodes: int) -> RolloutJob:
         from manip_il.engine.jobs import RolloutJob
 
         path = None if self.policy.path is None else find_policy(self.policy.path)
         self._check_memory(path, episodes)
+        if episodes > 1:
+            engine.warm_up(learned=path is not None)  # while the policy is looked at here
         if path is None:
             env, driver, cameras = self._env(None), self.policy.type, None
         else:
@@ -141,7 +144,7 @@ class EvalOptions:
                 say(looks(cameras, path))
         conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
         job = RolloutJob(env, driver or "random", policy=path, labels="last", conditions=conditions)
-        return replace(job, batch=self.eval.batch_size)
+        return replace(job, hold=self.eval.hold, batch=self.eval.batch_size)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
         """Before anything large is loaded; on a cluster memory is its own affair."""

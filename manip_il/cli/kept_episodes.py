@@ -70,5 +70,5 @@ def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
     return {
         "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver,
         "fingerprint": env_fingerprint(job.env, drawn_cameras(job)),
-        "settings": EvalSettings.of(job.env, suite, job.conditions).to_json(),
+        "settings": EvalSettings.of(job, suite).to_json(),
     }

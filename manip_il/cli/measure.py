@@ -47,8 +47,9 @@ class Trial:
     def job(self, policy: Path) -> RolloutJob:
         """The rollouts of one policy."""
         from manip_il.engine.jobs import RolloutJob
+        from manip_il.evaluation.runner import HOLD
 
-        return RolloutJob(self.env, "policy", policy=policy, labels="last", conditions=self.conditions)
+        return RolloutJob(self.env, "policy", policy=policy, hold=HOLD, labels="last", conditions=self.conditions)
 
     def file(self, folder: Path, policy: Path) -> Path:
         """Where the evaluation of `policy` lies: named after its files, the environment and the episodes.
@@ -57,13 +58,13 @@ class Trial:
         """
         from manip_il.engine.describe import env_fingerprint, policy_sha256
 
-        conditions = [condition.to_json() for condition in self.conditions]
-        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), conditions, policy_sha256(policy))
+        settings = EvalSettings.of(self.job(policy), self.suite).to_json()
+        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, policy_sha256(policy))
         return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
 
     def check_result(self, name: str, result: EvalResult) -> None:
         """Raise `MismatchError` or `ManipError` unless an evaluation from elsewhere is this test's."""
-        settings = EvalSettings.of(self.env, self.suite, self.conditions)
+        settings = EvalSettings.of(self.job(Path()), self.suite)
         wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
         for what, value in wanted.items():
             if getattr(result, what) != value:

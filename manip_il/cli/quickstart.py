@@ -94,6 +94,7 @@ class QuickstartOptions:
 
         kept = f"every finished episode, round and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+            engine.warm_up(learned=True)
             story = _Story(self, config, engine, stages)
             story.add_time("start", time.monotonic() - started)
             story.tell()

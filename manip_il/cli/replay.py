@@ -76,16 +76,16 @@ class ReplayOptions:
         from manip_il.learn.checkpoint import read_meta
 
         env = result.settings.env(result.robot, result.task)
-        conditions = result.settings.conditions
+        conditions, hold = result.settings.conditions, result.settings.hold
         if result.policy in NO_FILES and not result.policy_sha256 and self.policy.path is None:
             cameras = None
-            job = RolloutJob(env, result.policy, labels="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
+            job = RolloutJob(env, result.policy, hold=hold, labels="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
         else:
             path = self._find(result)
             cameras = check_policy(path, read_meta(path), env)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn([f"{path} is not the policy of {self.file}: its files differ"])
-            job = RolloutJob(env, "policy", policy=path, labels="last", conditions=conditions)
+            job = RolloutJob(env, "policy", policy=path, hold=hold, labels="last", conditions=conditions)
         here = env_fingerprint(env, cameras)
         warn(compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
         return job

@@ -24,7 +24,7 @@ from manip_il.errors import RenderError
 from manip_il.evaluation.film import encode_mp4, film, paths, run_states, strip
 from manip_il.evaluation.report_data import Film, Kind, Paths, Strip
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.runner import evaluate
+from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Contestant:
         """Its rollouts."""
         driver: Literal["expert", "policy"] = "expert" if self.policy is None else "policy"
         conditions = suite_conditions(suite, env.task, sees=False)
-        return RolloutJob(env, driver, policy=self.policy, labels="last", conditions=conditions)
+        return RolloutJob(env, driver, policy=self.policy, hold=HOLD, labels="last", conditions=conditions)
 
 
 def clone_with_labels(

@@ -114,6 +114,13 @@ class Engine:
             self._close(in_order=False)  # what still runs belongs to nobody any more
             raise
 
+    def warm_up(self, learned: bool) -> None:
+        """Begin to start what workers need, and return at once. learned: whether policies will drive."""
+        if self.where == "local" and self.workers != 1:
+            from manip_il.engine.local import start_server
+
+            start_server(learned)
+
     def __enter__(self) -> Engine:
         return self
 

@@ -7,15 +7,47 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Iterator
-from multiprocessing import resource_tracker
+from collections.abc import Generator, Iterator
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 
 from manip_il.engine.engine import Event, Task, portable, run_task
 from manip_il.mdp import Episode
 
-_CONTEXT = multiprocessing.get_context("spawn")  # a forked child would share OpenGL and threads
+# Workers are forked from a server that has imported what they need, and nothing else: neither OpenGL nor threads are
+# shared, and the import of torch, seconds of work, is paid once and not by every worker.
+_CONTEXT = multiprocessing.get_context("forkserver")
+_EVERY_JOB, _LEARNED_JOB = ("manip_il.engine.jobs",), ("manip_il.engine.jobs", "manip_il.learn.policy")
 _PATIENCE = 10.0  # for a worker that was told to stop [s]
+
+
+def start_server(learned: bool) -> None:
+    """Start what workers are forked from, beside whatever this process does meanwhile; once a process.
+
+    learned: whether policies will drive. The server has the environment variables of this moment.
+    """
+    _CONTEXT.set_forkserver_preload(list(_LEARNED_JOB if learned else _EVERY_JOB))
+    threads = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
+    try:
+        with _without_interrupts():
+            resource_tracker.ensure_running()  # first, as its own start would undo the mask
+            forkserver.ensure_running()
+    finally:
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Generator[None]:
+    """Processes that are started meanwhile do not hear Ctrl-C, which is not for workers."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class LocalProcesses:
@@ -32,6 +64,7 @@ class LocalProcesses:
 
     def submit(self, task: Task) -> None:
         """Hand a task to a worker."""
+        start_server(learned=task.job.policy is not None)
         worker = self._idle.pop() if self._idle else _Worker()
         self._busy[worker.connection] = worker
         worker.start(task)
@@ -64,12 +97,8 @@ class _Worker:
     def __init__(self) -> None:
         self.connection, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_serve, args=(theirs,), daemon=True)
-        resource_tracker.ensure_running()  # here, as its own start would undo the mask
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child has it: Ctrl-C is not for workers
-        try:
+        with _without_interrupts():
             self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()  # so that the pipe ends when the worker does
         self._task: Task | None = None
 
@@ -101,7 +130,6 @@ class _Worker:
 
 def _serve(connection: Connection) -> None:
     """A worker's life: tasks in, episodes out, until the other end goes away."""
-    os.environ["OMP_NUM_THREADS"] = "1"  # read by torch, which is imported later; one core each
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             for message in _answer(connection.recv_bytes()):

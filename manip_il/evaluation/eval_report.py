@@ -110,12 +110,14 @@ def _how_measured(result: EvalResult) -> str:
     sizes = sorted({len(episodes) for episodes in by_condition(result).values()})
     each = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
     apart = f", {each} in each condition" if len(by_condition(result)) > 1 else ""
+    ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
     intervals = "Intervals are Wilson's score intervals."
     if result.until_width is not None:
         intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
     return (
         f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. Success is to be within "
-        f"{100 * settings.tolerance:g} cm of the goal for {settings.success_steps} control steps in a row. {intervals}"
+        f"{100 * settings.tolerance:g} cm of the goal for {settings.success_steps} control steps in a row{ends}. "
+        + intervals
     )
 
 

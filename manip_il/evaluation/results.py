@@ -14,6 +14,7 @@ from manip_il.evaluation.statistics import CONFIDENCE, PairedComparison, Proport
 from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
+    from manip_il.engine.jobs import RolloutJob
     from manip_il.sim.env import EnvConfig
 
 FILE_NAME = "eval.json"
@@ -69,7 +70,8 @@ class EvalSettings:
     """What two evaluations must share to be compared, and what running an episode again needs.
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as there [m]. suite: the name of
-    the conditions that episodes meet in turn.
+    the conditions that episodes meet in turn. hold: control steps after success at which an episode ends, None where it
+    goes on to the horizon.
     """
 
     horizon: int
@@ -78,11 +80,13 @@ class EvalSettings:
     success_steps: int = _STEPS
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
+    hold: int | None = None
 
     @classmethod
-    def of(cls, env: EnvConfig, suite: str = NOMINAL.name, conditions: tuple[Condition, ...] = ()) -> EvalSettings:
-        """Of episodes in `env` under `conditions`."""
-        return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions or (NOMINAL,))
+    def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
+        """Of the episodes of a job, whose conditions are called `suite`."""
+        env, conditions = job.env, job.conditions or (NOMINAL,)
+        return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions, job.hold)
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """The environment that was evaluated in."""
@@ -97,7 +101,8 @@ class EvalSettings:
 
     def __str__(self) -> str:
         rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
-        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}"
+        ends = "" if self.hold is None else f", ended {self.hold} steps after success"
+        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}"
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
@@ -106,6 +111,7 @@ class EvalSettings:
             "tolerance": self.tolerance,
             "control_hz": self.control_hz,
             "success_steps": self.success_steps,
+            "hold": self.hold,
             "suite": self.suite,
             "conditions": [condition.to_json() for condition in self.conditions],
         }
@@ -121,6 +127,7 @@ class EvalSettings:
             success_steps=_whole(data.get("success_steps", _STEPS)),
             suite=str(data.get("suite", NOMINAL.name)),
             conditions=tuple(Condition.from_mapping(str(one.pop("name")), one) for one in named),
+            hold=None if data.get("hold") is None else _whole(data["hold"]),
         )
 
 

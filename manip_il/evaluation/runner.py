@@ -20,6 +20,7 @@ from manip_il.mdp import Episode, Phase
 from manip_il.sim.conditions import NOMINAL, draw
 
 _LOG = logging.getLogger(__name__)
+HOLD = 10  # control steps after success at which an evaluation's episodes end: whether it lasts, and no more
 LOOK_EVERY = 100  # episodes after which an evaluation asks whether its interval is narrow enough
 OnResult = Callable[[EpisodeResult], None]
 
@@ -63,7 +64,7 @@ def evaluate(
         task=job.env.task,
         fingerprint=env_fingerprint(job.env, drawn_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
-        settings=EvalSettings.of(job.env, suite, job.conditions),
+        settings=EvalSettings.of(job, suite),
         policy_sha256=policy_sha256(job.policy) if job.policy is not None else "",
         until_width=until_width,
     )
@@ -82,7 +83,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         success_at_end=episode.success_at_end,
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
-        phase_at_end=Phase(int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])).name.lower(),
+        phase_at_end=_last_phase(episode).name.lower(),
         detail={
             "steps_to_success": first,
             "condition": met.condition,
@@ -92,6 +93,12 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
             "end": {name: at for name, at in end.items() if name != "goal"},
         },
     )
+
+
+def _last_phase(episode: Episode) -> Phase:
+    """What the expert calls the last state; nobody asks it about one in which the task is solved."""
+    phase = Phase(int(episode.columns[schema.EXPERT_PHASE].ravel()[-1]))
+    return Phase.AT_GOAL if phase == Phase.NONE and episode.success_at_end else phase
 
 
 def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence[int]]:

@@ -12,6 +12,7 @@ from manip_il.cli.folders import append_jsonl
 from manip_il.cli.groups import EnvGroup, TaskGroup, save_options
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.sim.env import EnvConfig
 
@@ -58,6 +59,6 @@ def make_run(
 def make_eval(path: Path, outcomes: list[bool], seed: int = 4_000_000, horizon: int = 8, task: str = "reach") -> Path:
     """An evaluation with these outcomes."""
     episodes = tuple(EpisodeResult(seed + i, good, good, 8, 0.0) for i, good in enumerate(outcomes))
-    settings = EvalSettings(horizon, ENV.tolerance)
+    settings = EvalSettings(horizon, ENV.tolerance, hold=HOLD)
     EvalResult(path.parent.name, "panda", task, env_fingerprint(ENV), episodes, settings).write(path)
     return path

@@ -38,7 +38,7 @@ def test_the_keys_are_the_contracts():
     assert set(data["episodes"][0]) == {"seed", "success", "success_at_end", "steps", "return", "phase_at_end"}
     assert data["settings"] == {
         **{"horizon": 150, "tolerance": 0.02, "control_hz": 20, "success_steps": 5},
-        **{"suite": "nominal", "conditions": [{"name": "nominal"}]},
+        **{"hold": None, "suite": "nominal", "conditions": [{"name": "nominal"}]},
     }
     assert data["by_condition"] == {}  # nothing says which it met
     assert (data["interval_method"], data["until_width"]) == ("Wilson's score interval", None)
