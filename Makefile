@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup gl demo test test-fast lint format bench lock clean
+.PHONY: help setup gl browser demo test test-fast lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= python3.12
@@ -12,7 +12,7 @@ UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .tools/bin/uv)
 BIN := .venv/bin
 
 help:  ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-11s %s\n", $$1, $$2}'
 
 setup: .venv/.installed  ## the environment, in .venv
 
@@ -32,8 +32,11 @@ demo: setup gl  ## the whole story, small: runs/quickstart/report.html
 gl:  ## the system's OpenGL, where it is missing and this is root
 	@.ci/gl
 
+browser:  ## a headless Chromium for the tests of reports, where it is missing and this is root
+	@.ci/browser
+
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
-test: setup gl  ## every test
+test: setup gl browser  ## every test
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL
@@ -48,6 +51,12 @@ lint: setup  ## style, types and who may import whom
 format: setup  ## put the code into shape
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+docker:  ## the image manip-il; TORCH_BACKEND=cpu for a small one without CUDA
+	docker build --build-arg TORCH_BACKEND=$(TORCH_BACKEND) --tag manip-il .
+
+docker-test: setup gl  ## build the image, evaluate in it, compare with here
+	.ci/docker
 
 # One by one: two at a time would measure each other.
 bench: setup  ## every speed ratio

@@ -34,7 +34,7 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     try:
         with contextlib.suppress(OSError):  # a network file system may know no locks; then leftovers stay
             fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel lets go when the writer dies: so leftovers are known
-        partial.chmod(0o777 & ~_umask())
+        partial.chmod(0o777 & ~umask())
         yield partial
         _sync_tree(partial)
         if replace and root.exists():
@@ -92,7 +92,7 @@ def write_file(path: Path, data: bytes) -> None:
     partial = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            os.fchmod(stream.fileno(), 0o666 & ~_umask())
+            os.fchmod(stream.fileno(), 0o666 & ~umask())
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
@@ -151,7 +151,8 @@ def _remove_leftovers(root: Path) -> None:
                 os.close(lock)
 
 
-def _umask() -> int:
+def umask() -> int:
+    """The mask that new files are made with."""
     mask = os.umask(0o077)  # there is no way to only read it
     os.umask(mask)
     return mask

@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from manip_il.data.atomic import umask
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 
@@ -143,8 +144,7 @@ def save_checkpoint(
     state.mkdir()
     save_optimizer_state(optimizer, state)
     write_json(state / STEP_FILE, {"step": step, **resume_key})
-    temporary.rename(final)
-    point_last_at(final)
+    publish(temporary, final)
     for other in checkpoints.iterdir():
         if not other.is_symlink() and other.name != final.name:
             shutil.rmtree(other, ignore_errors=True)
@@ -195,12 +195,16 @@ def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMe
     write_json(folder / META_FILE, asdict(meta))
 
 
-def point_last_at(final: Path) -> None:
-    """Make a checkpoint's folder the one that `last` leads to, in one rename."""
-    temporary = final.parent / ".last.tmp"
-    temporary.unlink(missing_ok=True)
-    temporary.symlink_to(final.name)
-    os.replace(temporary, final.parent / _LAST)
+def publish(temporary: Path, final: Path) -> None:
+    """Give a checkpoint that is whole its name, and make it `last`."""
+    for path in temporary.rglob("*"):
+        if path.is_file():  # safetensors hides its files from other users, a container's among them
+            path.chmod(0o666 & ~umask())
+    temporary.rename(final)
+    link = final.parent / ".last.tmp"
+    link.unlink(missing_ok=True)
+    link.symlink_to(final.name)
+    os.replace(link, final.parent / _LAST)  # in one rename
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

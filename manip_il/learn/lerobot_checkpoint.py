@@ -26,7 +26,7 @@ from manip_il.learn.checkpoint import (
     STEP_FILE,
     TRAINING_STATE,
     CheckpointMeta,
-    point_last_at,
+    publish,
     read_step,
     write_json,
 )
@@ -68,5 +68,4 @@ def save_lerobot_checkpoint(
     key = {"data": progress.data, "options": progress.options, "batch_size": pipeline.batch_size}
     write_json(temporary / TRAINING_STATE / STEP_FILE, read_step(temporary) | key)
     yield temporary / PRETRAINED_MODEL
-    temporary.rename(final)
-    point_last_at(final)
+    publish(temporary, final)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,9 @@ def read_config(path: Path) -> dict[str, Any]:
         adapter = (path / "adapter_model.safetensors").is_file()
         hint = "it is an adapter: merge it into its base policy first" if adapter else "the weights are missing"
         raise ManipError(f"no {WEIGHTS} in {path}; {hint}")
+    for name in (CONFIG, WEIGHTS):
+        if not os.access(path / name, os.R_OK):
+            raise ManipError(f"{path / name} may not be read by this user (uid {os.getuid()}); run as its owner")
     try:
         config = json.loads((path / CONFIG).read_text())
         _ = config["type"], config["input_features"].items(), config["output_features"].items()

@@ -124,3 +124,10 @@ def test_pictures_that_a_policy_fills_in_itself_are_not_asked_for(act):
     empty = {"type": "VISUAL", "shape": [3, 480, 640]}
     edit_config(act, input_features={"observation.images.empty_camera_0": empty})
     assert read_interface(act).pictures == {}
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_file_of_another_user_is_said_to_be_that_and_not_missing(name, act, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != name)
+    with pytest.raises(ManipError, match=rf"{name} may not be read by this user \(uid \d+\); run as its owner"):
+        LearnedPolicy.load(act)

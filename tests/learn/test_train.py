@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 import torch
 
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
-from manip_il.learn.checkpoint import CheckpointMeta, check_fits, read_meta
+from manip_il.learn.checkpoint import CheckpointMeta, check_fits, publish, read_meta
 from manip_il.learn.columns import learning_rows, split_by_episode
 from manip_il.learn.losses import LOSSES
 from manip_il.learn.mlp import MLPConfig
@@ -250,3 +252,15 @@ def test_a_wrong_option_is_refused():
         TrainConfig(steps=0)
     with pytest.raises(UsageError, match=r"policy\.width is 0"):
         MLPConfig(width=0)
+
+
+def test_a_checkpoint_is_readable_for_whom_the_umask_lets_read(tmp_path):
+    before = os.umask(0o027)
+    try:
+        made = tmp_path / "made"
+        made.mkdir()
+        (made / "model.safetensors").touch(mode=0o600)
+        publish(made, tmp_path / "000002")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "last" / "model.safetensors").stat().st_mode) == 0o640

@@ -263,6 +263,11 @@ def test_an_unknown_robot_is_no_fault_of_opengl():
 def test_the_users_choice_of_backend_stands(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     assert choose_backend() == "glfw"
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    assert choose_backend() == "off"
+    monkeypatch.setenv("MUJOCO_GL", "eglo")
+    with pytest.raises(RenderError, match="MUJOCO_GL is 'eglo'; expected egl or osmesa"):
+        choose_backend()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,79 @@
+"""The image is built from what is locked, holds nothing but the program, and may run as anyone."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def dockerfile() -> str:
+    """Without comments, one instruction a line."""
+    text = "\n".join(line for line in (ROOT / "Dockerfile").read_text().splitlines() if not line.startswith("#"))
+    return text.replace("\\\n", " ")
+
+
+def final_stage(dockerfile: str) -> str:
+    return re.split(r"^FROM ", dockerfile, flags=re.MULTILINE)[-1]
+
+
+def ignored() -> list[str]:
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def test_what_is_copied_is_sent_and_nothing_else_is(dockerfile):
+    copied = {
+        name
+        for line in re.findall(r"^COPY (?!--from)(.*)$", dockerfile, flags=re.MULTILINE)
+        for name in line.split()[:-1]
+    }
+    assert ignored()[0] == "*"
+    assert {line[1:] for line in ignored() if line.startswith("!")} == copied
+    assert all((ROOT / name).exists() for name in copied)
+    assert not {"runs", "datasets", ".git", ".venv", ".tools", "tests"} & copied
+
+
+def test_uv_and_the_version_are_those_of_the_project(dockerfile):
+    [uv] = re.findall(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    assert f"ARG UV_VERSION={uv}\n" in dockerfile
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f'org.opencontainers.image.version="{version}"' in final_stage(dockerfile)
+
+
+def test_hashes_are_required_unless_another_index_is_asked_for(dockerfile):
+    [install] = [line for line in dockerfile.splitlines() if "uv pip install" in line and "runtime.txt" in line]
+    assert re.search(r'if \[ "\$TORCH_BACKEND" \]; then echo "--no-verify-hashes .*else echo --require-hashes', install)
+    for stage in re.split(r"^FROM ", dockerfile, flags=re.MULTILINE):  # an argument is known where it is declared
+        assert ("$TORCH_BACKEND" in stage) == ("ARG TORCH_BACKEND=\n" in stage)
+
+
+def test_the_final_image_is_debians_without_build_tools_and_not_roots(dockerfile):
+    final = final_stage(dockerfile)
+    assert final.startswith("debian:trixie-slim\n")
+    assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", final, flags=re.MULTILINE)
+    assert not re.search(r"\b(pip|uv pip|python3-venv|gcc|build-essential)\b", final)
+    assert 'ENTRYPOINT ["manip-il"]' in final
+
+
+def test_whatever_is_written_goes_under_tmp(dockerfile):
+    settings = dict(re.findall(r"\b((?:HOME|\w+_HOME|\w+_DIR|\w+DIR))=(\S+)", final_stage(dockerfile)))
+    assert {"HOME", "HF_HOME", "XDG_CACHE_HOME"} <= settings.keys()
+    assert all(place == "/tmp" or place.startswith("/tmp/") for place in settings.values())
+
+
+def test_pictures_need_the_packages_that_errors_name(dockerfile):
+    from manip_il.sim.gl import PACKAGES
+
+    assert PACKAGES in final_stage(dockerfile)
+
+
+@pytest.mark.parametrize("script", ["docker", "docker-daemon", "run", "gl"])
+def test_the_scripts_are_sound_bash(script):
+    subprocess.run(["bash", "-n", str(ROOT / ".ci" / script)], check=True)
