@@ -1,0 +1,71 @@
+"""`manip-il push SOURCE REMOTE`: a dataset or a policy, somewhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli.groups import option, warn
+from manip_il.cli.progress import say
+from manip_il.cli.transfer import bytes_text, moved
+
+if TYPE_CHECKING:
+    from manip_il.data.remote.push import Plan
+    from manip_il.data.remote.remote import Published
+
+
+@dataclass
+class PushOptions:
+    """Push a dataset, or a policy with its run, to the Hugging Face Hub, an S3 store, another machine or a folder.
+
+    A dataset is examined first, as by manip-il doctor, and refused where it is not whole. Only what changed is
+    uploaded; whoever reads the remote sees the old version until the new one is there whole and verified. After a cut
+    the same command goes on. Of two pushes at once one wins, and the other is told.
+    """
+
+    example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
+    source: Path = field(metadata={"help": "folder of a dataset, a run or a policy", "positional": True})
+    remote: str = field(
+        metadata={
+            "help": "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER",
+            "positional": True,
+        }
+    )
+    dry_run: bool = option(False, "only say what would be uploaded and removed")
+    journals: bool = option(False, "take the journals along, of which the dataset can be built again")
+    private: bool = option(False, "make a repo that is not on the Hub yet a private one")
+
+    def run(self) -> None:
+        """Examine, list, upload, switch over; say what was done."""
+        from manip_il.data.remote.push import push
+        from manip_il.data.remote.url import RemoteUrl, open_remote
+
+        url = RemoteUrl.parse(self.remote)
+        remote = open_remote(url, private=self.private)
+        try:
+            plan, published = push(self.source, url, remote, moved, journals=self.journals, dry_run=self.dry_run)
+        finally:
+            warn(remote.warnings)
+        if published is None:
+            _say_plan(plan, url)
+            return
+        say(_summary(published, url))
+        say(f"next: manip-il pull {url} FOLDER")
+
+
+def _say_plan(plan: Plan, url: object) -> None:
+    for path in plan.upload:
+        say(f"upload   {path} ({bytes_text(plan.manifest.by_path[path].size)})")
+    for path in plan.remove:
+        say(f"remove   {path}")
+    kept = len(plan.manifest.files) - len(plan.upload)
+    counts = f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload; {len(plan.remove)} to remove; {kept} stay"
+    say(f"{url}: {counts}; nothing was done")
+
+
+def _summary(published: Published, url: object) -> str:
+    if not published.uploaded and not published.removed:
+        return f"{url}: {published.kept} files, all there already"
+    counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
+    return f"{url}: {counts}; {published.removed} removed; {published.kept} were there"

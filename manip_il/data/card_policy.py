@@ -1,0 +1,201 @@
+"""The card of a policy: a `pretrained_model` folder, or a run that holds one."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import EvalResult, ModelCardData
+
+from manip_il.data.card_text import LICENSE, REPOSITORY, command, fingerprint_rows, repository, table
+from manip_il.data.lerobot_layout import INFO
+from manip_il.data.lerobot_read import dataset_info
+from manip_il.errors import ManipError
+
+_INSIDE = ("", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
+_LEVELS = re.compile(r"pretrained_model|policy|best|last|checkpoints|\d+")  # folders of one run, above its weights
+_DATASET = "dataset"  # of a DAgger run: what its policy was fitted to
+_REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a folder says of its policy; `{}` for what is not there. path: of the weights, in the pushed folder."""
+
+    path: str
+    config: Mapping[str, Any]
+    meta: Mapping[str, Any]
+    training: Mapping[str, Any]
+    evaluation: Mapping[str, Any]
+    chosen_by: bool  # whether the evaluation is one that the policy was chosen by
+
+    @property
+    def type(self) -> str:
+        """LeRobot's name for it."""
+        return str(self.config.get("type", "policy"))
+
+    def named(self, key: str) -> str:
+        """Its `robot` or `task`; empty where nothing says it."""
+        return str(self.meta.get(key) or self.evaluation.get(key) or "")
+
+    @property
+    def robot_task(self) -> tuple[str, str]:
+        """Both names."""
+        return self.named("robot"), self.named("task")
+
+
+def policy_card(root: Path, url: str) -> str:
+    """`README.md`. Raises `ManipError` for a folder without a policy."""
+    policy, place = read_policy(root), repository(url)
+    robot, task = policy.robot_task
+    title = f"{policy.type} for {robot} {task}" if robot else policy.type
+    made = command(root / "config.yaml")
+    steps = f"```sh\n{made}\n```\n\n" if made else ""
+    return (
+        f"---\n{_metadata(policy, title).to_yaml()}\n---\n\n# {title}\n\n"
+        "Taught by an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
+        f"{table(_rows(root, policy))}\n\n## Use\n\n{_use(policy, place)}"
+        f"## How it was made\n\n{steps}{fingerprint_rows(policy.meta.get('fingerprint') or {})}"
+    )
+
+
+def read_policy(root: Path) -> Policy:
+    """The policy in a folder, or in the run that the folder is. Raises `ManipError` where there is none."""
+    for inside in _INSIDE:
+        folder = root / inside
+        if (folder / "config.json").is_file():
+            evaluation, chosen_by = _evaluation(root, folder)
+            config, meta, training = (_read(folder / f"{name}.json") for name in ("config", "manip_il", "train_config"))
+            return Policy(_real(root, folder), config, meta, training, evaluation, chosen_by)
+    raise ManipError(f"no policy in {root}; expected config.json there, or in one of {', '.join(_INSIDE[1:])}")
+
+
+def _real(root: Path, folder: Path) -> str:
+    """As it is found in the pushed folder, where no link is."""
+    path = folder.resolve().relative_to(root.resolve()).as_posix()
+    return "" if path == "." else path
+
+
+def _metadata(policy: Policy, title: str) -> ModelCardData:
+    robot, task = policy.robot_task
+    tags = dict.fromkeys(["robotics", "lerobot", "manip_il", policy.type, robot, task])
+    results = None
+    if "success_rate" in policy.evaluation:
+        rate, name = float(policy.evaluation["success_rate"]), f"{robot} {task}".strip() or "unknown"
+        result = EvalResult("robotics", "manip_il", name, "success_rate", rate, metric_name="success rate")
+        results = [result]
+    return ModelCardData(
+        license=LICENSE,
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=[tag for tag in tags if tag],
+        model_name=title.replace(" ", "_"),
+        datasets=_dataset(policy),
+        eval_results=results,
+    )
+
+
+def _dataset(policy: Policy) -> str | None:
+    """USER/NAME of what it was trained on, where that is a name on the Hub."""
+    name = str((policy.training.get("dataset") or {}).get("repo_id") or "")
+    return name if _REPO_ID.fullmatch(name) and not name.startswith("local/") else None
+
+
+def _rows(root: Path, policy: Policy) -> Iterator[tuple[str, object]]:
+    meta, training = policy.meta, policy.training
+    robot, task = policy.robot_task
+    yield "policy", f"`{policy.type}`"
+    if robot:
+        yield "robot, task", f"`{robot}`, `{task}`"
+    yield "sees", ", ".join(f"`{key}`" for key in policy.config.get("input_features") or {}) or "nothing"
+    if meta.get("cameras"):
+        height, width = meta.get("image_size", (0, 0))
+        yield "cameras", f"{', '.join(meta['cameras'])}, {width} x {height} pixels"
+    if meta.get("action_meaning"):
+        yield "action", f"{meta['action_meaning']}, {meta.get('fps', '?')} a second"
+    if name := str((training.get("dataset") or {}).get("repo_id") or ""):
+        yield "learnt from", f"`{name}`"
+    elif (root / _DATASET / INFO).is_file():
+        data = dataset_info(root / _DATASET)
+        yield "learnt from", f"{data.episodes:,} episodes, {data.frames:,} frames"
+    yield from _fit(policy)
+    yield "success", _success(policy)
+
+
+def _fit(policy: Policy) -> Iterator[tuple[str, object]]:
+    options = {**(policy.meta.get("options") or {}), **policy.training}
+    words = [f"{name} {options[key]}" for key, name in _FIT.items() if options.get(key) is not None]
+    if words:
+        yield "fit", ", ".join(words)
+
+
+_FIT = {"steps": "steps", "batch_size": "batch size", "lr": "learning rate", "seed": "seed"}
+
+
+def _success(policy: Policy) -> str:
+    found = policy.evaluation
+    if "success_rate" not in found:
+        return "not measured; see below"
+    low, high = found.get("interval") or (float("nan"), float("nan"))
+    sure = float(found.get("confidence", 0.95))
+    count = f"{found['n_episodes']:,} episodes"
+    text = f"**{found['success_rate']:.1%}** [{low:.1%}, {high:.1%}] ({sure:.0%} interval, {count})"
+    return f"{text}, on the seeds that it was chosen by" if policy.chosen_by else f"{text}, on unseen seeds"
+
+
+def _use(policy: Policy, place: str) -> str:
+    robot, task = policy.robot_task
+    options = f" --robot.type={robot} --task.type={task} --eval.n_episodes=200" if robot and task else ""
+    folder = place.rpartition("/")[2] if place != REPOSITORY else "policy"
+    lerobot = f"With LeRobot: `--policy.path={place}` in its own commands.\n\n" if policy.path == "" else ""
+    return _USE.format(place=place, folder=folder, options=options) + lerobot
+
+
+_USE = """```sh
+manip-il pull hf://{place} runs/{folder}
+manip-il eval --policy.path=runs/{folder}{options}
+```
+
+In Docker, with no network and no rights:
+
+```sh
+mkdir -p out
+docker run --rm --network=none --read-only --tmpfs /tmp --user "$(id -u):$(id -g)" \\
+  -v ./runs/{folder}:/policy:ro -v ./out:/out \\
+  manip-il eval --policy.path=/policy{options} --output_dir=/out/eval
+```
+
+"""
+
+
+def _evaluation(root: Path, folder: Path) -> tuple[Mapping[str, Any], bool]:
+    """The nearest `eval.json` beside the weights, up to the folder of their run; else one of the run's rounds."""
+    place = folder.resolve()
+    while True:
+        found = [_read(path) for path in (place / "eval.json", *sorted(place.glob("eval*/eval.json")))]
+        found = [one for one in found if _is_evaluation(one)]
+        if found:
+            return max(found, key=lambda one: one["n_episodes"]), place.name.startswith("round_")
+        if not _LEVELS.fullmatch(place.name):
+            break
+        place = place.parent
+    rounds = [_read(path) for path in sorted(root.glob("round_*/eval.json"))]
+    rounds = [one for one in rounds if _is_evaluation(one)]
+    return (max(rounds, key=lambda one: one["success_rate"]), True) if rounds else ({}, False)
+
+
+def _is_evaluation(one: Mapping[str, Any]) -> bool:
+    return all(isinstance(one.get(key), int | float) for key in ("success_rate", "n_episodes"))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; empty where there is none."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) else {}

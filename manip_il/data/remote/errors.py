@@ -1,0 +1,80 @@
+"""What can go wrong with a remote; no message ever holds a token, a key or a password."""
+
+from __future__ import annotations
+
+import os
+import re
+
+from manip_il.errors import ManipError
+
+HIDDEN = "[hidden]"
+_SECRET_VARIABLES = (
+    *("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "FSSPEC_S3_KEY", "FSSPEC_S3_SECRET"),
+    *("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN"),
+)
+_PATTERNS = (
+    (re.compile(r"\bhf_[A-Za-z0-9]{8,}"), HIDDEN),
+    (re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{12,}"), HIDDEN),
+    (re.compile(r"(\w://[^/\s:@]*):[^\s@]*@"), rf"\1:{HIDDEN}@"),
+    (
+        re.compile(r"(?i)(x-amz-(?:signature|credential|security-token)|awsaccesskeyid|signature)=[^&\s'\"]+"),
+        r"\1=" + HIDDEN,
+    ),
+    (re.compile(r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?)(?:bearer |basic |aws4[\w-]* )?[^\s'\"]+"), r"\1" + HIDDEN),
+)
+_SHORTEST = 6  # characters of a secret that is hidden wherever it stands: shorter ones are words of any text
+
+
+class RemoteError(ManipError):
+    """A remote that cannot do what was asked; the text is cleaned of secrets on construction."""
+
+    def __init__(self, message: str):
+        super().__init__(redact(message))
+
+
+class ConflictError(RemoteError):
+    """Somebody else changed the remote meanwhile: this push did not happen."""
+
+    def __init__(self, place: str):
+        super().__init__(
+            f"{place} was changed by another push meanwhile; nothing of this one is seen there; push again"
+        )
+
+
+class AuthError(RemoteError):
+    """Nobody is logged in, or who is may not do this."""
+
+
+class NotFoundError(RemoteError):
+    """No such repo, bucket, folder, host, revision or file."""
+
+
+class NoSpaceError(RemoteError):
+    """A disk, here or there, is full."""
+
+
+class HashError(RemoteError):
+    """Bytes that are not those of the manifest."""
+
+
+class ManifestError(RemoteError):
+    """A manifest, or a folder to make one of, that no push makes and no pull takes."""
+
+
+class TransientError(RemoteError):
+    """What may work a moment later: a cut connection, a 500, a 429. after: what the server asked to wait [s]."""
+
+    def __init__(self, message: str, after: float | None = None):
+        super().__init__(message)
+        self.after = after
+
+
+def redact(text: str, *secrets: str) -> str:
+    """`text` without what looks like a secret, without those in the environment, and without `secrets`."""
+    known = {*secrets, *(os.environ.get(name, "") for name in _SECRET_VARIABLES)}
+    for secret in sorted(known, key=len, reverse=True):
+        if len(secret) >= _SHORTEST or (secret and secret in secrets):
+            text = text.replace(secret, HIDDEN)
+    for pattern, instead in _PATTERNS:
+        text = pattern.sub(instead, text)
+    return text

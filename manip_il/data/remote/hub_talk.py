@@ -1,0 +1,150 @@
+"""Talking to a Hub by huggingface_hub: with time limits, without its noise, and with errors of ours."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+from collections.abc import Iterator
+
+import httpx
+from huggingface_hub import constants, get_session
+from huggingface_hub.errors import (
+    EntryNotFoundError,
+    HfHubHTTPError,
+    HFValidationError,
+    LocalTokenNotFoundError,
+    OfflineModeIsEnabled,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
+from huggingface_hub.utils import (
+    are_progress_bars_disabled,
+    disable_progress_bars,
+    enable_progress_bars,
+    get_token,
+)
+from huggingface_hub.utils import (
+    logging as hub_logging,
+)
+
+from manip_il.data.remote.errors import AuthError, ConflictError, NotFoundError, RemoteError, TransientError, redact
+from manip_il.data.remote.retry import retry_after
+from manip_il.errors import ManipError
+
+HF = "https://huggingface.co"
+CONNECT, PATIENCE = 20.0, 120.0  # until a connection is there, until the next byte [s]
+LOGIN = "run `hf auth login`, or set HF_TOKEN"
+_TEMPORARY = (408, 429, 500, 502, 503, 504)
+
+
+@contextlib.contextmanager
+def talking(place: str, endpoint: str) -> Iterator[None]:
+    """What goes wrong inside is one of our errors, about `place`; time limits hold inside.
+
+    huggingface_hub sets no limits, so that a server that says nothing would be waited for without end.
+    """
+    noisy = logging.getLogger("httpx")  # it tells every URL, signatures included, wherever INFO is on
+    if noisy.getEffectiveLevel() < logging.WARNING:
+        noisy.setLevel(logging.WARNING)
+    hooks = get_session().event_hooks["request"]
+    if _limit not in hooks:
+        hooks.append(_limit)
+    try:
+        yield
+    except ManipError:
+        raise
+    except Exception as error:
+        known = explained(error, place, endpoint)
+        if known is None:
+            raise
+        raise known from None  # its text may hold the signature of an upload
+
+
+@contextlib.contextmanager
+def quiet(endpoint: str) -> Iterator[None]:
+    """No progress bars and warnings of huggingface_hub, and no xet where only the public Hub is known to have it.
+
+    Its warnings name URLs, those of uploads with their signatures.
+    """
+    shown, level, xet = not are_progress_bars_disabled(), hub_logging.get_verbosity(), constants.HF_HUB_DISABLE_XET
+    if shown:
+        disable_progress_bars()
+    hub_logging.set_verbosity_error()
+    constants.HF_HUB_DISABLE_XET = xet or endpoint != HF
+    try:
+        yield
+    finally:
+        constants.HF_HUB_DISABLE_XET = xet
+        hub_logging.set_verbosity(level)
+        if shown:
+            enable_progress_bars()
+
+
+def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | None:
+    """The error in our words; None for one that is no remote's."""
+    cause = _cause(error)
+    if isinstance(cause, HfHubHTTPError):
+        return _answered(cause, place, endpoint)
+    if isinstance(cause, OfflineModeIsEnabled):
+        return RemoteError(f"{place} cannot be reached: HF_HUB_OFFLINE is set; unset it")
+    if isinstance(cause, LocalTokenNotFoundError):
+        return AuthError(f"{place}: nobody is logged in at {host(endpoint)}; {LOGIN}")
+    if isinstance(cause, HFValidationError):
+        return NotFoundError(f"{place} is no name that a Hub may have; expected USER/NAME of letters, digits, - _ .")
+    if isinstance(cause, httpx.ConnectError):
+        return TransientError(f"{place} cannot be reached: nothing answers at {host(endpoint)}; is HF_ENDPOINT right?")
+    if isinstance(cause, httpx.TimeoutException):
+        return TransientError(f"{place}: {host(endpoint)} gave no answer in time")
+    if isinstance(cause, httpx.TransportError):
+        return TransientError(f"{place}: the connection to {host(endpoint)} was cut")
+    if isinstance(cause, json.JSONDecodeError):
+        return TransientError(f"{place}: {host(endpoint)} answered something that is not JSON; is it a Hub?")
+    return None
+
+
+def host(endpoint: str) -> str:
+    """The endpoint without the name and password that it may hold."""
+    return httpx.URL(endpoint).copy_with(userinfo=b"").__str__().rstrip("/")
+
+
+def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
+    status, said = error.response.status_code, _said(error.response)
+    if status in _TEMPORARY:
+        after = retry_after(error.response.headers.get("Retry-After"))
+        return TransientError(f"{place}: {host(endpoint)} answered {status}{said}", after)
+    if isinstance(error, RevisionNotFoundError):
+        return NotFoundError(f"{place}: no such revision{said}")
+    if isinstance(error, EntryNotFoundError):
+        return NotFoundError(f"{place}: no such file{said}")
+    if isinstance(error, RepositoryNotFoundError):
+        return NotFoundError(f"{place} is not at {host(endpoint)}, or is private: check the name, or {LOGIN}")
+    if status == 401:
+        wrong = f"the token is refused{said}" if get_token() else "nobody is logged in"
+        return AuthError(f"{place}: {wrong}; {LOGIN}, with a token of {host(endpoint)}/settings/tokens")
+    if status == 403:
+        text = f"{place}: this token may not do that{said}"
+        return AuthError(f"{text}; take one with the right to write there, of {host(endpoint)}/settings/tokens")
+    if status in (409, 412):
+        return ConflictError(place)
+    return RemoteError(f"{place}: {host(endpoint)} answered {status}{said}")
+
+
+def _said(response: httpx.Response) -> str:
+    """The server's own words, one line of them, without the token."""
+    text = " ".join(response.headers.get("X-Error-Message", "").split())[:200]
+    return f" ({redact(text, get_token() or '')})" if text else ""
+
+
+def _cause(error: BaseException) -> BaseException:
+    """What huggingface_hub wrapped in a RuntimeError of its upload threads."""
+    while isinstance(error, RuntimeError) and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def _limit(request: httpx.Request) -> None:
+    given = request.extensions.get("timeout") or {}
+    if all(value is None for value in given.values()):
+        limits = {"connect": CONNECT, "read": PATIENCE, "write": PATIENCE, "pool": PATIENCE}
+        request.extensions = {**request.extensions, "timeout": limits}

@@ -1,0 +1,118 @@
+"""One file on its way here: kept between tries, counted, hashed, and refused where it is not what was promised."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO, Protocol, cast
+
+from manip_il.data.remote.errors import HashError, NoSpaceError, RemoteError, TransientError
+from manip_il.data.remote.manifest import FileEntry
+from manip_il.data.remote.remote import Advance
+
+_CHUNK = 2**20  # [bytes]
+
+Fetch = Callable[[BinaryIO, int], None]  # writes the bytes from an offset on
+
+
+class Hasher(Protocol):
+    """What `hashlib` makes."""
+
+    def update(self, data: bytes | memoryview, /) -> None:
+        """Feed bytes."""
+        ...
+
+    def hexdigest(self) -> str:
+        """The hash of all that was fed."""
+        ...
+
+
+class Landing:
+    """Brings the bytes of `entry` into the file `part`, a try at a time."""
+
+    def __init__(self, entry: FileEntry, part: Path, advance: Advance):
+        self._entry, self._part, self._advance = entry, part, advance
+        self._counted = 0
+        self._mismatches = 0
+
+    def once(self, fetch: Fetch) -> None:
+        """Go on where the last try stopped. Raises `TransientError` where another try may help."""
+        entry, part = self._entry, self._part
+        with part.open("ab") as file:
+            digest = hasher(entry)
+            offset = self._hash_what_is_there(digest)
+            self._count(offset)
+            incoming = _Incoming(file, digest, entry, offset, self._count)
+            if offset < entry.size:
+                fetch(cast("BinaryIO", incoming), offset)
+        if incoming.position != entry.size:
+            raise TransientError(f"{entry.path} ended after {incoming.position:,} of {entry.size:,} bytes")
+        if digest.hexdigest() != (entry.sha256 or entry.git_sha1):
+            part.unlink()
+            self._mismatches += 1
+            text = f"{entry.path} is not what the manifest says: its hash differs"
+            if self._mismatches > 1:
+                raise HashError(f"{text}, twice; nothing of it was kept: ask who pushed it to push again")
+            raise TransientError(text)
+
+    def _hash_what_is_there(self, digest: Hasher) -> int:
+        size = self._part.stat().st_size
+        if size > self._entry.size:
+            self._part.write_bytes(b"")
+            return 0
+        with self._part.open("rb") as file:
+            while chunk := file.read(_CHUNK):
+                digest.update(chunk)
+        return size
+
+    def _count(self, position: int) -> None:
+        if position > self._counted:
+            self._advance(position - self._counted)
+            self._counted = position
+
+
+def hasher(entry: FileEntry) -> Hasher:
+    """What the bytes of an entry are fed to."""
+    if entry.sha256:
+        return hashlib.sha256()
+    return hashlib.sha1(b"blob %d\0" % entry.size, usedforsecurity=False)
+
+
+def is_whole(entry: FileEntry, path: Path) -> bool:
+    """Whether a plain file holds the bytes of an entry."""
+    if path.is_symlink() or not path.is_file() or path.stat().st_size != entry.size:
+        return False
+    digest = hasher(entry)
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest() == (entry.sha256 or entry.git_sha1)
+
+
+class _Incoming(io.RawIOBase):
+    def __init__(self, file: BinaryIO, digest: Hasher, entry: FileEntry, offset: int, count: Advance):
+        super().__init__()
+        self._file, self._digest, self._entry, self._count = file, digest, entry, count
+        self.position = offset
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object, /) -> int:
+        chunk = memoryview(cast("bytes", data))
+        if self.position + len(chunk) > self._entry.size:
+            text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
+            raise HashError(f"{text}; nothing of it was kept: ask who pushed it to push again")
+        try:
+            self._file.write(chunk)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise NoSpaceError("the disk is full; make room and pull again: what has come is kept") from None
+            raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; look at that disk") from None
+        self._digest.update(chunk)
+        self.position += len(chunk)
+        self._count(self.position)
+        return len(chunk)

@@ -1,0 +1,112 @@
+"""A folder to a remote: checked, listed, uploaded, and only then seen."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+from manip_il.data.doctor.examine import examine_folder, has_errors
+from manip_il.data.doctor.finding import NotWhole, Severity
+from manip_il.data.remote.manifest import Kind, Manifest
+from manip_il.data.remote.remote import Advance, Published, Remote, Snapshot
+from manip_il.data.remote.scan import Scanned, kind_of, scan
+from manip_il.data.remote.url import RemoteUrl
+from manip_il.errors import UsageError
+
+Progress = Callable[[int, str], AbstractContextManager[Advance]]  # total [bytes] and what it is of
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a push will do. upload: files of which the remote lacks the bytes; size: of those [bytes]."""
+
+    manifest: Manifest
+    before: Snapshot | None
+    upload: tuple[str, ...]
+    size: int
+    remove: tuple[str, ...]
+
+
+def push(
+    source: Path, url: RemoteUrl, remote: Remote, progress: Progress, *, journals: bool = False, dry_run: bool = False
+) -> tuple[Plan, Published | None]:
+    """What was to be done, and what was; nothing with `dry_run`.
+
+    A dataset that the doctor finds errors in is refused (`NotWhole`), and so is one kind over the other (`UsageError`).
+    """
+    kind = check_source(source, url)
+    with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
+        extra = _cards(source, kind, url, Path(folder))
+        scanned = scan(source, kind, journals=journals, extra=extra)
+        before = remote.read()
+        plan = make_plan(scanned, before, remote.describe())
+        if dry_run:
+            return plan, None
+        with progress(plan.size, "push") as advance:
+            return plan, remote.publish(scanned.local, scanned.manifest, before, advance)
+
+
+def check_source(source: Path, url: RemoteUrl) -> Kind:
+    """What `source` holds, where it may be pushed to `url`."""
+    kind = kind_of(source)
+    if url.kind not in (None, kind):
+        place = url.place
+        right = f"hf://datasets/{place}" if kind == "dataset" else f"hf://{place}"
+        raise UsageError(f"{source} is a {kind}, {url} is the place of a {url.kind}; push it to {right}")
+    if kind == "dataset":
+        findings = examine_folder(source)
+        if has_errors(findings):
+            first = next(finding for finding in findings if finding.severity is Severity.ERROR)
+            text = f"{source} is not whole and was not pushed: {' '.join(str(first).split())}"
+            raise NotWhole(f"{text}; see all with manip-il doctor {source}, and repair it with --repair=true")
+    return kind
+
+
+def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
+    """The difference between a folder and what is there. Raises `UsageError` where another kind is there."""
+    manifest = scanned.manifest
+    if before and before.manifest.kind != manifest.kind:
+        there, here = before.manifest.kind, manifest.kind
+        raise UsageError(f"{place} holds a {there}; a {here} cannot take its place: choose another name")
+    old = before.manifest.by_path if before else {}
+    known = before.manifest.keys if before else frozenset[str]()
+    new = [entry for entry in manifest.files if not _is_known(entry.path, entry.key, known, before, scanned)]
+    gone = tuple(path for path in old if path not in manifest.by_path)
+    return Plan(manifest, before, tuple(entry.path for entry in new), sum(entry.size for entry in new), gone)
+
+
+def _is_known(path: str, key: str, known: frozenset[str], before: Snapshot | None, scanned: Scanned) -> bool:
+    """Whether the remote has these bytes; where it says only git's hash of a file, the same is computed here."""
+    if key in known:
+        return True
+    there = before.manifest.by_path.get(path) if before else None
+    if there is None or not there.git_sha1 or there.size != scanned.manifest.by_path[path].size:
+        return False
+    return there.git_sha1 == git_sha1(scanned.local[path])
+
+
+def git_sha1(path: Path) -> str:
+    """Git's blob id of a file (`git hash-object`)."""
+    import hashlib
+
+    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+    with path.open("rb") as file:
+        while chunk := file.read(2**20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _cards(source: Path, kind: Kind, url: RemoteUrl, folder: Path) -> dict[str, Path]:
+    """Files that the Hub shows a visitor; other stores show none, and keep the folder byte for byte."""
+    if url.scheme != "hf":
+        return {}
+    from manip_il.data.cards import card_for
+
+    paths: dict[str, Path] = {}
+    for number, (name, data) in enumerate(card_for(source, kind, str(url)).items()):
+        paths[name] = folder / str(number)
+        paths[name].write_bytes(data)
+    return paths

@@ -1,0 +1,108 @@
+"""The manifest of a local folder: what a push takes along."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from manip_il.data.lerobot_layout import INFO
+from manip_il.data.remote.errors import ManifestError
+from manip_il.data.remote.manifest import FileEntry, Kind, Manifest
+from manip_il.data.remote.paths import check_path
+from manip_il.data.remote.remote import MANIFEST_FILE
+from manip_il.errors import UsageError
+
+JOURNALS = "journals"  # folder of a pushed dataset's journals; in a run every folder of that name holds some
+LAST = "last"  # the link in `checkpoints` to the newest one: a pull makes it again
+CHECKPOINTS = "checkpoints"
+HASHERS = 4  # threads: hashlib lets go of Python's lock
+_LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
+_POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS)
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """A manifest, and where its files lie."""
+
+    manifest: Manifest
+    local: Mapping[str, Path]
+
+
+def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None) -> Scanned:
+    """Every file of a dataset or of a run, hashed.
+
+    journals: a dataset's folder `<root>.journals` goes along as `journals/`, and those inside a run. extra: files that
+    take the place of the folder's own, by path. Left out is what begins with a dot and what a killed writer left.
+    Raises `ManifestError` for links, and for what `FileEntry` refuses.
+    """
+    local = {path.relative_to(root).as_posix(): path for path in _files(root, journals)}
+    if journals and kind == "dataset":
+        beside = root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
+        if beside.is_dir():
+            local |= {f"{JOURNALS}/{path.relative_to(beside).as_posix()}": path for path in _files(beside, journals)}
+    local |= extra or {}
+    if not local:
+        raise ManifestError(f"{root} holds no file to push; expected a dataset or a run")
+    for path in local:
+        check_path(path)
+    with ThreadPoolExecutor(HASHERS) as pool:
+        entries = tuple(pool.map(lambda item: entry_of(*item), sorted(local.items())))
+    return Scanned(Manifest(kind, entries), local)
+
+
+def kind_of(root: Path) -> Kind:
+    """What a folder holds; `UsageError` where it is neither."""
+    if not root.is_dir():
+        raise UsageError(f"{root} is no folder; expected the folder of a dataset or of a run")
+    if (root / INFO).is_file():
+        return "dataset"
+    if any((root / name).exists() for name in _POLICY_FILES):
+        return "policy"
+    text = f"{root} is neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_POLICY_FILES)})"
+    raise UsageError(f"{text}; name the folder that holds one")
+
+
+def entry_of(name: str, path: Path) -> FileEntry:
+    """The entry of a local file."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return FileEntry(name, file.tell(), digest)
+
+
+def is_left_out(name: str) -> bool:
+    """Whether no push takes a file or folder of this name along."""
+    return bool(_LEFT_OUT.fullmatch(name))
+
+
+def _files(folder: Path, journals: bool) -> Iterator[Path]:
+    with os.scandir(folder) as found:
+        entries = sorted(found, key=lambda entry: entry.name)
+    for entry in entries:
+        path = Path(entry.path)
+        if is_left_out(entry.name) or (entry.name == JOURNALS and not journals and entry.is_dir()):
+            continue
+        if entry.is_symlink():
+            if not _is_last(path):
+                raise ManifestError(f"{path} is a link; nothing is pushed through links: put the file itself there")
+        elif entry.is_dir():
+            yield from _files(path, journals)
+        elif entry.is_file():
+            yield path
+        else:
+            raise ManifestError(f"{path} is no plain file; move it out of the folder")
+
+
+def _is_last(path: Path) -> bool:
+    """Whether it is LeRobot's `checkpoints/last`, a link to the newest checkpoint beside it."""
+    return path.name == LAST and path.parent.name == CHECKPOINTS and os.readlink(path) == newest(path.parent)
+
+
+def newest(checkpoints: Path) -> str | None:
+    """Name of the checkpoint with the highest step."""
+    steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
+    return max(steps, key=int, default=None)

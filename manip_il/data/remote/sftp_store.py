@@ -1,0 +1,292 @@
+"""A folder of another machine that runs sshd: `sftp://me@machine/srv/demos`. Keys and known hosts are those of ssh."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import posixpath
+import secrets
+import shlex
+import stat
+import time
+from collections.abc import Generator, Iterable, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from manip_il.data.remote.blobs import OBJECTS, STALE, Stored
+from manip_il.data.remote.errors import NoSpaceError, NotFoundError, RemoteError, TransientError
+from manip_il.data.remote.manifest import LONGEST_TEXT
+from manip_il.data.remote.object_store import ObjectRemote, in_threads
+from manip_il.data.remote.remote import MANIFEST_FILE, Advance
+from manip_il.data.remote.sftp_connection import Connection, Sftp
+from manip_il.data.remote.url import RemoteUrl
+from manip_il.errors import UsageError
+
+CHUNK = 2**18  # of what is sent or read at a time [bytes]
+LOCK = ".manip_il_push.lock"
+LOCK_STALE = 60.0  # a lock that nobody has touched for so long was left by a killed push [s]
+LOCK_WAIT = 180.0  # [s]
+HASH_TIME = 600.0  # the other machine may take so long over sha256sum [s]
+
+
+def open_sftp(url: RemoteUrl) -> ObjectRemote:
+    """The remote of an `sftp://` URL; nothing is connected yet."""
+    return ObjectRemote(SftpBlobs(url))
+
+
+class SftpBlobs:
+    """`Blobs` on another machine. Two pushes are kept apart by a lock file, made where there is none."""
+
+    threads = 4
+
+    def __init__(self, url: RemoteUrl):
+        self._name = str(url)
+        self._root = url.place[3:] if url.place.startswith("/~/") else url.place
+        self._connection = Connection(url)
+        self.warnings: tuple[str, ...] = ()
+        self._folders: set[str] = set()
+        self._left: list[str] = []
+
+    def describe(self) -> str:
+        """The URL, without the password."""
+        return self._name
+
+    def manifest(self) -> tuple[bytes, str] | None:
+        """Content and its hash."""
+        with self._sftp("read") as sftp:
+            try:
+                with sftp.open(self._at(MANIFEST_FILE), "rb") as file:
+                    file.prefetch(min(file.stat().st_size or 0, LONGEST_TEXT + 1))
+                    data = file.read(LONGEST_TEXT + 1)
+            except FileNotFoundError:
+                return None
+        return data, hashlib.sha256(data).hexdigest()
+
+    def prepare(self, size: int) -> None:
+        """Make the folder; refuse one that holds something else."""
+        with self._sftp("write to") as sftp:
+            names: set[str] = set()
+            with contextlib.suppress(FileNotFoundError):
+                if not stat.S_ISDIR(sftp.stat(self._root).st_mode or 0):
+                    raise UsageError(f"{self._name} is a file; expected a folder, or a name that is free")
+                names = {name for name in sftp.listdir(self._root) if not name.startswith(".")}
+            if names and not names & {MANIFEST_FILE, OBJECTS}:
+                raise UsageError(f"{self._name} holds other files; name an empty or a new folder to push to")
+            folder = "/" if self._root.startswith("/") else ""
+            for part in f"{self._root}/{OBJECTS}".strip("/").split("/"):
+                folder = posixpath.join(folder, part)
+                _make_folder(sftp, folder)
+
+    def swap(self, data: bytes, before: str | None, needed: Mapping[str, int]) -> str | None:
+        """Replace the manifest where it still has the token `before`; None where it has not."""
+        partial = self._at(f".{secrets.token_hex(8)}.partial")
+        with self._sftp("write to") as sftp, self._locked(sftp) as mine:
+            found = self.manifest()
+            if (found[1] if found else None) != before:
+                return None
+            self._send(sftp, partial, data)
+            if not mine():
+                sftp.remove(partial)
+                raise TransientError(f"another push has taken {self._name} for left alone")
+            sftp.posix_rename(partial, self._at(MANIFEST_FILE))
+        return hashlib.sha256(data).hexdigest()
+
+    def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
+        """Read an object from `offset` on, many requests under way at a time."""
+        with self._sftp("read") as sftp:
+            try:
+                file = sftp.open(self._path(key), "rb")
+            except FileNotFoundError:
+                raise NotFoundError(f"{self._name} has no object {key[:12]}") from None
+            with file:
+                size = file.stat().st_size or 0
+                file.seek(offset)
+                file.prefetch(size)
+                while chunk := file.read(CHUNK):
+                    target.write(chunk)
+
+    def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
+        """Send under another name and rename; what has arrived is looked at later, for many objects at once."""
+        partial = self._at(f"{OBJECTS}/{key[:2]}/.{key[:12]}.{secrets.token_hex(6)}.partial")
+        sent, digest = 0, hashlib.sha256()
+        with self._sftp("write to") as sftp, source.open("rb") as file:
+            if key[:2] not in self._folders:
+                _make_folder(sftp, self._at(f"{OBJECTS}/{key[:2]}"))
+                self._folders.add(key[:2])
+            with sftp.open(partial, "wbx") as out:
+                out.set_pipelined(True)
+                while chunk := file.read(CHUNK):
+                    out.write(chunk)
+                    digest.update(chunk)
+                    sent += len(chunk)
+                    advance(len(chunk))
+            if digest.hexdigest() != key or sent != size:
+                sftp.remove(partial)
+                raise RemoteError(f"{source} changed while it was pushed; push again when nobody writes to it")
+            sftp.posix_rename(partial, self._path(key))
+        return False
+
+    def find(self, keys: Iterable[str]) -> dict[str, Stored]:
+        """Those of `keys` that are there."""
+        found: dict[str, Stored] = {}
+        with self._sftp("read") as sftp:
+            for key in keys:
+                with contextlib.suppress(FileNotFoundError):
+                    found[key] = _stored(sftp.lstat(self._path(key)))
+        return found
+
+    def list(self) -> dict[str, Stored]:
+        """Every object."""
+        found: dict[str, Stored] = {}
+        self._left = []
+        with self._sftp("list") as sftp:
+            for folder in sftp.listdir(self._at(OBJECTS)):
+                for item in sftp.listdir_attr(self._at(f"{OBJECTS}/{folder}")):
+                    one = _stored(item)
+                    if not item.filename.startswith("."):
+                        found[item.filename] = one
+                    elif one.age > STALE:
+                        self._left.append(self._at(f"{OBJECTS}/{folder}/{item.filename}"))
+        return found
+
+    def wrong(self, sizes: Mapping[str, int]) -> set[str]:
+        """Those that are not what their name says: hashed over there where that can be had, else read back."""
+        right = self._hashed_there(sizes)
+
+        def one(key: str) -> bool:
+            digest = _Digest()
+            try:
+                self.fetch(key, digest, 0)  # pyright: ignore[reportArgumentType]
+            except NotFoundError:
+                return True
+            return digest.sha256.hexdigest() != key
+
+        unknown = [key for key in sizes if key not in right]
+        return {key for key, is_wrong in in_threads(self.threads, one, unknown).items() if is_wrong}
+
+    def remove(self, keys: Iterable[str], token: str) -> None:
+        """Remove objects, and what killed pushes left, unless another push has been."""
+        with self._sftp("write to") as sftp, self._locked(sftp) as mine:
+            found = self.manifest()
+            if found is None or found[1] != token:
+                return
+            for path in [*map(self._path, keys), *self._left]:
+                if not mine():
+                    return
+                with contextlib.suppress(FileNotFoundError):
+                    sftp.remove(path)
+
+    def _hashed_there(self, keys: Iterable[str]) -> set[str]:
+        """Objects of which `sha256sum`, run on the other machine, says what their name says; empty without a shell."""
+        names = b"".join(f"{key[:2]}/{key}\0".encode() for key in keys)
+        command = f"cd {shlex.quote(self._at(OBJECTS))} && xargs -0 sha256sum --"
+        output = self._connection.answer(command, names, HASH_TIME)
+        rows = [line.split() for line in output.splitlines()]
+        return {row[0] for row in rows if len(row) == 2 and row[1] == f"{row[0][:2]}/{row[0]}"}
+
+    @contextlib.contextmanager
+    def _locked(self, sftp: Sftp) -> Generator[_Held]:
+        held = _Held(sftp, self._at(LOCK))
+        last = time.monotonic() + LOCK_WAIT
+        seen, since = "", time.monotonic()
+        while not held.take():
+            now = held.seen()
+            if now != seen:
+                seen, since = now, time.monotonic()
+            if time.monotonic() - since > LOCK_STALE:
+                held.break_open(seen)
+            if time.monotonic() > last:
+                raise RemoteError(f"another push is switching {self._name} over; wait, and push again")
+            time.sleep(0.1)
+        try:
+            yield held
+        finally:
+            held.release()
+
+    def _send(self, sftp: Sftp, path: str, data: bytes) -> None:
+        with sftp.open(path, "wbx") as out:
+            out.set_pipelined(True)
+            out.write(data)
+        if sftp.stat(path).st_size != len(data):
+            raise NoSpaceError(f"{self._name} did not keep all of the manifest; make room there and push again")
+
+    @contextlib.contextmanager
+    def _sftp(self, what: str) -> Generator[Sftp]:
+        with self._connection.sftp(f"{what} {self._name}") as sftp:
+            yield sftp
+
+    def _at(self, name: str) -> str:
+        return f"{self._root}/{name}"
+
+    def _path(self, key: str) -> str:
+        return self._at(f"{OBJECTS}/{key[:2]}/{key}")
+
+
+class _Held:
+    """A lock file that is made only where there is none. Called: whether it is still ours."""
+
+    def __init__(self, sftp: Sftp, path: str):
+        self._sftp, self._path, self._word = sftp, path, secrets.token_hex(16)
+
+    def __call__(self) -> bool:
+        return self.seen() == self._word
+
+    def take(self) -> bool:
+        """Whether it could be made."""
+        try:
+            with self._sftp.open(self._path, "wx") as file:
+                file.write(self._word)
+        except PermissionError:
+            raise
+        except OSError:  # SFTP has no word for "is there already"
+            if not self.seen():
+                self._sftp.stat(posixpath.dirname(self._path))  # says so where the folder itself is the problem
+            return False
+        return True
+
+    def seen(self) -> str:
+        """The word of who holds it; empty where nobody does."""
+        try:
+            with self._sftp.open(self._path, "r") as file:
+                return file.read(64).decode(errors="replace")
+        except FileNotFoundError:
+            return ""
+
+    def break_open(self, word: str) -> None:
+        """Take a dead push's lock away. Two that try are told apart by the rename, which one alone can do."""
+        aside = f"{self._path}.{secrets.token_hex(6)}"
+        with contextlib.suppress(FileNotFoundError):
+            if self.seen() == word:
+                self._sftp.posix_rename(self._path, aside)
+                self._sftp.remove(aside)
+
+    def release(self) -> None:
+        """Remove it, if it is ours."""
+        with contextlib.suppress(OSError, EOFError):
+            if self():
+                self._sftp.remove(self._path)
+
+
+class _Digest:
+    def __init__(self) -> None:
+        self.sha256 = hashlib.sha256()
+
+    def write(self, data: bytes) -> None:
+        self.sha256.update(data)
+
+
+def _make_folder(sftp: Sftp, path: str) -> None:
+    try:
+        sftp.stat(path)
+    except FileNotFoundError:
+        try:
+            sftp.mkdir(path)
+        except OSError as error:
+            if isinstance(error, PermissionError):
+                raise
+            sftp.stat(path)  # somebody else has made it meanwhile
+
+
+def _stored(item: object) -> Stored:
+    size, modified = getattr(item, "st_size", 0), getattr(item, "st_mtime", 0)
+    return Stored(size or 0, time.time() - (modified or 0))

@@ -1,0 +1,116 @@
+"""`manip-il push` and `manip-il pull`: what they say, and their exit codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.cli.transfer import bytes_text
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("# manip-il\n")
+    (folder / "metrics.jsonl").write_bytes(b"x" * 1500)
+    return folder
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return f"file://{tmp_path}/store"
+
+
+def test_there_and_back(run: Path, url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["push", str(run), url]) == 0
+    captured = capsys.readouterr()
+    assert captured.out.splitlines() == [
+        f"{url}: 2 files, 1.51 kB, uploaded; 0 removed; 0 were there",
+        f"next: manip-il pull {url} FOLDER",
+    ]
+    assert "push [bytes]: 1511/1511 (" in captured.err
+    assert "rate" in captured.err
+    target = tmp_path / "got"
+    assert main(["pull", url, str(target), "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{target}: a policy of 2 files, 1.51 kB, all verified\n"
+    assert captured.err == ""
+    assert (target / "metrics.jsonl").read_bytes() == b"x" * 1500
+
+
+def test_again_nothing_travels(run: Path, url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["push", str(run), url]) == 0
+    capsys.readouterr()
+    assert main(["push", str(run), url]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == f"{url}: 2 files, all there already"
+
+
+def test_dry_runs_only_say(run: Path, url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["push", str(run), url, "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "upload   config.yaml (11 B)",
+        "upload   metrics.jsonl (1.5 kB)",
+        f"{url}: 2 files, 1.51 kB, to upload; 0 to remove; 0 stay; nothing was done",
+    ]
+    assert not (tmp_path / "store").exists()
+    main(["push", str(run), url])
+    capsys.readouterr()
+    assert main(["pull", url, str(tmp_path / "got"), "--dry-run=true"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith("a policy of 2 files, 1.51 kB; nothing was done")
+    assert not (tmp_path / "got").exists()
+
+
+def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(
+    run: Path, url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["push", str(run), url])
+    target = tmp_path / "got"
+    target.mkdir()
+    (target / "thesis.txt").write_text("mine")
+    assert main(["pull", url, str(target)]) == 2
+    assert "exist already; replace them by --overwrite=true" in capsys.readouterr().err
+    assert main(["pull", url, str(target), "--overwrite=true"]) == 2
+    assert "manip-il did not make" in capsys.readouterr().err
+    assert (target / "thesis.txt").read_text() == "mine"
+    (target / "config.yaml").write_text("# manip-il\n")
+    assert main(["pull", url, str(target), "--overwrite=true"]) == 0
+    assert not (target / "thesis.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["push", "RUN", "ftp://x/y"], 2, "unknown scheme 'ftp://' (did you mean 'sftp://'?)"),
+        (["push", "nowhere", "URL"], 2, "nowhere is no folder; expected the folder of a dataset or of a run"),
+        (["push", ".", "URL"], 2, "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
+        (
+            ["push", "RUN", "hf://datasets/me/x"],
+            2,
+            "hf://datasets/me/x is the place of a dataset; push it",
+        ),
+        (["push", "RUN"], 2, "REMOTE is missing"),
+        (["pull", "URL", "got"], 1, "holds nothing that can be pulled"),
+        (["pull", "URL", "got", "--revision=main"], 2, "--revision=main is of the Hub alone"),
+        (["pull", "hf://me/x@a", "got", "--revision=b"], 2, "hf://me/x@a and --revision=b differ"),
+    ],
+)
+def test_wrong_words_and_empty_places(
+    words: list[str], code: int, says: str, run: Path, url: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    names = {"RUN": str(run), "URL": url}
+    assert main([names.get(word, word) for word in words]) == code
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+
+
+def test_bytes_as_people_read_them() -> None:
+    assert [bytes_text(n) for n in (0, 999, 1000, 123_456, 999_600, 5 * 10**12)] == [
+        *("0 B", "999 B", "1 kB", "123 kB", "1 MB", "5 TB"),
+    ]

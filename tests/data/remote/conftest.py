@@ -1,0 +1,55 @@
+"""Stores on this machine: moto, sshd, folders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import boto3
+import pytest
+
+from .s3 import KEY, SECRET, Proxy, running_moto, running_proxy, variables
+from .sshd import Sshd, running_sshd
+
+
+@pytest.fixture(scope="session")
+def moto() -> Iterator[str]:
+    with running_moto() as endpoint:
+        yield endpoint
+
+
+@pytest.fixture(scope="session")
+def sshd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
+    with running_sshd(tmp_path_factory.mktemp("sshd")) as server:
+        yield server
+
+
+@pytest.fixture
+def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
+    """Name of an empty bucket; the environment says how to reach it."""
+    for name, value in variables(moto).items():
+        monkeypatch.setenv(name, value)
+    name = f"b{abs(hash(request.node.nodeid)):x}"
+    client = boto3.client("s3", endpoint_url=moto, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
+    client.create_bucket(Bucket=name)
+    return name
+
+
+@pytest.fixture
+def proxy(bucket: str, moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
+    """Between us and the bucket."""
+    with running_proxy(moto) as running:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", running.url)
+        yield running
+
+
+@pytest.fixture(params=["file", "s3", "sftp"])
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A URL where nothing is yet, on each kind of store."""
+    if request.param == "s3":
+        return f"s3://{request.getfixturevalue('bucket')}/some/demos"
+    if request.param == "file":
+        return f"file://{tmp_path}/store/demos"
+    server: Sshd = request.getfixturevalue("sshd")
+    monkeypatch.setenv("HOME", str(server.home))
+    return server.url(tmp_path / "store" / "demos")

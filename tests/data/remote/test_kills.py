@@ -1,0 +1,102 @@
+"""kill -9 at random moments, in either direction: readers see a whole version, and a second try completes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from manip_il.data.remote.pull import pull
+
+from .trees import content, impatient, make_run, unwatched
+
+KILLS = 10  # in each direction, on each of two kinds of store
+
+
+class Killer:
+    def __init__(self) -> None:
+        script = Path(__file__).with_name("killer.py")
+        self.process = subprocess.Popen(
+            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def __call__(self, do: str, url: str, folder: Path, after: float | None = None) -> dict[str, Any]:
+        command = {"do": do, "url": url, "folder": str(folder), "after": after}
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+
+@pytest.fixture
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "file":
+        return f"file://{tmp_path}/store/demos"
+    return f"s3://{request.getfixturevalue('bucket')}/demos"
+
+
+@pytest.fixture
+def killer(url: str) -> Iterator[Killer]:
+    killer = Killer()  # after the environment says where S3 is
+    yield killer
+    killer.process.stdin.close()
+    killer.process.wait(30)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("url", ["file", "s3"], indirect=True)
+def test_pushes(url: str, killer: Killer, tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / f"run{n}", n, files=8) for n in range(3)]
+    versions = [content(run) for run in runs]
+    assert killer("push", url, runs[0])["ended"] == 0
+    usual = killer("push", url, runs[1])["seconds"]
+    rng, killed, now, read = np.random.default_rng(7), 0, 1, Reader(url)
+    for number in range(5 * KILLS):
+        if killed == KILLS:
+            break
+        new = (now + 1) % 3
+        killed += killer("push", url, runs[new], float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
+        usual *= 1.0 if killed > number * 0.7 else 0.9  # it was slow when it was measured
+        assert read(tmp_path / f"seen{number}") in (versions[now], versions[new])
+        assert killer("push", url, runs[new])["ended"] == 0
+        assert read(tmp_path / f"then{number}") == versions[new]
+        now = new
+    assert killed == KILLS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("url", ["file", "s3"], indirect=True)
+def test_pulls(url: str, killer: Killer, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", 1, files=8)
+    assert killer("push", url, run)["ended"] == 0
+    usual = killer("pull", url, tmp_path / "first")["seconds"]
+    rng, killed = np.random.default_rng(8), 0
+    for number in range(5 * KILLS):
+        if killed == KILLS:
+            break
+        target = tmp_path / f"got{number}"
+        killed += killer("pull", url, target, float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
+        usual *= 1.0 if killed > number * 0.7 else 0.9  # it was slow when it was measured
+        if target.exists():
+            assert content(target) == content(run)
+        else:
+            assert killer("pull", url, target)["ended"] == 0
+        assert content(target) == content(run)
+    assert killed == KILLS
+
+
+class Reader:
+    def __init__(self, url: str):
+        self.url, self.remote = impatient(url)
+
+    def __call__(self, target: Path) -> dict[str, bytes | str]:
+        pull(self.url, self.remote, target, unwatched)
+        seen = content(target)
+        shutil.rmtree(target)
+        return seen
