@@ -102,8 +102,9 @@ def _dispatch(words: list[str]) -> None:
     else:
         name, words = _split(words)
         options = parse(load(name), words)
-        from manip_il.sim.gl import choose_backend
+        from manip_il.sim.gl import choose_backend, require_known_backend
 
+        require_known_backend()
         choose_backend()  # mujoco takes the OpenGL that is chosen when it is imported, never another
         options.run()
 

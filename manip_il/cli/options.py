@@ -196,14 +196,9 @@ def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
 
 
 def _read_yaml(path: Path, cls: type, known: Mapping[str, Option]) -> dict[str, _Given]:
-    import yaml
+    from manip_il.data.yaml_file import read_yaml
 
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; expected a YAML file of options") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    tree = read_yaml(path, "a YAML file of options")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of option names to values")
     return {name: _Given(value, f"{path}: {name}", False) for name, value in _leaves(tree or {}, known, path)}

@@ -49,16 +49,10 @@ def _read(name: str) -> Condition:
 
 def read_condition(path: Path) -> Condition:
     """A YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
-    import yaml
-
+    from manip_il.data.yaml_file import read_yaml
     from manip_il.sim.conditions import Condition
 
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; expected a YAML of ranges") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    tree = read_yaml(path, "a YAML of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
     return Condition.from_mapping(path.stem, tree or {})

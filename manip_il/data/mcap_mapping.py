@@ -33,6 +33,7 @@ import yaml
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.mcap_path import FieldPath, parse_path
 from manip_il.data.resample import Method
+from manip_il.data.yaml_file import read_yaml
 from manip_il.errors import UnknownName, UsageError
 
 TEXT = "string"  # LeRobot's dtype of text
@@ -157,12 +158,7 @@ class _Dumper(yaml.SafeDumper):
 
 def load_mapping(path: Path) -> Mapping:
     """Read a mapping file. Raises `UsageError` naming file, key, value and what was expected."""
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; expected a mapping file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    tree = read_yaml(path, "a mapping file")
     try:
         table = _table(tree, ("fps", "robot_type", "task", "features"), optional=("robot_type",))
         features = table["features"]

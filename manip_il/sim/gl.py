@@ -16,17 +16,18 @@ _SWITCHES = ("enable", "enabled", "on", "true", "1", "disable", "disabled", "off
 
 
 def choose_backend() -> str | None:
-    """Set MUJOCO_GL to `egl`, else `osmesa`, unless the user has set it; None where neither is there.
-
-    Raises `RenderError` for a value that mujoco does not know: it could not even be imported.
-    """
+    """Set MUJOCO_GL to `egl`, else `osmesa`, unless the user has set it; None where neither is there."""
     if "MUJOCO_GL" in os.environ:
-        chosen = os.environ["MUJOCO_GL"]
-        if chosen.lower().strip() not in (*_KNOWN, *_SWITCHES):
-            raise RenderError(f"MUJOCO_GL is {chosen!r}; expected egl or osmesa, or unset it")
-        return chosen
+        return os.environ["MUJOCO_GL"]
     for backend, library in _BACKENDS.items():
         if ctypes.util.find_library(library):
             os.environ["MUJOCO_GL"] = backend
             return backend
     return None
+
+
+def require_known_backend() -> None:
+    """Raise `RenderError` where MUJOCO_GL is set to what mujoco does not know: it could not even be imported."""
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if chosen.lower().strip() not in (*_KNOWN, *_SWITCHES):
+        raise RenderError(f"MUJOCO_GL is {chosen!r}; expected egl or osmesa, or unset it")

@@ -122,10 +122,8 @@ class _Process:
         if self._gl is None:
             from mujoco.gl_context import GLContext  # where there is no OpenGL, not even this can be imported
 
-            context: Any = GLContext.__new__(GLContext)
-            context._context = None  # its destructor looks for this, even where its constructor has failed
-            context.__init__(1, 1)  # its size does not matter, pictures have a buffer of their own
-            self._gl = context
+            setattr(GLContext, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
+            self._gl = GLContext(1, 1)  # its size does not matter, pictures have a buffer of their own
             self._pid = os.getpid()
             atexit.register(self.close)
         self._gl.make_current()

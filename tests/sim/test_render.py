@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from manip_il.errors import RenderError, UnknownName
 from manip_il.sim import render
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.gl import choose_backend
+from manip_il.sim.gl import choose_backend, require_known_backend
 from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.world import CAMERAS
 
@@ -266,8 +266,11 @@ def test_the_users_choice_of_backend_stands(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "off")
     assert choose_backend() == "off"
     monkeypatch.setenv("MUJOCO_GL", "eglo")
+    assert choose_backend() == "eglo"  # it is called on import, where nobody could answer an error
     with pytest.raises(RenderError, match="MUJOCO_GL is 'eglo'; expected egl or osmesa"):
-        choose_backend()
+        require_known_backend()
+    monkeypatch.setenv("MUJOCO_GL", "EGL ")
+    require_known_backend()
 
 
 @pytest.mark.parametrize(
