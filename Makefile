@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup gl browser demo test test-fast lint format docker docker-test bench lock clean
+.PHONY: help setup gl browser sshd demo test test-fast lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= python3.12
@@ -35,8 +35,11 @@ gl:  ## the system's OpenGL, where it is missing and this is root
 browser:  ## a headless Chromium for the tests of reports, where it is missing and this is root
 	@.ci/browser
 
+sshd:  ## Debian's sshd for the tests of sftp://, where it is missing and this is root
+	@.ci/sshd
+
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
-test: setup gl browser  ## every test
+test: setup gl browser sshd  ## every test
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL
