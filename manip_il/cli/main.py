@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _silence_stdout()
             return EXIT_BROKEN_PIPE
         if debug:
-            traceback.print_exc()
+            print(_clean(traceback.format_exc()), file=sys.stderr, end="")
         return _report(error, words)
     return 0
 
@@ -153,7 +153,14 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
 
 
 def _complain(text: str) -> None:
-    print(f"{PROGRAM}: {' '.join(text.split())}", file=sys.stderr, flush=True)
+    print(f"{PROGRAM}: {' '.join(_clean(text).split())}", file=sys.stderr, flush=True)
+
+
+def _clean(text: str) -> str:
+    """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library."""
+    from manip_il.data.remote.errors import redact
+
+    return redact(text)
 
 
 def _help() -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il.cli.folders import require_ours
 from manip_il.cli.groups import option, warn
 from manip_il.cli.progress import say
-from manip_il.cli.transfer import bytes_text, moved
+from manip_il.cli.transfer import bytes_text, going_on, moved
 from manip_il.errors import FolderExistsError, UsageError
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ class PullOptions:
             require_ours(self.target)
         remote = open_remote(url)
         try:
-            pulled = pull(url, remote, self.target, moved, overwrite=self.overwrite, dry_run=self.dry_run)
+            with going_on():
+                pulled = pull(url, remote, self.target, moved, overwrite=self.overwrite, dry_run=self.dry_run)
         except FolderExistsError:
             text = (
                 f"{self.target} or its journals exist already; replace them by --overwrite=true, or name a new folder"

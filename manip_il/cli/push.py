@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.groups import option, warn
 from manip_il.cli.progress import say
-from manip_il.cli.transfer import bytes_text, moved
+from manip_il.cli.transfer import bytes_text, going_on, moved
 
 if TYPE_CHECKING:
     from manip_il.data.remote.push import Plan
@@ -44,7 +44,8 @@ class PushOptions:
         url = RemoteUrl.parse(self.remote)
         remote = open_remote(url, private=self.private)
         try:
-            plan, published = push(self.source, url, remote, moved, journals=self.journals, dry_run=self.dry_run)
+            with going_on():
+                plan, published = push(self.source, url, remote, moved, journals=self.journals, dry_run=self.dry_run)
         finally:
             warn(remote.warnings)
         if published is None:

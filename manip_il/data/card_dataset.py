@@ -24,6 +24,7 @@ from manip_il.data.lerobot_read import (
 from manip_il.errors import UnknownName
 
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
+_UNITS = ((3600, "hours"), (60, "minutes"), (1, "seconds"))
 _SOURCES = 20  # of a merged dataset: as many are named
 _DRIVERS = {"expert": "the expert", "noisy_expert": "the expert with noise", "policy": "the learner"}
 
@@ -41,7 +42,7 @@ def dataset_card(root: Path, url: str, picture: str | None) -> str:
         f"## Use\n\n```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
         f'dataset = LeRobotDataset("{place}")\n```\n\n'
         f"```sh\nmanip-il pull hf://datasets/{place} datasets/{place.rpartition('/')[2]}\n"
-        f"lerobot-train --dataset.repo_id={place} --policy.type=act\n```\n\n"
+        f"lerobot-train --dataset.repo_id={place} \\\n  --policy.type=act --policy.push_to_hub=false\n```\n\n"
         f"## How it was made\n\n{made}\n\n{_command(root)}{fingerprint_rows(read_fingerprint(root))}"
     )
 
@@ -59,8 +60,9 @@ def _metadata(info: DatasetInfo) -> DatasetCardData:
 
 
 def _rows(root: Path, info: DatasetInfo) -> Iterator[tuple[str, object]]:
-    minutes = info.frames / info.fps / 60
-    time = f"{minutes / 60:.1f} hours" if minutes >= 60 else f"{minutes:.1f} minutes"
+    seconds = info.frames / info.fps
+    unit, name = next((unit, name) for unit, name in _UNITS if seconds >= unit or unit == 1)
+    time = f"{seconds / unit:.3g} {name}"
     yield "robot", f"`{info.robot}`"
     yield "task", f"`{info.task}`: {info.instruction}"
     cameras = [key.removeprefix(s.IMAGES) for key in camera_keys(root)]

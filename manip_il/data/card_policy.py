@@ -14,19 +14,24 @@ from huggingface_hub import EvalResult, ModelCardData
 from manip_il.data.card_text import LICENSE, REPOSITORY, command, fingerprint_rows, repository, table
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_read import dataset_info
+from manip_il.data.remote.front import CONFIG, policy_folder
+from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.errors import ManipError
 
-_INSIDE = ("", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
+_PLACES = tuple(
+    f"{folder}{CONFIG}" for folder in ("", "pretrained_model/", "*/pretrained_model/", "*/*/pretrained_model/")
+)
 _LEVELS = re.compile(r"pretrained_model|policy|best|last|checkpoints|\d+")  # folders of one run, above its weights
+_TAUGHT = "Taught by an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
+_PLUGIN = "manip_il.lerobot_plugin"  # our robots and policies in LeRobot's own commands
 _DATASET = "dataset"  # of a DAgger run: what its policy was fitted to
 _REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 
 @dataclass(frozen=True)
 class Policy:
-    """What a folder says of its policy; `{}` for what is not there. path: of the weights, in the pushed folder."""
+    """What a folder says of its policy; `{}` for what is not there."""
 
-    path: str
     config: Mapping[str, Any]
     meta: Mapping[str, Any]
     training: Mapping[str, Any]
@@ -57,27 +62,20 @@ def policy_card(root: Path, url: str) -> str:
     steps = f"```sh\n{made}\n```\n\n" if made else ""
     return (
         f"---\n{_metadata(policy, title).to_yaml()}\n---\n\n# {title}\n\n"
-        "Taught by an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
-        f"{table(_rows(root, policy))}\n\n## Use\n\n{_use(policy, place)}"
+        f"{_TAUGHT if policy.meta else ''}{table(_rows(root, policy))}\n\n## Use\n\n{_use(policy, place)}"
         f"## How it was made\n\n{steps}{fingerprint_rows(policy.meta.get('fingerprint') or {})}"
     )
 
 
 def read_policy(root: Path) -> Policy:
     """The policy in a folder, or in the run that the folder is. Raises `ManipError` where there is none."""
-    for inside in _INSIDE:
-        folder = root / inside
-        if (folder / "config.json").is_file():
-            evaluation, chosen_by = _evaluation(root, folder)
-            config, meta, training = (_read(folder / f"{name}.json") for name in ("config", "manip_il", "train_config"))
-            return Policy(_real(root, folder), config, meta, training, evaluation, chosen_by)
-    raise ManipError(f"no policy in {root}; expected config.json there, or in one of {', '.join(_INSIDE[1:])}")
-
-
-def _real(root: Path, folder: Path) -> str:
-    """As it is found in the pushed folder, where no link is."""
-    path = folder.resolve().relative_to(root.resolve()).as_posix()
-    return "" if path == "." else path
+    inside = policy_folder(path.relative_to(root).as_posix() for place in _PLACES for path in root.glob(place))
+    if inside is None:
+        raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
+    folder = root / inside
+    evaluation, chosen_by = _evaluation(root, folder)
+    config, meta, training = (_read(folder / f"{name}.json") for name in ("config", "manip_il", "train_config"))
+    return Policy(config, meta, training, evaluation, chosen_by)
 
 
 def _metadata(policy: Policy, title: str) -> ModelCardData:
@@ -128,12 +126,12 @@ def _rows(root: Path, policy: Policy) -> Iterator[tuple[str, object]]:
 
 def _fit(policy: Policy) -> Iterator[tuple[str, object]]:
     options = {**(policy.meta.get("options") or {}), **policy.training}
-    words = [f"{name} {options[key]}" for key, name in _FIT.items() if options.get(key) is not None]
+    words = [text.format(options[key]) for key, text in _FIT.items() if options.get(key) is not None]
     if words:
         yield "fit", ", ".join(words)
 
 
-_FIT = {"steps": "steps", "batch_size": "batch size", "lr": "learning rate", "seed": "seed"}
+_FIT = {"steps": "{} steps", "batch_size": "batches of {}", "lr": "learning rate {}", "seed": "seed {}"}
 
 
 def _success(policy: Policy) -> str:
@@ -148,11 +146,29 @@ def _success(policy: Policy) -> str:
 
 
 def _use(policy: Policy, place: str) -> str:
-    robot, task = policy.robot_task
-    options = f" --robot.type={robot} --task.type={task} --eval.n_episodes=200" if robot and task else ""
+    named = [
+        (key, policy.named(key)) for key in ("robot", "task") if not policy.meta.get(key)
+    ]  # else it says so itself
+    options = "".join(f" --{key}.type={name}" for key, name in named if name) + " --eval.n_episodes=200"
     folder = place.rpartition("/")[2] if place != REPOSITORY else "policy"
-    lerobot = f"With LeRobot: `--policy.path={place}` in its own commands.\n\n" if policy.path == "" else ""
-    return _USE.format(place=place, folder=folder, options=options) + lerobot
+    return _USE.format(place=place, folder=folder, options=options, environment=_environment(policy))
+
+
+def _environment(policy: Policy) -> str:
+    """The options by which LeRobot's evaluator finds our robots; a word where the policy is of another robot."""
+    if not policy.meta or not all(policy.robot_task):
+        return "--env.type=..."
+    task = "".join(word.capitalize() for word in "_".join(policy.robot_task).split("_"))
+    words = [f"--env.discover_packages_path={_PLUGIN}", "--env.type=manip_il", f"--env.task={task}-v0"]
+    if policy.meta.get("cameras"):
+        height, width = policy.meta.get("image_size", (128, 128))
+        both = ENVIRONMENT_STATE in (policy.config.get("input_features") or {})
+        words += [
+            f"--env.observation={'both' if both else 'images'}",
+            f"--env.cameras={','.join(policy.meta['cameras'])}",
+        ]
+        words += [f"--env.observation_height={height}", f"--env.observation_width={width}"]
+    return " \\\n  ".join([*words, "--eval.n_episodes=50"])
 
 
 _USE = """```sh
@@ -160,13 +176,21 @@ manip-il pull hf://{place} runs/{folder}
 manip-il eval --policy.path=runs/{folder}{options}
 ```
 
-In Docker, with no network and no rights:
+With LeRobot, straight from here:
+
+```sh
+lerobot-eval --policy.path={place} \\
+  {environment}
+```
+
+In Docker, with no network and no rights, after the pull:
 
 ```sh
 mkdir -p out
 docker run --rm --network=none --read-only --tmpfs /tmp --user "$(id -u):$(id -g)" \\
   -v ./runs/{folder}:/policy:ro -v ./out:/out \\
-  manip-il eval --policy.path=/policy{options} --output_dir=/out/eval
+  manip-il eval --policy.path=/policy{options} \\
+  --output_dir=/out/eval
 ```
 
 """

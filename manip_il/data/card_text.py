@@ -17,7 +17,10 @@ LICENSE = "apache-2.0"
 REPOSITORY = "USER/NAME"  # where the card is not for a Hub
 _COMMANDS = {"RecordOptions": "record", "TrainOptions": "train", "DaggerOptions": "dagger"}
 _HEADER = re.compile(r"# manip-il \S+: resolved options \((\w+)\)")
-_PLACES = ("root", "output_dir", "workers", "engine", "resume", "overwrite", "config_path", "device", "repo_id")
+_PLACES = (
+    *("root", "output_dir", "repo_id", "config_path", "resume", "overwrite", "engine", "device", "workers", "threads"),
+    *("num_workers", "image_cache_gb", "log_freq", "save_freq", "tensorboard"),
+)
 _SECRET = re.compile(r"token|secret|password|passwd|credential|api_?key", re.IGNORECASE)
 _LARGEST_CONFIG = 100_000  # [bytes]
 

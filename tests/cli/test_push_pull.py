@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli import push as push_command
 from manip_il.cli.main import main
 from manip_il.cli.transfer import bytes_text
+
+from ..data.remote.hub_use import DATASET, SAMPLE, a_hub
 
 
 @pytest.fixture
@@ -108,6 +111,77 @@ def test_wrong_words_and_empty_places(
     error = capsys.readouterr().err
     assert says in error
     assert error.count("\n") == 1
+
+
+def test_a_hub_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def said(*words: object) -> list[str]:
+        assert main([str(word) for word in words]) == 0
+        return capsys.readouterr().out.splitlines()
+
+    with a_hub(tmp_path / "hub") as hub:
+        assert said("push", SAMPLE, DATASET, "--dry-run")[-1] == (
+            f"{DATASET}: 8 files, 572 kB, to upload; 0 to remove; 0 stay; nothing was done"
+        )
+        assert not hub.repos
+        assert said("push", SAMPLE, DATASET, "--private") == [
+            f"{DATASET}: 8 files, 572 kB, uploaded; 0 removed; 0 were there",
+            f"next: manip-il pull {DATASET} FOLDER",
+        ]
+        assert hub.repo("datasets/user/demos").private
+        assert said("push", SAMPLE, f"{DATASET}@trial")[0] == f"{DATASET}@trial: 8 files, all there already"
+        target = tmp_path / "got"
+        assert said("pull", DATASET, target, "--revision=trial") == [
+            f"{target}: a dataset of 8 files, 572 kB, all verified",
+            f"next: manip-il doctor {target}",
+        ]
+        assert main(["pull", DATASET, str(tmp_path / "more"), "--revision=v9"]) == 1
+        error = capsys.readouterr().err
+        assert (
+            "(no revision v9; there are: main, trial, v3.0) holds nothing that can be pulled: check the name" in error
+        )
+        assert error.count("\n") == 1
+
+
+def test_no_password_and_no_token_is_said_again(url: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (
+        ["push", str(run), url, "sftp://me:hunt@er2@host/x"],
+        ["push", str(run), url, "--sftp://me:hunter2@host/x"],
+        ["pull", url, "got", "hf_HunterTwoHunterTwo"],
+        ["hunter2://me:hunter2@host"],
+        ["record", "--seed=sftp://me:hunter2@host/x", "--debug"],
+        ["pull", "sftp://me:hunter2@", "got", "--debug"],
+    ):
+        assert main(words) == 2
+        captured = capsys.readouterr()
+        for secret in (":hunt", "er2@", "HunterTwo"):
+            assert secret not in captured.out + captured.err
+
+
+def test_a_traceback_of_any_error_is_cleaned(
+    run: Path, url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(words: object) -> None:
+        raise RuntimeError(
+            "PUT https://store/x?X-Amz-Signature=0123456789abcdef with Authorization: Bearer hf_HunterTwo"
+        )
+
+    monkeypatch.setattr(push_command.PushOptions, "run", fail)
+    assert main(["push", str(run), url, "--debug"]) == 1
+    error = capsys.readouterr().err
+    assert "RuntimeError: PUT https://store/x?X-Amz-Signature=[hidden]" in error
+    assert "0123456789abcdef" not in error
+    assert "HunterTwo" not in error
+
+
+def test_ctrl_c_says_how_to_go_on(
+    run: Path, url: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*words: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("manip_il.data.remote.push.push", interrupted)
+    assert main(["push", str(run), url]) == 130
+    assert "kept: what has come so far; go on with: the same command" in capsys.readouterr().err
 
 
 def test_bytes_as_people_read_them() -> None:

@@ -17,6 +17,7 @@ from manip_il.data.card_strip import read_paths
 from manip_il.data.cards import CARD, STRIP, card_for
 from manip_il.data.lerobot_io import read_spec
 from manip_il.errors import ManipError
+from manip_il.learn.checkpoint import CheckpointMeta
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -106,7 +107,19 @@ def test_a_policy_that_nobody_evaluated_says_so(run: Path):
     text = card_for(folder, "policy", "hf://user/act")[CARD].decode()
     assert "not measured" in text
     assert "model-index" not in ModelCard(text).data.to_dict()
-    assert "`--policy.path=user/act`" in text
+    assert "lerobot-eval --policy.path=user/act" in text
+    assert "no human" not in text  # another program's: nobody knows who demonstrated
+
+
+def test_a_dagger_runs_card_is_of_its_best_policy(tmp_path: Path):
+    spec, run = read_spec(SAMPLE), tmp_path / "run"
+    meta = CheckpointMeta("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
+    write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
+    write_checkpoint(run / "best" / "pretrained_model", "act", spec, meta=meta)
+    text = card_for(run, "policy", "hf://user/act")[CARD].decode()
+    assert "# act for panda pick_place\n" in text
+    assert "--env.task=PandaPickPlace-v0" in text
+    assert "manip-il eval --policy.path=runs/act --eval.n_episodes=200\n" in text
 
 
 def test_a_card_that_somebody_wrote_is_kept_and_one_of_ours_is_made_again(tmp_path: Path):

@@ -15,7 +15,7 @@ _SECRET_VARIABLES = (
 _PATTERNS = (
     (re.compile(r"\bhf_[A-Za-z0-9]{8,}"), HIDDEN),
     (re.compile(r"\b(?:AKIA|ASIA)[A-Z0-9]{12,}"), HIDDEN),
-    (re.compile(r"(\w://[^/\s:@]*):[^\s@]*@"), rf"\1:{HIDDEN}@"),
+    (re.compile(r"(\w://[^/\s:@]*):\S*@"), rf"\1:{HIDDEN}@"),
     (
         re.compile(r"(?i)(x-amz-(?:signature|credential|security-token)|awsaccesskeyid|signature)=[^&\s'\"]+"),
         r"\1=" + HIDDEN,

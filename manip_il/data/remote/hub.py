@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -17,6 +17,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, constants
 
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.data.remote.errors import ConflictError, HashError, NotFoundError, RemoteError, TransientError
+from manip_il.data.remote.hub_count import counted
 from manip_il.data.remote.hub_repo import HubRepo, Type
 from manip_il.data.remote.hub_talk import HF, LOGIN, host, quiet
 from manip_il.data.remote.hub_tree import with_git
@@ -27,7 +28,7 @@ from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
 
 MAIN = "main"
-BATCH_FILES, BATCH_SIZE = 100, 2**28  # uploaded between two words of progress: files, bytes
+BATCH_FILES, BATCH_SIZE = 100, 2**28  # uploaded at once: files, bytes
 _TYPES: dict[Kind, Type] = {"dataset": "dataset", "policy": "model"}
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _TAG_TRIES = 5
@@ -112,8 +113,8 @@ class HubRemote:
             other: Kind = "policy" if self.kind == "dataset" else "dataset"
             if self._repo.exists_as(_TYPES[other]):
                 return f" (there is only a {other} of that name, {_url(other, self.url.place)})"
-            hidden = "to this token" if get_token() else f"unless you {LOGIN}"
-            return f" (no such {self.kind}, or a private one that shows itself not {hidden})"
+            hidden = " that this token may not see" if get_token() else f", for which you {LOGIN}"
+            return f" (no such {self.kind}, or a private one{hidden})"
         if found == "no revision":
             branches, tags = self._repo.refs()
             return f" (no revision {self.branch}; there are: {', '.join([*branches, *tags]) or 'none'})"
@@ -144,11 +145,15 @@ class HubRemote:
     def _upload(
         self, new: Sequence[FileEntry], local: Mapping[str, Path], known: frozenset[str], progress: Advance
     ) -> list[CommitOperationAdd]:
+        """Bytes that several files share travel once: the others are named when they have come."""
+        first = {entry.key: entry for entry in reversed(new)}
+        twins = [entry for entry in new if first[entry.key] is not entry]
         adds: list[CommitOperationAdd] = []
-        for batch in _batches(new):
+        for batch in (*_batches(first.values()), *_batches(twins)):
             part = [_addition(entry, local[entry.path]) for entry in batch]
-            self._repo.upload(self.branch, part)
-            progress(sum(entry.size for entry in batch if entry.sha256 not in known))
+            size = sum(entry.size for entry in batch if entry.sha256 not in known)
+            with counted(size, progress):
+                self._repo.upload(self.branch, part)
             adds += part
         return adds
 
@@ -202,7 +207,7 @@ def _addition(entry: FileEntry, path: Path) -> CommitOperationAdd:
     return operation
 
 
-def _batches(entries: Sequence[FileEntry]) -> Iterator[list[FileEntry]]:
+def _batches(entries: Iterable[FileEntry]) -> Iterator[list[FileEntry]]:
     batch: list[FileEntry] = []
     for entry in entries:
         batch.append(entry)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import re
 from collections.abc import Iterator
 
 import httpx
@@ -28,7 +29,15 @@ from huggingface_hub.utils import (
     logging as hub_logging,
 )
 
-from manip_il.data.remote.errors import AuthError, ConflictError, NotFoundError, RemoteError, TransientError, redact
+from manip_il.data.remote.errors import (
+    AuthError,
+    ConflictError,
+    NoSpaceError,
+    NotFoundError,
+    RemoteError,
+    TransientError,
+    redact,
+)
 from manip_il.data.remote.retry import retry_after
 from manip_il.errors import ManipError
 
@@ -36,6 +45,10 @@ HF = "https://huggingface.co"
 CONNECT, PATIENCE = 20.0, 120.0  # until a connection is there, until the next byte [s]
 LOGIN = "run `hf auth login`, or set HF_TOKEN"
 _TEMPORARY = (408, 429, 500, 502, 503, 504)
+_FULL = (402, 507)  # payment required, insufficient storage
+_QUOTA = re.compile(
+    r"(?i)\b(?:storage|quota|space)\b"
+)  # of the Hub's own words, where it answers 403 to a full account
 
 
 @contextlib.contextmanager
@@ -119,12 +132,18 @@ def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
         return NotFoundError(f"{place}: no such file{said}")
     if isinstance(error, RepositoryNotFoundError):
         return NotFoundError(f"{place} is not at {host(endpoint)}, or is private: check the name, or {LOGIN}")
+    if status == 413:
+        text = f"{place}: that Hub takes no files as large as these{said}"
+        return NoSpaceError(f"{text}; ask who runs it for a higher limit, or push in parts")
+    if status in _FULL or (status == 403 and _QUOTA.search(said)):
+        text = f"{place}: that Hub has no space left for this account{said}"
+        return NoSpaceError(f"{text}; delete what is old there, or get more, and push again: what has come is kept")
     if status == 401:
         wrong = f"the token is refused{said}" if get_token() else "nobody is logged in"
-        return AuthError(f"{place}: {wrong}; {LOGIN}, with a token of {host(endpoint)}/settings/tokens")
+        return AuthError(f"{place}: {wrong}; {LOGIN}, with a token from {host(endpoint)}/settings/tokens")
     if status == 403:
         text = f"{place}: this token may not do that{said}"
-        return AuthError(f"{text}; take one with the right to write there, of {host(endpoint)}/settings/tokens")
+        return AuthError(f"{text}; make one with the right to write there at {host(endpoint)}/settings/tokens")
     if status in (409, 412):
         return ConflictError(place)
     return RemoteError(f"{place}: {host(endpoint)} answered {status}{said}")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 from huggingface_hub import RepoFile
 
@@ -54,7 +56,9 @@ class Tree:
         file = self.files.get(MANIFEST_FILE)
         if file is None:
             return False
-        return file.lfs.sha256 == hashlib.sha256(listed).hexdigest() if file.lfs else file.blob_id == git_sha1(listed)
+        if file.lfs:
+            return file.lfs.sha256 == hashlib.sha256(listed).hexdigest()
+        return file.blob_id == _git_sha1(io.BytesIO(listed), len(listed))
 
     def differences(self, manifest: Manifest) -> list[str]:
         """Paths that the commit does not hold as the manifest has them, or holds beyond it."""
@@ -64,16 +68,21 @@ class Tree:
 
 def with_git(manifest: Manifest, local: Mapping[str, Path]) -> Manifest:
     """The manifest with git's hash of every file that may not go into LFS."""
-    files = [
-        replace(entry, git_sha1=git_sha1(local[entry.path].read_bytes())) if entry.size < SMALL else entry
-        for entry in manifest.files
-    ]
-    return replace(manifest, files=tuple(files), replaced=())
+    files = tuple(_with_git(entry, local[entry.path]) if entry.size < SMALL else entry for entry in manifest.files)
+    return replace(manifest, files=files, replaced=())
 
 
-def git_sha1(content: bytes) -> str:
-    """Git's id of a file (`git hash-object`)."""
-    return hashlib.sha1(b"blob %d\0" % len(content) + content, usedforsecurity=False).hexdigest()
+def _with_git(entry: FileEntry, path: Path) -> FileEntry:
+    with path.open("rb") as file:
+        return replace(entry, git_sha1=_git_sha1(file, entry.size))
+
+
+def _git_sha1(file: BinaryIO, size: int) -> str:
+    """Git's id of a file of `size` bytes (`git hash-object`)."""
+    digest = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
+    while chunk := file.read(2**20):
+        digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _entry(file: RepoFile, known: FileEntry | None) -> FileEntry:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.doctor.finding import NotWhole, Severity
+from manip_il.data.remote.front import with_front
+from manip_il.data.remote.landing import is_whole
 from manip_il.data.remote.manifest import Kind, Manifest
 from manip_il.data.remote.remote import Advance, Published, Remote, Snapshot
 from manip_il.data.remote.scan import Scanned, kind_of, scan
@@ -41,6 +43,8 @@ def push(
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
         extra = _cards(source, kind, url, Path(folder))
         scanned = scan(source, kind, journals=journals, extra=extra)
+        if url.scheme == "hf":
+            scanned = with_front(scanned)
         before = remote.read()
         plan = make_plan(scanned, before, remote.describe())
         if dry_run:
@@ -83,20 +87,7 @@ def _is_known(path: str, key: str, known: frozenset[str], before: Snapshot | Non
     if key in known:
         return True
     there = before.manifest.by_path.get(path) if before else None
-    if there is None or not there.git_sha1 or there.size != scanned.manifest.by_path[path].size:
-        return False
-    return there.git_sha1 == git_sha1(scanned.local[path])
-
-
-def git_sha1(path: Path) -> str:
-    """Git's blob id of a file (`git hash-object`)."""
-    import hashlib
-
-    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
-    with path.open("rb") as file:
-        while chunk := file.read(2**20):
-            digest.update(chunk)
-    return digest.hexdigest()
+    return there is not None and not there.sha256 and is_whole(there, scanned.local[path])
 
 
 def _cards(source: Path, kind: Kind, url: RemoteUrl, folder: Path) -> dict[str, Path]:

@@ -43,6 +43,9 @@ class Repo:
     lock: threading.RLock = field(default_factory=threading.RLock)
     _pointers: dict[str, tuple[str, int]] = field(default_factory=dict)
     _trees: dict[str, dict[str, Blob]] = field(default_factory=dict)
+    _refs: dict[str, str] = field(default_factory=dict)  # as git has them: nobody else writes there
+    _commits: set[str] = field(default_factory=set)
+    _contents: dict[str, bytes] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.lfs.mkdir(parents=True)
@@ -63,21 +66,22 @@ class Repo:
 
     def refs(self, kind: str) -> dict[str, str]:
         """Name -> commit of all `heads` or `tags`."""
-        lines = self._git("for-each-ref", "--format=%(objectname) %(refname)", f"refs/{kind}").splitlines()
-        pairs = (line.split(" ", 1) for line in lines)
-        return {name.removeprefix(f"refs/{kind}/"): sha for sha, name in pairs}
+        start = f"refs/{kind}/"
+        return {ref.removeprefix(start): sha for ref, sha in sorted(self._refs.items()) if ref.startswith(start)}
 
     def find(self, revision: str) -> str | None:
         """The commit that a branch, a tag or a commit id names; None for an unknown one."""
         for kind in ("heads", "tags"):
             if revision in (refs := self.refs(kind)):
                 return refs[revision]
-        known = len(revision) == 40 and self._git("cat-file", "-t", revision, check=False).strip() == "commit"
-        return revision if known else None
+        return revision if revision in self._commits else None
 
     def set_ref(self, ref: str, commit: str | None) -> None:
         """Make `ref` point to the commit, or remove it."""
-        self._git("update-ref", *(("-d", ref) if commit is None else (ref, commit)))
+        with self.lock:
+            self._git("update-ref", *(("-d", ref) if commit is None else (ref, commit)))
+            self._refs = {name: sha for name, sha in self._refs.items() if name != ref}
+            self._refs |= {ref: commit} if commit else {}
 
     def tree(self, commit: str) -> dict[str, Blob]:
         """Path -> file of a commit, LFS pointers followed."""
@@ -95,8 +99,10 @@ class Repo:
         """The bytes of a file."""
         if blob.oid is not None:
             return self.object_path(blob.oid).read_bytes()
-        command = ["git", "--git-dir", str(self.git), "cat-file", "blob", blob.git_sha1]
-        return subprocess.run(command, check=True, capture_output=True).stdout
+        if blob.git_sha1 not in self._contents:
+            command = ["git", "--git-dir", str(self.git), "cat-file", "blob", blob.git_sha1]
+            self._contents[blob.git_sha1] = subprocess.run(command, check=True, capture_output=True).stdout
+        return self._contents[blob.git_sha1]
 
     def log(self, commit: str) -> list[tuple[str, str]]:
         """(commit, title), newest first."""
@@ -128,7 +134,8 @@ class Repo:
             tree = self._tree_of(head, lines)
             parents = ("-p", head) if head else ()
             commit = self._git(*_NAME, "commit-tree", tree, *parents, "-m", title).strip()
-            self._git("update-ref", ref, commit, head or "0" * 40)
+            self._commits.add(commit)
+            self.set_ref(ref, commit)
             return commit
 
     def _tree_of(self, head: str | None, lines: list[str]) -> str:

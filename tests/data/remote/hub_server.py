@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import re
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,7 @@ class Hub(Wire):
         self.folder = folder
         self.repos: dict[str, Repo] = {}
         self.tokens: dict[str, Token] = {}
+        self.creating = threading.Lock()
         super().__init__()
 
     def add_token(self, token: str, user: str, *, write: bool = True) -> str:
@@ -116,10 +118,11 @@ def _create(hub: Hub, call: _Call) -> Answer:
     if not user.write or owner != user.user:
         raise Refused(403, f"You don't have the rights to create a {kind[:-1]} under the namespace {owner}")
     url = f"{hub.url}/{'datasets/' if kind == 'datasets' else ''}{name}"
-    if f"{kind}/{name}" in hub.repos:
-        raise Refused(409, f"You already created this {kind[:-1]} repo", url=url)
     private = asked.get("private") or asked.get("visibility") == "private"
-    hub.repos[f"{kind}/{name}"] = Repo(f"{kind}/{name}", hub.folder / kind / name, owner, bool(private))
+    with hub.creating:
+        if f"{kind}/{name}" in hub.repos:
+            raise Refused(409, f"You already created this {kind[:-1]} repo", url=url)
+        hub.repos[f"{kind}/{name}"] = Repo(f"{kind}/{name}", hub.folder / kind / name, owner, bool(private))
     return Answer(200, {"url": url, "name": name})
 
 

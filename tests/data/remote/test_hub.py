@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import contextlib
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,13 +13,13 @@ from huggingface_hub import HfApi, constants
 
 from manip_il.data.cards import CARD, STRIP
 from manip_il.data.remote.errors import ConflictError
-from manip_il.data.remote.push import check_source
+from manip_il.data.remote.push import check_source, push
 from manip_il.data.remote.remote import MANIFEST_FILE
 from manip_il.data.remote.scan import scan
 from manip_il.data.remote.url import RemoteUrl, open_remote
 from manip_il.errors import UsageError
 
-from .hub_server import Hub, clean_environment
+from .hub_server import Hub
 from .hub_use import (
     DATASET,
     POLICY,
@@ -34,15 +33,7 @@ from .hub_use import (
     make_policy,
     other_version,
 )
-
-LOAD = """
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.act.modeling_act import ACTPolicy
-
-dataset = LeRobotDataset("user/demos")
-print(len(dataset), dataset.num_episodes, tuple(dataset[0]["action"].shape), dataset.revision)
-print(sorted(ACTPolicy.from_pretrained("user/policy").config.input_features))
-"""
+from .hub_wire import Fault
 
 
 @pytest.fixture
@@ -85,14 +76,6 @@ def test_the_tag_names_the_commit(hub: Hub):
     assert repo.refs("tags") == {"v3.0": published.token} == {"v3.0": repo.refs("heads")["main"]}
 
 
-@pytest.mark.slow
-def test_lerobots_own_loaders_load_what_was_pushed(hub: Hub, tmp_path: Path, tiny_policy: Path):
-    do_push(SAMPLE)
-    do_push(tiny_policy, POLICY)
-    lines = _python(LOAD, hub, tmp_path).splitlines()
-    assert lines == ["373 10 (8,) v3.0", "['observation.environment_state', 'observation.state']"]
-
-
 def test_an_unchanged_dataset_makes_no_commit(hub: Hub):
     first = do_push(SAMPLE)
     received = hub.received()
@@ -120,6 +103,23 @@ def test_only_what_changed_travels_and_what_is_gone_is_deleted(hub: Hub, tmp_pat
     listed = tree[MANIFEST_FILE].size
     assert hub.received() - before < 1.4 * (5000 + listed) + 1000  # base64 makes a third more of both
     assert ".gitattributes" in tree  # the Hub's own
+
+
+def test_bytes_of_one_large_file_are_told_of_while_they_go(hub: Hub, tmp_path: Path, tiny_policy: Path):
+    run = shutil.copytree(tiny_policy, tmp_path / "run")
+    (run / "large.safetensors").write_bytes(bytes(10_000_000))
+    hub.faults.append(Fault("^PUT ", cut=4_000_000))  # and none twice
+    told: list[tuple[int, int]] = []
+
+    @contextlib.contextmanager
+    def watched(total: int, what: str) -> Iterator:
+        yield lambda count: told.append((count, len(hub.requests("/commit/"))))
+        assert sum(count for count, _ in told) == total
+
+    url = RemoteUrl.parse(POLICY)
+    push(run, url, open_remote(url), watched)
+    assert max(count for count, _ in told) < 2_000_000
+    assert sum(count for count, commits in told if not commits) > 10_000_000
 
 
 def test_a_reader_of_the_old_commit_finishes_while_a_new_one_is_pushed(hub: Hub, tmp_path: Path, other: Path):
@@ -243,13 +243,3 @@ def test_a_private_repository_is_private(hub: Hub, tmp_path: Path, monkeypatch: 
     do_pull(tmp_path / "mine")
     monkeypatch.setenv("HF_TOKEN", hub.add_token("hf_SomebodyElsesToken", "else"))
     assert open_remote(RemoteUrl.parse(DATASET)).read() is None
-
-
-def _python(code: str, hub: Hub, folder: Path) -> str:
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("HF_", "HUGGING"))}
-    environment |= clean_environment(hub, folder / "home", TOKEN)
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, capture_output=True, text=True, env=environment, timeout=300
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout.strip()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.remote.errors import AuthError, NotFoundError, RemoteError
+from manip_il.data.remote.errors import AuthError, NoSpaceError, NotFoundError, RemoteError
 from manip_il.errors import ManipError, UsageError
 
 from .hub_server import LFS_SECRET, Hub
@@ -53,9 +53,12 @@ def test_a_token_without_the_right_to_write(hub: Hub, tmp_path: Path, monkeypatc
     assert "the right to write" in said(AuthError, lambda: do_push(copy))
 
 
-def test_no_such_repository(hub: Hub, tmp_path: Path):
+def test_no_such_repository(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
-    assert "no such dataset, or a private one" in text
+    assert "(no such dataset, or a private one that this token may not see) holds nothing" in text
+    monkeypatch.delenv("HF_TOKEN")
+    text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
+    assert "or a private one, for which you run `hf auth login`, or set HF_TOKEN)" in text
 
 
 def test_no_such_revision(hub: Hub, tmp_path: Path):
@@ -71,6 +74,26 @@ def test_a_name_that_is_taken_by_the_other_type(hub: Hub, tmp_path: Path):
     assert "user/demos is taken by a dataset, hf://datasets/user/demos; choose another name" in text
     text = said(NotFoundError, lambda: do_pull(tmp_path / "back", "hf://user/demos"))
     assert "there is only a dataset of that name, hf://datasets/user/demos" in text
+
+
+FULL = {
+    "an upload too large": (Fault("^PUT ", 100, status=413), "takes no files as large as these; ask who runs it"),
+    "a commit too large": (Fault("/commit/", 100, status=413), "takes no files as large as these; ask who runs it"),
+    "a full disk": (Fault("^PUT ", 100, status=507), "has no space left for this account; delete what is old there"),
+    "an account that must pay": (Fault("/preupload/", 100, status=402), "has no space left for this account; delete"),
+    "a quota": (
+        Fault(
+            "/repos/create", 100, status=403, headers={"X-Error-Message": "Private repository storage limit reached"}
+        ),
+        "has no space left for this account (Private repository storage limit reached); delete",
+    ),
+}
+
+
+@pytest.mark.parametrize(("fault", "text"), FULL.values(), ids=FULL)
+def test_no_space(hub: Hub, fault: Fault, text: str):
+    hub.faults.append(fault)
+    assert text in said(NoSpaceError, lambda: do_push(SAMPLE))
 
 
 def test_a_server_that_fails_for_good(hub: Hub, monkeypatch: pytest.MonkeyPatch):
