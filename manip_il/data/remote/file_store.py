@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import fcntl
 import hashlib
@@ -15,8 +14,9 @@ from collections.abc import Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from manip_il.data.atomic import PARTIAL, exclusive, umask, write_file
+from manip_il.data.atomic import PARTIAL, exclusive, write_file
 from manip_il.data.remote.blobs import OBJECTS, STALE, Stored
+from manip_il.data.remote.disk import copy_file, hash_file, sync_disk
 from manip_il.data.remote.errors import AuthError, NoSpaceError, NotFoundError, RemoteError, TransientError
 from manip_il.data.remote.manifest import LONGEST_TEXT
 from manip_il.data.remote.object_store import ObjectRemote, in_threads
@@ -36,10 +36,11 @@ def open_file(url: RemoteUrl) -> ObjectRemote:
 class FileBlobs:
     """`Blobs` in a folder; the kernel's locks keep two pushes apart, and let go of what a killed one held."""
 
-    threads = 4
+    threads = 2  # more of them only wait for Python's lock
 
     def __init__(self, root: Path, name: str):
         self.root, self._name = root, name
+        self._folders: set[str] = set()
         self.warnings: tuple[str, ...] = ()
 
     def describe(self) -> str:
@@ -94,25 +95,27 @@ class FileBlobs:
                 raise NotFoundError(f"{self._name} has no object {key[:12]}") from None
             with os.fdopen(handle, "rb", buffering=0) as file:
                 file.seek(offset)
-                while chunk := file.read(CHUNK):
-                    target.write(chunk)
+                room = memoryview(bytearray(min(CHUNK, os.fstat(handle).st_size)))
+                while count := file.readinto(room):
+                    target.write(room[:count])
 
     def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
         """Copy, read back, rename."""
-        path = self._path(key)
+        folder = f"{self.root}/{OBJECTS}/{key[:2]}"
+        partial = f"{folder}/.{key[:12]}.{secrets.token_hex(6)}{PARTIAL}"
         with self._explained(f"write to {self._name}"):
-            path.parent.mkdir(exist_ok=True)
-            partial = path.with_name(f".{key[:12]}.{secrets.token_hex(6)}{PARTIAL}")
+            if folder not in self._folders:
+                os.makedirs(folder, exist_ok=True)
+                self._folders.add(folder)
             try:
-                shutil.copyfile(source, partial)
-                partial.chmod(0o666 & ~umask())
-                if _digest(partial) != key:
-                    raise TransientError(
-                        f"{source} changed while it was pushed, or {self._name} does not keep it whole"
-                    )
-                partial.replace(path)
-            finally:
-                partial.unlink(missing_ok=True)
+                if copy_file(source, partial) != key:
+                    text = f"{source} changed while it was pushed, or {self._name} does not keep it whole"
+                    raise TransientError(text)
+                os.replace(partial, f"{folder}/{key}")
+            except BaseException:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(partial)
+                raise
         advance(size)
         return True
 
@@ -200,15 +203,6 @@ class FileBlobs:
 
 
 def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def sync_disk(folder: Path) -> None:
-    """Have the disk beneath `folder` hold all that was written to it: one call for any number of files (Linux)."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        if ctypes.CDLL(None, use_errno=True).syncfs(handle):
-            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-    finally:
-        os.close(handle)
+    digest = hashlib.sha256()
+    hash_file(path, digest)
+    return digest.hexdigest()

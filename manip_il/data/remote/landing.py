@@ -6,28 +6,18 @@ import errno
 import hashlib
 import io
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO, Protocol, cast
+from typing import BinaryIO, cast
 
+from manip_il.data.remote.disk import Hasher, hash_file, start_writing, write_all
 from manip_il.data.remote.errors import HashError, NoSpaceError, RemoteError, TransientError
 from manip_il.data.remote.manifest import FileEntry
 from manip_il.data.remote.remote import Advance
 
-_CHUNK = 2**20  # [bytes]
+_WORTH_A_THREAD = 2**17  # bytes that are hashed beside the writing [bytes]
 
 Fetch = Callable[[BinaryIO, int], None]  # writes the bytes from an offset on
-
-
-class Hasher(Protocol):
-    """What `hashlib` makes."""
-
-    def update(self, data: bytes | memoryview, /) -> None:
-        """Feed bytes."""
-        ...
-
-    def hexdigest(self) -> str:
-        """The hash of all that was fed."""
-        ...
 
 
 class Landing:
@@ -41,11 +31,11 @@ class Landing:
     def once(self, fetch: Fetch) -> None:
         """Go on where the last try stopped. Raises `TransientError` where another try may help."""
         entry, part = self._entry, self._part
-        with part.open("ab") as file:
+        with part.open("ab", buffering=0) as file, ThreadPoolExecutor(1) as helper:
             digest = hasher(entry)
             offset = self._hash_what_is_there(digest)
             self._count(offset)
-            incoming = _Incoming(file, digest, entry, offset, self._count)
+            incoming = _Incoming(file, digest, entry, offset, self._count, helper)
             if offset < entry.size:
                 fetch(cast("BinaryIO", incoming), offset)
         if incoming.position != entry.size:
@@ -63,10 +53,7 @@ class Landing:
         if size > self._entry.size:
             self._part.write_bytes(b"")
             return 0
-        with self._part.open("rb") as file:
-            while chunk := file.read(_CHUNK):
-                digest.update(chunk)
-        return size
+        return hash_file(self._part, digest) if size else 0
 
     def _count(self, position: int) -> None:
         if position > self._counted:
@@ -86,16 +73,22 @@ def is_whole(entry: FileEntry, path: Path) -> bool:
     if path.is_symlink() or not path.is_file() or path.stat().st_size != entry.size:
         return False
     digest = hasher(entry)
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
+    hash_file(path, digest)
     return digest.hexdigest() == (entry.sha256 or entry.git_sha1)
 
 
 class _Incoming(io.RawIOBase):
-    def __init__(self, file: BinaryIO, digest: Hasher, entry: FileEntry, offset: int, count: Advance):
+    def __init__(
+        self,
+        file: io.RawIOBase,
+        digest: Hasher,
+        entry: FileEntry,
+        offset: int,
+        count: Advance,
+        helper: ThreadPoolExecutor,
+    ):
         super().__init__()
-        self._file, self._digest, self._entry, self._count = file, digest, entry, count
+        self._file, self._digest, self._entry, self._count, self._helper = file, digest, entry, count, helper
         self.position = offset
 
     def writable(self) -> bool:
@@ -106,13 +99,19 @@ class _Incoming(io.RawIOBase):
         if self.position + len(chunk) > self._entry.size:
             text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
             raise HashError(f"{text}; nothing of it was kept: ask who pushed it to push again")
+        hashed = self._helper.submit(self._digest.update, chunk) if len(chunk) >= _WORTH_A_THREAD else None
         try:
-            self._file.write(chunk)
+            write_all(self._file, chunk)
+            if hashed is not None:
+                start_writing(self._file.fileno(), self.position, len(chunk))
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise NoSpaceError("the disk is full; make room and pull again: what has come is kept") from None
             raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; look at that disk") from None
-        self._digest.update(chunk)
+        if hashed is None:
+            self._digest.update(chunk)
+        else:
+            hashed.result()  # before the caller uses the memory again
         self.position += len(chunk)
         self._count(self.position)
         return len(chunk)

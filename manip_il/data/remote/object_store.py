@@ -33,6 +33,11 @@ class ObjectRemote:
     retry: Retry = field(default_factory=Retry)
 
     @property
+    def threads(self) -> int:
+        """That may use it at a time."""
+        return self.blobs.threads
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What the store has shown that it cannot do."""
         return self.blobs.warnings
@@ -126,6 +131,8 @@ class ObjectRemote:
             raise ConflictError(self.describe())
 
         token = self.retry(swap)
+        if before is None:  # then nobody had a version either, to clear away after
+            return token
         # A store without locks may have let another push clear an object away that this one found there.
         lost = set(sizes) - self._stored(sizes).keys()
         if lost:

@@ -8,19 +8,20 @@ from __future__ import annotations
 import os
 import shutil
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from manip_il.data import atomic
+from manip_il.data.remote.disk import sync_disk
 from manip_il.data.remote.errors import NoSpaceError, NotFoundError
-from manip_il.data.remote.file_store import sync_disk
+from manip_il.data.remote.front import without_front
 from manip_il.data.remote.landing import Landing, is_whole
 from manip_il.data.remote.manifest import FileEntry, Manifest
-from manip_il.data.remote.object_store import in_threads
+from manip_il.data.remote.object_store import ObjectRemote, in_threads
 from manip_il.data.remote.push import Progress
 from manip_il.data.remote.remote import Advance, Remote, Snapshot
 from manip_il.data.remote.retry import Retry
-from manip_il.data.remote.scan import CHECKPOINTS, JOURNALS, LAST, newest
+from manip_il.data.remote.scan import CHECKPOINTS, HASHERS, JOURNALS, LAST, newest
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import FolderExistsError, UsageError
 
@@ -85,9 +86,14 @@ class _Stage:
     retry: Retry
     tree: Path = field(init=False)
     parts: Path = field(init=False)
+    _folders: set[Path] = field(default_factory=set[Path])
 
     def __post_init__(self) -> None:
         self.tree, self.parts = self.folder / "tree", self.folder / "parts"
+
+    @property
+    def _threads(self) -> int:
+        return self.remote.threads if isinstance(self.remote, ObjectRemote) else THREADS
 
     def fill(self, progress: Progress) -> int:
         """Bring and verify every file; return how many bytes were there already."""
@@ -106,7 +112,7 @@ class _Stage:
             advance(whole)
             # The largest first, else the last one runs alone.
             order = sorted(missing, key=lambda key: -missing[key][0].size)
-            in_threads(THREADS, lambda key: self._bring(missing[key], advance), order)
+            in_threads(self._threads, lambda key: self._bring(missing[key], advance), order)
         sync_disk(self.folder)
         return whole + had
 
@@ -115,7 +121,7 @@ class _Stage:
         by_path = self.snapshot.manifest.by_path
         there = {path.relative_to(self.tree).as_posix(): path for path in _leaves(self.tree)}
         known = [path for path in there if path in by_path]
-        whole = in_threads(THREADS, lambda path: is_whole(by_path[path], there[path]), known)
+        whole = in_threads(HASHERS, lambda path: is_whole(by_path[path], there[path]), known)
         for path, place in there.items():
             if not whole.get(path):
                 place.unlink()
@@ -146,18 +152,20 @@ class _Stage:
 
     def _place(self, entry: FileEntry) -> Path:
         path = self.tree / entry.path
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.parent not in self._folders:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._folders.add(path.parent)
         return path
 
 
 def _read(url: RemoteUrl, remote: Remote) -> Snapshot:
     snapshot = remote.read()
     if snapshot is None:
-        text = f"{remote.describe()} holds nothing that can be pulled; expected what manip-il push has put there"
-        raise NotFoundError(f"{text}: check the name")
+        text = f"{remote.describe()} holds nothing that can be pulled"
+        raise NotFoundError(f"{text}: check the name, or push there first")
     if url.kind not in (None, snapshot.manifest.kind):
         raise UsageError(f"{remote.describe()} holds a {snapshot.manifest.kind}, not a {url.kind}; check the name")
-    return snapshot
+    return replace(snapshot, manifest=without_front(snapshot.manifest)) if url.scheme == "hf" else snapshot
 
 
 def _check_target(target: Path, manifest: Manifest, overwrite: bool) -> None:

@@ -9,10 +9,19 @@ from manip_il.data.remote.errors import AuthError, NoSpaceError, NotFoundError, 
 from manip_il.data.remote.retry import retry_after
 
 CREDENTIALS = "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a profile in ~/.aws"
+GONE = "NoSuchUpload"  # somebody else has completed or aborted it
 _FULL = {"XMinioStorageFull", "QuotaExceeded", "InsufficientStorage", "EntityTooLarge", "NotEnoughSpace"}
 _BUSY = {
     *("SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "InternalError", "ServiceUnavailable"),
-    *("BadDigest", "IncompleteBody", "XAmzContentSHA256Mismatch", "ConditionalRequestConflict", "OperationAborted"),
+    *(
+        GONE,
+        "InvalidPart",
+        "BadDigest",
+        "IncompleteBody",
+        "XAmzContentSHA256Mismatch",
+        "ConditionalRequestConflict",
+        "OperationAborted",
+    ),
 }
 _KEYS = {"InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "InvalidToken", "TokenRefreshRequired"}
 

@@ -20,7 +20,7 @@ from manip_il.data.remote.manifest import LONGEST_TEXT
 from manip_il.data.remote.object_store import ObjectRemote, in_threads
 from manip_il.data.remote.remote import MANIFEST_FILE, Advance
 from manip_il.data.remote.s3_errors import code_of, explained, status_of
-from manip_il.data.remote.s3_upload import Part, is_as_sent, send_parts
+from manip_il.data.remote.s3_upload import Part, abort_old, is_as_sent, send_parts
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
 
@@ -195,13 +195,14 @@ class S3Blobs:
         found = self.manifest()
         if found is None or found[1] != token:
             return
-        doomed = [self._at_key(key)["Key"] for key in keys] + self._left
-        what = f"clear away in {self._name}"
+        doomed, what = [self._at_key(key)["Key"] for key in keys] + self._left, f"clear away in {self._name}"
 
         def one(key: str) -> None:
             self._run(lambda client: client.delete_object(Bucket=self._bucket, Key=key), what)
 
         in_threads(self.threads, one, doomed)
+        place = f"{self._prefix}/{OBJECTS}/"
+        self._run(lambda client: abort_old(client, self._bucket, place, _is_stale), what)
 
     def _names(self) -> set[str]:
         try:
@@ -287,6 +288,10 @@ class _Digest:
 
 def _is_refused(error: Exception) -> bool:
     return status_of(error) == 412 or code_of(error) == "PreconditionFailed"
+
+
+def _is_stale(began: datetime, answer: Mapping[str, Any]) -> bool:
+    return _age(began, answer) > STALE
 
 
 def _age(modified: datetime, answer: Mapping[str, Any]) -> float:

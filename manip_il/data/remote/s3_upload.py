@@ -1,17 +1,22 @@
-"""A large file in parts, several at a time; each is compared with what the store says it got."""
+"""A large file in parts, several at a time; each is compared with what the store says it got.
+
+An upload that was cut stays on the store, and the next try goes on with it.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from manip_il.data.remote.errors import TransientError
 from manip_il.data.remote.remote import Advance
+from manip_il.data.remote.s3_errors import GONE, code_of, status_of
 
 PART = 2**25  # [bytes]
 MOST_PARTS = 9_000  # S3 takes 10,000
@@ -45,16 +50,27 @@ def is_as_sent(answer: Mapping[str, Any], part: Part, checksum: str = "") -> boo
 
 
 async def send_parts(client: Any, place: Mapping[str, str], source: Path, advance: Advance) -> tuple[bool | None, str]:
-    """Upload `source`. Returns as `is_as_sent`, and the sha256 of what was sent: another one than it had is aborted."""
+    """Upload `source`. Returns as `is_as_sent`, and the sha256 of what was sent: another one than it had is aborted.
+
+    What a cut or a kill has ended is gone on with: parts that the store has already are not sent again.
+    """
     size = source.stat().st_size
     length = max(PART, -(-size // MOST_PARTS))
-    upload = (await client.create_multipart_upload(**place))["UploadId"]
+    upload = await _under_way(client, place)
+    is_ours = upload is None
+    there = {} if upload is None else await _parts(client, {**place, "UploadId": upload})
+    if upload is None:
+        upload = str((await client.create_multipart_upload(**place))["UploadId"])
     place = {**place, "UploadId": upload}
     digest, answers, running = hashlib.sha256(), dict[int, bool | None](), set[asyncio.Task[None]]()
     etags: dict[int, str] = {}
 
     async def send(number: int, data: bytes) -> None:
-        answers[number], etags[number] = await _send(client, place, number, data)
+        part = await asyncio.to_thread(Part.of, data)
+        if there.get(number) == (part.md5, len(data)):
+            answers[number], etags[number] = True, f'"{part.md5}"'
+        else:
+            answers[number], etags[number] = await _send(client, place, number, data, part)
         advance(len(data))
 
     try:
@@ -67,36 +83,98 @@ async def send_parts(client: Any, place: Mapping[str, str], source: Path, advanc
                         task.result()
                 running.add(asyncio.create_task(send(number, data)))
         await asyncio.gather(*running)
-        if digest.hexdigest() != place["Key"].rpartition("/")[2]:
-            raise _Changed
-        parts = [{"PartNumber": number, "ETag": etags[number]} for number in sorted(etags)]
-        await client.complete_multipart_upload(**place, MultipartUpload={"Parts": parts})
-    except BaseException as error:
+    except BaseException:  # what has arrived stays, for the next try
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
-        await client.abort_multipart_upload(**place)
-        if isinstance(error, _Changed):
-            return None, digest.hexdigest()
         raise
-    verified = None if None in answers.values() else all(answers.values())
-    return verified, digest.hexdigest()
+    if digest.hexdigest() != place["Key"].rpartition("/")[2]:
+        if is_ours:  # else it may be the upload of somebody whose file has not changed
+            await _abort(client, place)
+        return None, digest.hexdigest()
+    is_theirs = not await _complete(client, place, etags, size)
+    return None if is_theirs or None in answers.values() else all(answers.values()), digest.hexdigest()
 
 
-class _Changed(Exception):
-    """The file is not what it was when it was listed."""
+async def abort_old(
+    client: Any, bucket: str, prefix: str, is_old: Callable[[datetime, Mapping[str, Any]], bool]
+) -> None:
+    """Abort uploads that nobody will go on with. is_old: of when one began, and the answer that told it."""
+    answer = await _asked(client.list_multipart_uploads, Bucket=bucket, Prefix=prefix)
+    for item in answer.get("Uploads", ()):
+        if item["Key"].startswith(prefix) and is_old(item["Initiated"], answer):
+            await _abort(client, {"Bucket": bucket, "Key": item["Key"], "UploadId": item["UploadId"]})
 
 
-async def _send(client: Any, place: Mapping[str, str], number: int, data: bytes) -> tuple[bool | None, str]:
-    expected = await asyncio.to_thread(Part.of, data)
+async def _under_way(client: Any, place: Mapping[str, str]) -> str | None:
+    """The newest upload of this object that was begun and not ended."""
+    answer = await _asked(client.list_multipart_uploads, Bucket=place["Bucket"], Prefix=place["Key"])
+    uploads = [item for item in answer.get("Uploads", ()) if item["Key"] == place["Key"]]
+    return str(max(uploads, key=lambda item: item["Initiated"])["UploadId"]) if uploads else None
+
+
+async def _parts(client: Any, place: Mapping[str, str]) -> dict[int, tuple[str, int]]:
+    """ETag and size [bytes] of the parts that have arrived, by number."""
+    found, more = dict[int, tuple[str, int]](), dict[str, int]()
+    while True:
+        answer = await _asked(client.list_parts, **place, **more)
+        for part in answer.get("Parts", ()):
+            found[int(part["PartNumber"])] = str(part["ETag"]).strip('"'), int(part["Size"])
+        if not answer.get("IsTruncated"):
+            return found
+        more = {"PartNumberMarker": int(answer["NextPartNumberMarker"])}
+
+
+async def _asked(question: Callable[..., Awaitable[Mapping[str, Any]]], **about: Any) -> Mapping[str, Any]:
+    """The answer; an empty one of a store that does not know the question, or does not let this key ask it."""
+    try:
+        return await question(**about)
+    except Exception as error:
+        if code_of(error) != "NoSuchBucket" and status_of(error) in (400, 403, 404, 405, 501):
+            return {}
+        raise
+
+
+async def _complete(client: Any, place: Mapping[str, str], etags: Mapping[int, str], size: int) -> bool:
+    """Make the parts an object. False where it may be of others, who go on with the same upload: it must be read."""
+    parts = [{"PartNumber": number, "ETag": etags[number]} for number in sorted(etags)]
+    try:
+        answer = await client.complete_multipart_upload(**place, MultipartUpload={"Parts": parts})
+    except Exception as error:
+        if code_of(error) != GONE and status_of(error) < 500:
+            raise
+        there = await _asked(client.head_object, Bucket=place["Bucket"], Key=place["Key"])
+        if there.get("ContentLength") != size:
+            raise
+        return False
+    return str(answer.get("ETag", "")).strip('"') == _etag_of([etags[number] for number in sorted(etags)])
+
+
+def _etag_of(etags: Sequence[str]) -> str:
+    """What S3 calls an object of these parts: the MD5 of their MD5s, and how many they are; empty where encrypted."""
+    md5s = [etag.strip('"') for etag in etags]
+    if not all(map(_MD5.fullmatch, md5s)):
+        return ""
+    return f"{Part.of(bytes.fromhex(''.join(md5s))).md5}-{len(md5s)}"
+
+
+async def _abort(client: Any, place: Mapping[str, str]) -> None:
+    try:
+        await client.abort_multipart_upload(**place)
+    except Exception as error:
+        if code_of(error) != GONE:
+            raise
+
+
+async def _send(client: Any, place: Mapping[str, str], number: int, data: bytes, part: Part) -> tuple[bool | None, str]:
     for left in reversed(range(TRIES)):
         try:
             answer = await client.upload_part(**place, PartNumber=number, Body=data)
-            if (verified := is_as_sent(answer, expected)) is False:
+            if (verified := is_as_sent(answer, part)) is False:
                 raise TransientError("the store has received other bytes than were sent")
             return verified, answer["ETag"]
-        except Exception:
-            if not left:
+        except Exception as error:
+            if not left or code_of(error) == GONE:
                 raise
             await asyncio.sleep(0.5 * (TRIES - left))
     raise TransientError("no try was allowed; expected at least one")

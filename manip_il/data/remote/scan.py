@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from manip_il.data.lerobot_layout import INFO
+from manip_il.data.remote.disk import hash_file
 from manip_il.data.remote.errors import ManifestError
 from manip_il.data.remote.manifest import FileEntry, Kind, Manifest
 from manip_il.data.remote.paths import check_path
@@ -40,11 +41,11 @@ def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, 
     take the place of the folder's own, by path. Left out is what begins with a dot and what a killed writer left.
     Raises `ManifestError` for links, and for what `FileEntry` refuses.
     """
-    local = {path.relative_to(root).as_posix(): path for path in _files(root, journals)}
+    local = _below(root, journals)
     if journals and kind == "dataset":
         beside = root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
         if beside.is_dir():
-            local |= {f"{JOURNALS}/{path.relative_to(beside).as_posix()}": path for path in _files(beside, journals)}
+            local |= {f"{JOURNALS}/{name}": path for name, path in _below(beside, journals).items()}
     local |= extra or {}
     if not local:
         raise ManifestError(f"{root} holds no file to push; expected a dataset or a run")
@@ -69,14 +70,20 @@ def kind_of(root: Path) -> Kind:
 
 def entry_of(name: str, path: Path) -> FileEntry:
     """The entry of a local file."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-        return FileEntry(name, file.tell(), digest)
+    digest = hashlib.sha256()
+    size = hash_file(path, digest)
+    return FileEntry(name, size, digest.hexdigest())
 
 
 def is_left_out(name: str) -> bool:
     """Whether no push takes a file or folder of this name along."""
     return bool(_LEFT_OUT.fullmatch(name))
+
+
+def _below(folder: Path, journals: bool) -> dict[str, Path]:
+    """Files by their paths inside a folder."""
+    start = len(f"{folder}/")  # a slice is ten times as quick as `relative_to`
+    return {str(path)[start:]: path for path in _files(folder, journals)}
 
 
 def _files(folder: Path, journals: bool) -> Iterator[Path]:

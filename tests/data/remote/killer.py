@@ -13,12 +13,12 @@ import sys
 import time
 from pathlib import Path
 
-from manip_il.data.remote import file_store, s3_store
+from manip_il.data.remote import file_store, s3_store, sftp_lock, sftp_store
 from manip_il.data.remote.pull import pull
 from manip_il.data.remote.push import push
 from manip_il.data.remote.url import RemoteUrl, open_remote
 
-IMPORTED = (file_store, s3_store)  # before the fork, so that a kill meets work and not imports
+IMPORTED = (file_store, s3_store, sftp_store)  # before the fork, so that a kill meets work and not imports
 
 
 def work(do: str, url: RemoteUrl, folder: Path) -> None:
@@ -32,6 +32,7 @@ def work(do: str, url: RemoteUrl, folder: Path) -> None:
 
 
 def main() -> None:
+    sftp_lock.LOCK_STALE, sftp_lock.LOCK_REFRESH = 1.5, 0.3  # many locks are left here
     for line in sys.stdin:
         command = json.loads(line)
         start = time.monotonic()

@@ -48,7 +48,7 @@ def variables(endpoint: str) -> dict[str, str]:
 class Fault:
     """What happens to requests that match, so many times.
 
-    what: 500, 429, 403, 507, cut, flip (what is sent), flip_answer, slow, unconditional.
+    what: a status to refuse with (500, 429, 403), cut, flip (what is sent), flip_answer, slow, unconditional.
     """
 
     what: str
@@ -95,7 +95,7 @@ def running_proxy(endpoint: str) -> Iterator[Proxy]:
             proxy.before(self.command, self.path)
             fault = proxy.fault(self.command, self.path)
             what = fault.what if fault else ""
-            if what in ("500", "429", "403", "507"):
+            if what.isdecimal():
                 self._refuse(int(what), fault.code)
                 return
             headers = dict(self.headers.items())

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.remote import sftp_store
+from manip_il.data.remote import file_store, sftp_lock
 from manip_il.data.remote.errors import (
     AuthError,
     HashError,
@@ -25,6 +25,7 @@ from manip_il.data.remote.errors import (
 from manip_il.data.remote.pull import pull
 from manip_il.data.remote.push import push
 from manip_il.data.remote.retry import Retry, retry_after
+from manip_il.data.remote.sftp_store import SftpBlobs
 
 from .s3 import KEY, SECRET, Fault, Proxy
 from .sshd import Sshd
@@ -168,7 +169,7 @@ def test_a_disk_that_fills_up_meanwhile(tmp_path: Path, monkeypatch: pytest.Monk
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(shutil, "copyfile", full)
+    monkeypatch.setattr(file_store, "copy_file", full)
     with pytest.raises(NoSpaceError, match="the disk is full; make room there and push again"):
         push(run, url, remote, unwatched)
     monkeypatch.undo()
@@ -281,12 +282,29 @@ def test_an_sftp_lock_that_a_dead_push_left_is_broken(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(sshd.home))
-    monkeypatch.setattr(sftp_store, "LOCK_STALE", 0.3)
+    monkeypatch.setattr(sftp_lock, "LOCK_STALE", 0.3)
     (tmp_path / "store").mkdir()
-    (tmp_path / "store" / sftp_store.LOCK).write_text("dead")
+    (tmp_path / "store" / sftp_lock.LOCK).write_text("dead")
     url, remote = impatient(sshd.url(tmp_path / "store"))
     push(make_run(tmp_path / "run", 1), url, remote, unwatched)
-    assert not (tmp_path / "store" / sftp_store.LOCK).exists()
+    assert not (tmp_path / "store" / sftp_lock.LOCK).exists()
+
+
+def test_an_sftp_lock_of_a_living_push_is_respected(
+    sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(sshd.home))
+    for name, seconds in {"LOCK_REFRESH": 0.3, "LOCK_STALE": 1.5, "LOCK_WAIT": 2.5}.items():
+        monkeypatch.setattr(sftp_lock, name, seconds)
+    run, (url, remote) = make_run(tmp_path / "run", 1), impatient(sshd.url(tmp_path / "store"))
+    blobs = remote.blobs
+    assert isinstance(blobs, SftpBlobs)
+    blobs.prepare(0)
+    with blobs._sftp("x") as sftp, blobs._locked(sftp) as is_ours:
+        with pytest.raises(RemoteError, match=r"another push is switching .* over; wait, and push again"):
+            push(run, url, impatient(str(url))[1], unwatched)
+        assert is_ours()
+    push(run, url, remote, unwatched)
 
 
 def test_an_unknown_host_key_is_not_trusted(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

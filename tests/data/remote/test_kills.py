@@ -15,9 +15,10 @@ import pytest
 
 from manip_il.data.remote.pull import pull
 
+from .sshd import Sshd
 from .trees import content, impatient, make_run, unwatched
 
-KILLS = 10  # in each direction, on each of two kinds of store
+KILLS = 10  # in each direction, on each kind of store
 
 
 class Killer:
@@ -35,24 +36,28 @@ class Killer:
 
 
 @pytest.fixture
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "file":
         return f"file://{tmp_path}/store/demos"
-    return f"s3://{request.getfixturevalue('bucket')}/demos"
+    if request.param == "s3":
+        return f"s3://{request.getfixturevalue('bucket')}/demos"
+    server: Sshd = request.getfixturevalue("sshd")
+    monkeypatch.setenv("HOME", str(server.home))
+    return server.url(tmp_path / "store" / "demos")
 
 
 @pytest.fixture
 def killer(url: str) -> Iterator[Killer]:
-    killer = Killer()  # after the environment says where S3 is
+    killer = Killer()  # after the environment says where the store is
     yield killer
     killer.process.stdin.close()
     killer.process.wait(30)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["file", "s3"], indirect=True)
+@pytest.mark.parametrize("url", ["file", "s3", "sftp"], indirect=True)
 def test_pushes(url: str, killer: Killer, tmp_path: Path) -> None:
-    runs = [make_run(tmp_path / f"run{n}", n, files=8) for n in range(3)]
+    runs = [make_run(tmp_path / f"run{n}", n, files=4, size=5_000) for n in range(3)]
     versions = [content(run) for run in runs]
     assert killer("push", url, runs[0])["ended"] == 0
     usual = killer("push", url, runs[1])["seconds"]
@@ -71,9 +76,9 @@ def test_pushes(url: str, killer: Killer, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["file", "s3"], indirect=True)
+@pytest.mark.parametrize("url", ["file", "s3", "sftp"], indirect=True)
 def test_pulls(url: str, killer: Killer, tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", 1, files=8)
+    run = make_run(tmp_path / "run", 1, files=4, size=5_000)
     assert killer("push", url, run)["ended"] == 0
     usual = killer("pull", url, tmp_path / "first")["seconds"]
     rng, killed = np.random.default_rng(8), 0

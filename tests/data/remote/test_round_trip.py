@@ -13,6 +13,7 @@ from manip_il.data.build import build
 from manip_il.data.doctor.finding import NotWhole
 from manip_il.data.journal import write_episode
 from manip_il.data.lerobot_layout import TASKS
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.remote.errors import ConflictError, ManifestError, NotFoundError
 from manip_il.data.remote.pull import pull
 from manip_il.data.remote.push import push
@@ -91,6 +92,55 @@ def test_the_server_sees_only_the_new_file(proxy: Proxy, bucket: str, tmp_path: 
     assert len(sent) == 2  # the file, then the manifest
     assert sent[0][1] == 1234
     assert sum(1 for method, _, _ in proxy.requests if method == "GET") <= 2
+
+
+@pytest.fixture
+def versions(tmp_path: Path, spec: RobotTaskSpec, make_episode: Callable[..., Episode]) -> list[Path]:
+    """A dataset, a data file an episode, and the same with one episode more."""
+    for count in (4, 5):
+        write_dataset(
+            [make_episode(seed) for seed in range(count)],
+            tmp_path / f"d{count}",
+            spec,
+            repo_id="local/d",
+            fingerprint={},
+            data_files_size_in_mb=1e-6,
+        )
+    return [tmp_path / "d4", tmp_path / "d5"]
+
+
+def _changed(versions: list[Path]) -> dict[str, int]:
+    """Files of the second version that the first has not, or not so, and their sizes [bytes]."""
+    old, new = map(content, versions)
+    return {name: len(data) for name, data in new.items() if old.get(name) != data}
+
+
+def test_one_more_episode_sends_only_the_files_that_it_changes(
+    place: str, tmp_path: Path, versions: list[Path]
+) -> None:
+    changed = _changed(versions)
+    files = {name for name in content(versions[1]) if name.startswith("data/")}
+    assert len(files) == 5
+    assert len(files & changed.keys()) == 1  # the new episode's own: those of the others travel no more
+    url, remote = impatient(place)
+    push(versions[0], url, remote, silent)
+    plan, published = push(versions[1], url, remote, silent)
+    assert set(plan.upload) == changed.keys()
+    assert (published.uploaded, published.size) == (len(changed), sum(changed.values()))
+    assert published.kept == len(content(versions[1])) - len(changed)
+    pull(url, remote, tmp_path / "got", silent)
+    assert content(tmp_path / "got") == content(versions[1])
+
+
+def test_the_server_sees_no_more_bytes_than_one_more_episode_needs(
+    proxy: Proxy, bucket: str, versions: list[Path]
+) -> None:
+    url, remote = impatient(f"s3://{bucket}/demos")
+    push(versions[0], url, remote, silent)
+    proxy.requests.clear()
+    push(versions[1], url, remote, silent)
+    sent = [size for method, path, size in proxy.requests if method == "PUT" and "manip_il_manifest" not in path]
+    assert sorted(sent) == sorted(_changed(versions).values())
 
 
 def test_what_the_version_before_had_is_there_until_the_next_push(tmp_path: Path) -> None:
