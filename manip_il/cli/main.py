@@ -10,10 +10,11 @@ import inspect
 import os
 import select
 import sys
+import threading
 import traceback
 from collections.abc import Collection, Sequence
 from dataclasses import MISSING
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from manip_il import __version__
 from manip_il.cli import progress
@@ -77,6 +78,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(_clean(traceback.format_exc()), file=sys.stderr, end="")
         return _report(error, words)
     return 0
+
+
+def script() -> NoReturn:
+    """The program: `main`, and then the end, which after Ctrl-C does not wait for threads that still send or receive.
+
+    Nothing is lost by that: what every command writes outlives a kill.
+    """
+    code = main()
+    busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
+    if code == EXIT_INTERRUPTED and busy:
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def load(name: str) -> type:
@@ -238,4 +252,4 @@ def _silence_stdout() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    script()

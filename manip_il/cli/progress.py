@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 INTERVAL = 5.0  # [s] between plain lines
+_UNITS = ("B", "kB", "MB", "GB", "TB")
 
 _quiet = False
 
@@ -33,15 +34,15 @@ def say(line: str) -> None:
 
 
 @contextmanager
-def progress(total: int | None, description: str) -> Generator[Progress]:
-    """Show the progress of `total` steps (None where nobody knows) while the `with` lasts."""
+def progress(total: int | None, description: str, *, of_bytes: bool = False) -> Generator[Progress]:
+    """Show the progress of `total` steps (None where nobody knows), or bytes, while the `with` lasts."""
     if _quiet:
         yield _Silent()
     elif sys.stderr.isatty():
-        with _bar(total, description) as bar:
+        with _bar(total, description, of_bytes) as bar:
             yield bar
     else:
-        lines = _Lines(total, description)
+        lines = _Lines(total, description, bytes_text if of_bytes else _count_text)
         try:
             yield lines
         finally:
@@ -56,8 +57,8 @@ class _Silent:
 class _Lines:
     """Lines at most every `INTERVAL`, and one at the end: `record: 12/50 (3.4/s, success 0.92)`."""
 
-    def __init__(self, total: int | None, description: str):
-        self._total, self._description = total, description
+    def __init__(self, total: int | None, description: str, text: Callable[[float], str]):
+        self._total, self._description, self._text = total, description, text
         self._done = 0
         self._fields: dict[str, object] = {}
         self._start = self._printed = time.monotonic()
@@ -77,9 +78,9 @@ class _Lines:
 
     def _print(self, now: float) -> None:
         self._printed, self._fresh = now, False
-        count = f"{self._done}/{self._total}" if self._total is not None else f"{self._done}"
+        count = "/".join(self._text(number) for number in (self._done, self._total) if number is not None)
         rate = self._done / max(now - self._start, 1e-9)
-        details = ", ".join(filter(None, [f"{rate:.3g}/s", _fields_text(self._fields)]))
+        details = ", ".join(filter(None, [f"{self._text(rate)}/s", _fields_text(self._fields)]))
         print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
 
 
@@ -94,21 +95,34 @@ class _Bar:
 
 
 @contextmanager
-def _bar(total: int | None, description: str) -> Generator[_Bar]:
+def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]:
     # Imported here: `manip-il --help` needs none of it.
     from rich import progress as rich_progress
     from rich.console import Console
 
+    steps = (rich_progress.MofNCompleteColumn(),)
     columns = (
         rich_progress.TextColumn("{task.description}", markup=False),
         rich_progress.BarColumn(),
-        rich_progress.MofNCompleteColumn(),
+        *((rich_progress.DownloadColumn(), rich_progress.TransferSpeedColumn()) if of_bytes else steps),
         rich_progress.TimeRemainingColumn(),
         rich_progress.TextColumn("{task.fields[details]}", markup=False),
     )
     # Redirected output would go to standard error with the bar, and be lost to `manip-il ... > file`.
     with rich_progress.Progress(*columns, console=Console(stderr=True), redirect_stdout=sys.stdout.isatty()) as bar:
         yield _Bar(bar, bar.add_task(description, total=total, details=""))
+
+
+def bytes_text(count: float) -> str:
+    """As people read it: `1.2 GB`."""
+    unit = 0
+    while count >= 999.5 and unit < len(_UNITS) - 1:
+        count, unit = count / 1000, unit + 1
+    return f"{count:.0f} {_UNITS[unit]}" if unit == 0 else f"{count:.3g} {_UNITS[unit]}"
+
+
+def _count_text(count: float) -> str:
+    return f"{count}" if isinstance(count, int) else f"{count:.3g}"
 
 
 def _fields_text(fields: dict[str, object]) -> str:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.folders import require_ours
 from manip_il.cli.groups import option, warn
-from manip_il.cli.progress import say
-from manip_il.cli.transfer import bytes_text, going_on, moved
+from manip_il.cli.progress import bytes_text, say
+from manip_il.cli.transfer import going_on, moved
 from manip_il.errors import FolderExistsError, UsageError
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.groups import option, warn
-from manip_il.cli.progress import say
-from manip_il.cli.transfer import bytes_text, going_on, moved
+from manip_il.cli.progress import bytes_text, say
+from manip_il.cli.transfer import going_on, moved
 
 if TYPE_CHECKING:
     from manip_il.data.remote.push import Plan

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from manip_il.cli.interrupt import Interrupted
 from manip_il.cli.progress import progress
 
-_UNITS = ("B", "kB", "MB", "GB", "TB")
 SHOWN = 0.1  # between two changes of what is shown [s]
 
 
@@ -20,9 +19,8 @@ def moved(total: int, what: str) -> Generator[Callable[[int], None]]:
     if not total:
         yield lambda count: None
         return
-    lock, start = threading.Lock(), time.monotonic()
+    lock, shown = threading.Lock(), time.monotonic()
     done = waiting = 0
-    shown = start
 
     def advance(count: int) -> None:
         nonlocal done, waiting, shown
@@ -30,20 +28,11 @@ def moved(total: int, what: str) -> Generator[Callable[[int], None]]:
             done, waiting = done + count, waiting + count
             now = time.monotonic()
             if now - shown >= SHOWN or done >= total:
-                fields = {"of": bytes_text(total), "rate": f"{bytes_text(done / max(now - start, 1e-9))}/s"}
-                bar.advance(waiting, **fields)
+                bar.advance(waiting)
                 waiting, shown = 0, now
 
-    with progress(total, f"{what} [bytes]") as bar:
+    with progress(total, what, of_bytes=True) as bar:
         yield advance
-
-
-def bytes_text(count: float) -> str:
-    """As people read it: `1.2 GB`."""
-    unit = 0
-    while count >= 999.5 and unit < len(_UNITS) - 1:
-        count, unit = count / 1000, unit + 1
-    return f"{count:.0f} {_UNITS[unit]}" if unit == 0 else f"{count:.3g} {_UNITS[unit]}"
 
 
 @contextmanager

@@ -169,23 +169,29 @@ class _Sent:
 
 
 def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) -> dict[K, R]:
-    """`work` of every key; the first error ends all, and is raised when what runs already has ended."""
-    stop = threading.Event()
+    """`work` of every key; the first error ends all, and is raised when what runs already has ended.
+
+    Ctrl-C waits for nothing: a large file may take minutes yet.
+    """
+    stop, is_cut = threading.Event(), False
 
     def one(key: K) -> R | None:
         return None if stop.is_set() else work(key)
 
-    with ThreadPoolExecutor(threads) as pool:
+    pool = ThreadPoolExecutor(threads)
+    try:
         futures: dict[K, Future[R | None]] = {key: pool.submit(one, key) for key in keys}
-        try:
-            done, _ = wait(futures.values(), return_when="FIRST_EXCEPTION")
-            problem = next((future.exception() for future in done if future.exception()), None)
-            if problem is not None:
-                raise problem
-        except BaseException:
-            stop.set()
-            raise
+        done, _ = wait(futures.values(), return_when="FIRST_EXCEPTION")
+        problem = next((future.exception() for future in done if future.exception()), None)
+        if problem is not None:
+            raise problem
         return {key: cast("R", future.result()) for key, future in futures.items()}
+    except BaseException as error:
+        stop.set()
+        is_cut = isinstance(error, KeyboardInterrupt)
+        raise
+    finally:
+        pool.shutdown(wait=not is_cut, cancel_futures=True)
 
 
 def _is_usable(stored: Stored | None, size: int) -> bool:

@@ -23,7 +23,7 @@ LAST = "last"  # the link in `checkpoints` to the newest one: a pull makes it ag
 CHECKPOINTS = "checkpoints"
 HASHERS = 4  # threads: hashlib lets go of Python's lock
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
-_POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS)
+_POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS, "best")
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ def is_left_out(name: str) -> bool:
 
 def _below(folder: Path, journals: bool) -> dict[str, Path]:
     """Files by their paths inside a folder."""
+    folder = folder.absolute()
     start = len(f"{folder}/")  # a slice is ten times as quick as `relative_to`
     return {str(path)[start:]: path for path in _files(folder, journals)}
 
