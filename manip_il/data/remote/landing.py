@@ -45,7 +45,7 @@ class Landing:
             self._mismatches += 1
             text = f"{entry.path} is not what the manifest says: its hash differs"
             if self._mismatches > 1:
-                raise HashError(f"{text}, twice; nothing of it was kept: ask who pushed it to push again")
+                raise HashError(f"{text}, twice; nothing of it was kept: have it pushed anew, to an empty place")
             raise TransientError(text)
 
     def _hash_what_is_there(self, digest: Hasher) -> int:
@@ -98,7 +98,7 @@ class _Incoming(io.RawIOBase):
         chunk = memoryview(cast("bytes", data))
         if self.position + len(chunk) > self._entry.size:
             text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
-            raise HashError(f"{text}; nothing of it was kept: ask who pushed it to push again")
+            raise HashError(f"{text}; nothing of it was kept: have it pushed anew, to an empty place")
         hashed = self._helper.submit(self._digest.update, chunk) if len(chunk) >= _WORTH_A_THREAD else None
         try:
             write_all(self._file, chunk)

@@ -64,27 +64,29 @@ class ObjectRemote:
     def publish(
         self, local: Mapping[str, Path], manifest: Manifest, before: Snapshot | None, progress: Advance
     ) -> Published:
-        """Upload, verify, switch, clear away."""
+        """Upload, verify, switch, clear away; what the store has lost of the version before is uploaded again."""
         known = before.manifest.keys if before else frozenset[str]()
-        if before and before.manifest.files == manifest.files and before.manifest.kind == manifest.kind:
-            return Published(0, 0, len(manifest.files), 0, before.token)
-        sizes = {entry.sha256: entry.size for entry in manifest.files if entry.sha256 not in known}
+        is_same = bool(before) and (before.manifest.kind, before.manifest.files) == (manifest.kind, manifest.files)
+        sizes = {entry.sha256: entry.size for entry in manifest.files}
         sources = {entry.sha256: local[entry.path] for entry in manifest.files}
-        self.retry(lambda: self.blobs.prepare(sum(sizes.values())))
+        new = {key: size for key, size in sizes.items() if key not in known}
+        if not is_same:
+            self.retry(lambda: self.blobs.prepare(sum(new.values())))
         stored = self._stored(sizes)
-        there = {key for key, size in sizes.items() if _is_usable(stored.get(key), size)}
-        missing = {key: size for key, size in sizes.items() if key not in there}
-        of_files = sum(entry.size for entry in manifest.files if entry.sha256 in sizes)  # as a user counts
-        progress(of_files - sum(missing.values()))
-        verified = self._upload(missing, sources, progress)
-        self._verify({key: size for key, size in sizes.items() if key not in verified}, sources)
+        missing = {key: size for key, size in sizes.items() if not _is_usable(stored.get(key), size, key in known)}
+        to_send = {key: size for key, size in new.items() if key in missing}
+        progress(sum(entry.size for entry in manifest.files if entry.sha256 in new) - sum(to_send.values()))
+        verified = self._upload(to_send, sources, progress)
+        verified |= self._upload({key: size for key, size in missing.items() if key in known}, sources, lambda _: None)
+        self._verify({key: size for key, size in (new | missing).items() if key not in verified}, sources)
+        uploaded = sum(entry.sha256 in missing for entry in manifest.files)
+        kept, size = len(manifest.files) - uploaded, sum(missing.values())
+        if before and is_same:
+            return Published(uploaded, size, kept, 0, before.token)
         token = self._switch(manifest, before, sizes, sources)
         self._clear(manifest, before, stored, token)
-        size = sum(missing.values())
-        paths_before = set(before.manifest.by_path) if before else set[str]()
-        gone = len(paths_before - set(manifest.by_path))
-        uploaded = sum(entry.sha256 in missing for entry in manifest.files)
-        return Published(uploaded, size, len(manifest.files) - uploaded, gone, token)
+        gone = set(before.manifest.by_path if before else ()) - manifest.by_path.keys()
+        return Published(uploaded, size, kept, len(gone), token)
 
     def _stored(self, sizes: Mapping[str, int]) -> dict[str, Stored]:
         return self.retry(lambda: self.blobs.find(sizes) if len(sizes) <= FEW else self.blobs.list())
@@ -194,8 +196,8 @@ def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) ->
         pool.shutdown(wait=not is_cut, cancel_futures=True)
 
 
-def _is_usable(stored: Stored | None, size: int) -> bool:
-    return stored is not None and stored.size == size and stored.age < FRESH
+def _is_usable(stored: Stored | None, size: int, is_known: bool) -> bool:
+    return stored is not None and stored.size == size and (is_known or stored.age < FRESH)
 
 
 def _with_sha256(manifest: Manifest) -> Manifest:

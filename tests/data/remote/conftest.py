@@ -43,7 +43,7 @@ def proxy(bucket: str, moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
         yield running
 
 
-@pytest.fixture(params=["file", "s3", "sftp"])
+@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow)])
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A URL where nothing is yet, on each kind of store."""
     if request.param == "s3":

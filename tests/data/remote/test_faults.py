@@ -252,6 +252,7 @@ def relay(port: int, cut_after: list[int]) -> Iterator[int]:
         server.close()
 
 
+@pytest.mark.slow
 def test_sftp_outlives_cuts(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     shutil.copytree(sshd.home / ".ssh", tmp_path / ".ssh")
@@ -267,6 +268,7 @@ def test_sftp_outlives_cuts(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.Monk
     assert content(tmp_path / "got") == content(run)
 
 
+@pytest.mark.slow
 def test_sftp_without_a_shell_reads_back(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(sshd.home))
     url, remote = impatient(sshd.url(tmp_path / "store"))
@@ -278,6 +280,7 @@ def test_sftp_without_a_shell_reads_back(sshd: Sshd, tmp_path: Path, monkeypatch
     assert remote.blobs.wrong({path.name: 0}) == {path.name}
 
 
+@pytest.mark.slow
 def test_an_sftp_lock_that_a_dead_push_left_is_broken(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -290,6 +293,7 @@ def test_an_sftp_lock_that_a_dead_push_left_is_broken(
     assert not (tmp_path / "store" / sftp_lock.LOCK).exists()
 
 
+@pytest.mark.slow
 def test_an_sftp_lock_of_a_living_push_is_respected(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -307,12 +311,14 @@ def test_an_sftp_lock_of_a_living_push_is_respected(
     push(run, url, remote, unwatched)
 
 
+@pytest.mark.slow
 def test_an_unknown_host_key_is_not_trusted(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(AuthError, match=r"is not in ~/.ssh/known_hosts; run ssh 127.0.0.1 once"):
         impatient(sshd.url(tmp_path))[1].read()
 
 
+@pytest.mark.slow
 def test_a_wrong_sftp_password_is_never_shown(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / ".ssh").mkdir()

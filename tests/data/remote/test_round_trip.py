@@ -81,6 +81,20 @@ def test_only_changes_travel(place: str, tmp_path: Path) -> None:
     assert content(tmp_path / "got") == content(run)
 
 
+@pytest.mark.parametrize("more", [0, 40])  # few objects are asked for one by one, many are listed
+def test_what_the_store_has_lost_is_uploaded_again(place: str, more: int, tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", 1, files=2 + more, size=100)
+    url, remote = impatient(place)
+    plan, published = push(run, url, remote, silent)
+    remote.blobs.remove([plan.manifest.by_path["round_001/part 1.json"].sha256], published.token)
+    with pytest.raises(NotFoundError):
+        pull(url, remote, tmp_path / "got", unwatched)
+    _, published = push(run, url, remote, silent)
+    assert (published.uploaded, published.size, published.removed) == (1, 100, 0)
+    pull(url, remote, tmp_path / "got", unwatched)
+    assert content(tmp_path / "got") == content(run)
+
+
 def test_the_server_sees_only_the_new_file(proxy: Proxy, bucket: str, tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", 1)
     url, remote = impatient(f"s3://{bucket}/demos")
