@@ -144,3 +144,23 @@ def test_a_reader_that_goes_away_is_no_error():
 def test_every_command_leads_to_a_dataclass_that_runs(name):
     module, _, options_class = COMMANDS[name].target.partition(":")
     assert callable(getattr(importlib.import_module(module), options_class).run)
+
+
+BUSY = """
+import os, signal, sys, threading, time
+from manip_il.cli import main as program
+from manip_il.data.remote.object_store import in_threads
+
+def work(words):
+    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+    in_threads(2, lambda key: time.sleep(100), range(4))
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+program._dispatch = work
+program.script()
+"""
+
+
+def test_ctrl_c_does_not_wait_for_what_threads_send():
+    done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "manip-il: interrupted\n")

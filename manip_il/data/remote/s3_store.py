@@ -24,7 +24,7 @@ from manip_il.data.remote.s3_upload import Part, abort_old, is_as_sent, send_par
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
 
-CHUNK = 2**22  # of what is read at a time [bytes]
+CHUNK = 2**20  # of what is read at a time, at most [bytes]
 MULTIPART = 2**26  # from this size on a file goes in parts [bytes]
 TIMEOUTS = {"connect_timeout": 15, "read_timeout": 60}  # [s]
 _KEY = re.compile(r"[0-9a-f]{64}")
@@ -101,33 +101,21 @@ class S3Blobs:
 
     def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
         """One GET, from `offset` on."""
-        what = f"read {self._name}"
         span = {"Range": f"bytes={offset}-"} if offset else {}
 
-        async def start(client: Any) -> Any:
+        async def copy(client: Any) -> None:
             answer = await client.get_object(**self._at_key(key), **span)
-            if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
-                raise RemoteError(f"{self._name}: the store knows no ranges; remove the .pulling folder and pull again")
-            return answer["Body"]
+            body = answer["Body"]
+            try:
+                if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
+                    text = f"{self._name}: the store knows no ranges; remove the .pulling folder and pull again"
+                    raise RemoteError(text)
+                while chunk := await body.read(CHUNK):
+                    target.write(chunk)
+            finally:
+                body.close()
 
-        body = self._run(start, what)
-
-        async def more(_: Any) -> tuple[bytes, bool]:
-            chunk = bytearray()
-            while len(chunk) < CHUNK:
-                piece = await body.read(CHUNK - len(chunk))
-                if not piece:
-                    return bytes(chunk), True
-                chunk += piece
-            return bytes(chunk), False
-
-        try:
-            is_end = False
-            while not is_end:
-                chunk, is_end = self._run(more, what)
-                target.write(chunk)
-        finally:
-            body.close()
+        self._run(copy, f"read {self._name}")
 
     def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
         """Send, and compare what the store says it got; False where it says nothing that can be compared."""
