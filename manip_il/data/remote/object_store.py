@@ -8,6 +8,7 @@ What the replaced version alone names stays until the next push, so that who is 
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from manip_il.data.remote.blobs import STALE, Blobs, Stored
-from manip_il.data.remote.errors import ConflictError, HashError, ManifestError, RemoteError
+from manip_il.data.remote.errors import ConflictError, HashError, ManifestError, NotFoundError, RemoteError
 from manip_il.data.remote.manifest import FileEntry, Manifest
 from manip_il.data.remote.remote import Advance, Published, Snapshot
 from manip_il.data.remote.retry import Retry
@@ -194,6 +195,28 @@ def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) ->
         raise
     finally:
         pool.shutdown(wait=not is_cut, cancel_futures=True)
+
+
+def wrong_when_read(blobs: Blobs, keys: Iterable[str]) -> set[str]:
+    """Those of the keys whose objects are gone, or are not what their name says when all of them is read back."""
+
+    def one(key: str) -> bool:
+        digest = _Digest()
+        try:
+            blobs.fetch(key, cast("BinaryIO", digest), 0)
+        except NotFoundError:
+            return True
+        return digest.sha256.hexdigest() != key
+
+    return {key for key, is_wrong in in_threads(blobs.threads, one, keys).items() if is_wrong}
+
+
+class _Digest:
+    def __init__(self) -> None:
+        self.sha256 = hashlib.sha256()
+
+    def write(self, data: bytes) -> None:
+        self.sha256.update(data)
 
 
 def _is_usable(stored: Stored | None, size: int, is_known: bool) -> bool:

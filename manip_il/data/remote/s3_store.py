@@ -17,7 +17,7 @@ from s3fs import S3FileSystem
 from manip_il.data.remote.blobs import OBJECTS, STALE, Stored
 from manip_il.data.remote.errors import AuthError, NotFoundError, RemoteError, TransientError
 from manip_il.data.remote.manifest import LONGEST_TEXT
-from manip_il.data.remote.object_store import ObjectRemote, in_threads
+from manip_il.data.remote.object_store import ObjectRemote, in_threads, wrong_when_read
 from manip_il.data.remote.remote import MANIFEST_FILE, Advance
 from manip_il.data.remote.s3_errors import code_of, explained, status_of
 from manip_il.data.remote.s3_upload import Part, abort_old, is_as_sent, send_parts
@@ -167,16 +167,7 @@ class S3Blobs:
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
         """Those that are not what their name says: read back, as no store tells a sha256 that can be relied on."""
-
-        def one(key: str) -> bool:
-            digest = _Digest()
-            try:
-                self.fetch(key, digest, 0)  # pyright: ignore[reportArgumentType]
-            except NotFoundError:
-                return True
-            return digest.sha256.hexdigest() != key
-
-        return {key for key, is_wrong in in_threads(self.threads, one, sizes).items() if is_wrong}
+        return wrong_when_read(self, sizes)
 
     def remove(self, keys: Iterable[str], token: str) -> None:
         """Remove objects unless another push has been."""
@@ -264,14 +255,6 @@ class S3Blobs:
             raise
         except Exception as error:
             raise explained(error, what, self._bucket) from None
-
-
-class _Digest:
-    def __init__(self) -> None:
-        self.sha256 = hashlib.sha256()
-
-    def write(self, data: bytes) -> None:
-        self.sha256.update(data)
 
 
 def _is_refused(error: Exception) -> bool:

@@ -17,7 +17,7 @@ from typing import BinaryIO
 from manip_il.data.remote.blobs import OBJECTS, STALE, Stored
 from manip_il.data.remote.errors import NoSpaceError, NotFoundError, RemoteError, TransientError
 from manip_il.data.remote.manifest import LONGEST_TEXT
-from manip_il.data.remote.object_store import ObjectRemote, in_threads
+from manip_il.data.remote.object_store import ObjectRemote, wrong_when_read
 from manip_il.data.remote.remote import MANIFEST_FILE, Advance
 from manip_il.data.remote.sftp_connection import Connection, Sftp
 from manip_il.data.remote.sftp_lock import LOCK, Held, hold
@@ -157,17 +157,7 @@ class SftpBlobs:
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
         """Those that are not what their name says: hashed over there where that can be had, else read back."""
         right = self._hashed_there(sizes)
-
-        def one(key: str) -> bool:
-            digest = _Digest()
-            try:
-                self.fetch(key, digest, 0)  # pyright: ignore[reportArgumentType]
-            except NotFoundError:
-                return True
-            return digest.sha256.hexdigest() != key
-
-        unknown = [key for key in sizes if key not in right]
-        return {key for key, is_wrong in in_threads(self.threads, one, unknown).items() if is_wrong}
+        return wrong_when_read(self, [key for key in sizes if key not in right])
 
     def remove(self, keys: Iterable[str], token: str) -> None:
         """Remove objects, and what killed pushes left, unless another push has been."""
@@ -214,14 +204,6 @@ class SftpBlobs:
 
     def _path(self, key: str) -> str:
         return self._at(f"{OBJECTS}/{key[:2]}/{key}")
-
-
-class _Digest:
-    def __init__(self) -> None:
-        self.sha256 = hashlib.sha256()
-
-    def write(self, data: bytes) -> None:
-        self.sha256.update(data)
 
 
 def _make_folder(sftp: Sftp, path: str) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import boto3
 import pytest
 
+from .hub_server import Hub
+from .hub_use import a_hub, make_policy
 from .s3 import KEY, SECRET, Proxy, running_moto, running_proxy, variables
 from .sshd import Sshd, running_sshd
 
@@ -53,3 +55,16 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     server: Sshd = request.getfixturevalue("sshd")
     monkeypatch.setenv("HOME", str(server.home))
     return server.url(tmp_path / "store" / "demos")
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Hub]:
+    """A Hub that this process talks to."""
+    with a_hub(tmp_path / "hub") as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def tiny_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small ACT, as LeRobot writes it."""
+    return make_policy(tmp_path_factory.mktemp("policies") / "act")

@@ -25,26 +25,13 @@ from .hub_use import (
     POLICY,
     SAMPLE,
     TOKEN,
-    a_hub,
     contents,
     copy_sample,
     do_pull,
     do_push,
-    make_policy,
     other_version,
 )
 from .hub_wire import Fault
-
-
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[Hub]:
-    with a_hub(tmp_path / "hub") as server:
-        yield server
-
-
-@pytest.fixture(scope="module")
-def tiny_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_policy(tmp_path_factory.mktemp("policies") / "act")
 
 
 @pytest.fixture(scope="module")

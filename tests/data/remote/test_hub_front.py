@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from manip_il.data.remote.manifest import FileEntry, Manifest
 from manip_il.data.remote.scan import Scanned, scan
 
 from .hub_server import Hub
-from .hub_use import POLICY, a_hub, contents, do_pull, do_push, make_policy
+from .hub_use import POLICY, contents, do_pull, do_push
 
 RUN = {
     "config.yaml": b"# manip-il\n",
@@ -33,17 +32,6 @@ def manifest(files: dict[str, bytes]) -> Manifest:
 
 def fronted(files: dict[str, bytes]) -> Scanned:
     return with_front(Scanned(manifest(files), {path: Path(path) for path in files}))
-
-
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[Hub]:
-    with a_hub(tmp_path / "hub") as server:
-        yield server
-
-
-@pytest.fixture(scope="module")
-def tiny_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_policy(tmp_path_factory.mktemp("policies") / "act")
 
 
 @pytest.fixture

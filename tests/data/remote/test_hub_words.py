@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,14 +12,8 @@ from manip_il.data.remote.errors import AuthError, NoSpaceError, NotFoundError, 
 from manip_il.errors import ManipError, UsageError
 
 from .hub_server import LFS_SECRET, Hub
-from .hub_use import DATASET, POLICY, SAMPLE, TOKEN, a_hub, copy_sample, do_pull, do_push, make_policy
+from .hub_use import DATASET, POLICY, SAMPLE, TOKEN, copy_sample, do_pull, do_push, make_policy
 from .hub_wire import Fault
-
-
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[Hub]:
-    with a_hub(tmp_path / "hub") as server:
-        yield server
 
 
 def said(kind: type[ManipError], work: Callable[[], object]) -> str:

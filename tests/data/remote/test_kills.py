@@ -15,7 +15,6 @@ import pytest
 
 from manip_il.data.remote.pull import pull
 
-from .sshd import Sshd
 from .trees import content, impatient, make_run, unwatched
 
 KILLS = 10  # in each direction, on each kind of store
@@ -36,18 +35,7 @@ class Killer:
 
 
 @pytest.fixture
-def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "file":
-        return f"file://{tmp_path}/store/demos"
-    if request.param == "s3":
-        return f"s3://{request.getfixturevalue('bucket')}/demos"
-    server: Sshd = request.getfixturevalue("sshd")
-    monkeypatch.setenv("HOME", str(server.home))
-    return server.url(tmp_path / "store" / "demos")
-
-
-@pytest.fixture
-def killer(url: str) -> Iterator[Killer]:
+def killer(place: str) -> Iterator[Killer]:
     killer = Killer()  # after the environment says where the store is
     yield killer
     killer.process.stdin.close()
@@ -55,50 +43,48 @@ def killer(url: str) -> Iterator[Killer]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["file", "s3", "sftp"], indirect=True)
-def test_pushes(url: str, killer: Killer, tmp_path: Path) -> None:
+def test_pushes(place: str, killer: Killer, tmp_path: Path) -> None:
     runs = [make_run(tmp_path / f"run{n}", n, files=4, size=5_000) for n in range(3)]
     versions = [content(run) for run in runs]
-    assert killer("push", url, runs[0])["ended"] == 0
-    usual = killer("push", url, runs[1])["seconds"]
-    rng, killed, now, read = np.random.default_rng(7), 0, 1, Reader(url)
+    assert killer("push", place, runs[0])["ended"] == 0
+    usual = killer("push", place, runs[1])["seconds"]
+    rng, killed, now, read = np.random.default_rng(7), 0, 1, Reader(place)
     for number in range(5 * KILLS):
         if killed == KILLS:
             break
         new = (now + 1) % 3
-        killed += killer("push", url, runs[new], float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
+        killed += killer("push", place, runs[new], float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
         usual *= 1.0 if killed > number * 0.7 else 0.9  # it was slow when it was measured
         assert read(tmp_path / f"seen{number}") in (versions[now], versions[new])
-        assert killer("push", url, runs[new])["ended"] == 0
+        assert killer("push", place, runs[new])["ended"] == 0
         assert read(tmp_path / f"then{number}") == versions[new]
         now = new
     assert killed == KILLS
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("url", ["file", "s3", "sftp"], indirect=True)
-def test_pulls(url: str, killer: Killer, tmp_path: Path) -> None:
+def test_pulls(place: str, killer: Killer, tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", 1, files=4, size=5_000)
-    assert killer("push", url, run)["ended"] == 0
-    usual = killer("pull", url, tmp_path / "first")["seconds"]
+    assert killer("push", place, run)["ended"] == 0
+    usual = killer("pull", place, tmp_path / "first")["seconds"]
     rng, killed = np.random.default_rng(8), 0
     for number in range(5 * KILLS):
         if killed == KILLS:
             break
         target = tmp_path / f"got{number}"
-        killed += killer("pull", url, target, float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
+        killed += killer("pull", place, target, float(rng.uniform(0.05, 1.0) * usual))["ended"] == "killed"
         usual *= 1.0 if killed > number * 0.7 else 0.9  # it was slow when it was measured
         if target.exists():
             assert content(target) == content(run)
         else:
-            assert killer("pull", url, target)["ended"] == 0
+            assert killer("pull", place, target)["ended"] == 0
         assert content(target) == content(run)
     assert killed == KILLS
 
 
 class Reader:
-    def __init__(self, url: str):
-        self.url, self.remote = impatient(url)
+    def __init__(self, place: str):
+        self.url, self.remote = impatient(place)
 
     def __call__(self, target: Path) -> dict[str, bytes | str]:
         pull(self.url, self.remote, target, unwatched)
