@@ -87,6 +87,7 @@ def _hub(text: str, rest: str) -> RemoteUrl:
     if len(parts) == 3 and parts[0] in ("datasets", "models"):
         kind = "dataset" if parts.pop(0) == "datasets" else "policy"
     is_name = len(parts) == 2 and all(_HUB_NAME.fullmatch(part) and ".." not in part for part in parts)
+    is_name = is_name and parts[0] not in ("datasets", "models", "spaces")  # the user is missing
     if not is_name or (at and not _is_revision(revision)):
         raise _wrong("hf", text)
     return RemoteUrl("hf", "/".join(parts), kind, revision or None)

@@ -41,6 +41,7 @@ def test_a_host_with_everything() -> None:
         ("s3://bucket", "cannot be read; expected s3://BUCKET/FOLDER"),
         ("s3://bucket/../x", "expected s3://"),
         ("hf://demos", "expected hf://"),
+        ("hf://datasets/demos", "expected hf://datasets/USER/NAME"),
         ("hf://datasets/me/..", "expected hf://"),
         ("hf://me/x@../y", "expected hf://"),
         ("sftp://host", "expected sftp://"),
