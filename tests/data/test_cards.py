@@ -75,7 +75,7 @@ def test_a_card_tells_no_place_and_no_secret(tmp_path: Path, monkeypatch: pytest
     shutil.copytree(SAMPLE, copy)
     config = (
         "# manip-il 0.1.0: resolved options (RecordOptions)\nrobot:\n  type: panda\nseed: 3\n"
-        "dataset:\n  root: /home/me/demos\n  num_episodes: 10\nnote: hf_SecretOfTheTests\napi_key: abcdefgh\n"
+        "dataset:\n  root: /srv/lab/demos\n  num_episodes: 10\nnote: hf_SecretOfTheTests\napi_key: abcdefgh\n"
     )
     for place in (tmp_path / "demos.journals", run):
         place.mkdir(exist_ok=True)
@@ -84,7 +84,7 @@ def test_a_card_tells_no_place_and_no_secret(tmp_path: Path, monkeypatch: pytest
     for text in (card.decode() for card in cards):
         assert "--robot.type=panda" in text
         assert "--seed=3" in text
-        for secret in ("/home/me", str(tmp_path), "hf_Secret", "abcdefgh"):
+        for secret in ("/srv/lab", str(tmp_path), "hf_Secret", "abcdefgh"):
             assert secret not in text
         assert not re.search(r"\]\(/", text)
 
