@@ -45,6 +45,7 @@ class HubRemote:
     private: bool = False
     retry: Retry = field(default_factory=Retry)
     warnings: tuple[str, ...] = ()
+    threads: int = 8
 
     def __post_init__(self) -> None:
         self.endpoint = str(constants.ENDPOINT)

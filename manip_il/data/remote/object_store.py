@@ -35,7 +35,7 @@ class ObjectRemote:
 
     @property
     def threads(self) -> int:
-        """That may use it at a time."""
+        """That may fetch at a time."""
         return self.blobs.threads
 
     @property

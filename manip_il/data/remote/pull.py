@@ -17,7 +17,7 @@ from manip_il.data.remote.errors import NoSpaceError, NotFoundError
 from manip_il.data.remote.front import without_front
 from manip_il.data.remote.landing import Landing, is_whole
 from manip_il.data.remote.manifest import FileEntry, Manifest
-from manip_il.data.remote.object_store import ObjectRemote, in_threads
+from manip_il.data.remote.object_store import in_threads
 from manip_il.data.remote.push import Progress
 from manip_il.data.remote.remote import Advance, Remote, Snapshot
 from manip_il.data.remote.retry import Retry
@@ -25,7 +25,6 @@ from manip_il.data.remote.scan import CHECKPOINTS, HASHERS, JOURNALS, LAST, newe
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import FolderExistsError, UsageError
 
-THREADS = 8
 RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
 
 
@@ -91,10 +90,6 @@ class _Stage:
     def __post_init__(self) -> None:
         self.tree, self.parts = self.folder / "tree", self.folder / "parts"
 
-    @property
-    def _threads(self) -> int:
-        return self.remote.threads if isinstance(self.remote, ObjectRemote) else THREADS
-
     def fill(self, progress: Progress) -> int:
         """Bring and verify every file; return how many bytes were there already."""
         manifest = self.snapshot.manifest
@@ -112,7 +107,7 @@ class _Stage:
             advance(whole)
             # The largest first, else the last one runs alone.
             order = sorted(missing, key=lambda key: -missing[key][0].size)
-            in_threads(self._threads, lambda key: self._bring(missing[key], advance), order)
+            in_threads(self.remote.threads, lambda key: self._bring(missing[key], advance), order)
         sync_disk(self.folder)
         return whole + had
 

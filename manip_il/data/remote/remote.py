@@ -44,6 +44,11 @@ class Remote(Protocol):
         """What a user should know of this store, as far as it has shown by now."""
         ...
 
+    @property
+    def threads(self) -> int:
+        """That may fetch at a time."""
+        ...
+
     def describe(self) -> str:
         """The place, as messages name it: without any secret."""
         ...
