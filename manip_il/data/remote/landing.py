@@ -6,7 +6,7 @@ import errno
 import hashlib
 import io
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -15,7 +15,8 @@ from manip_il.data.remote.errors import HashError, NoSpaceError, RemoteError, Tr
 from manip_il.data.remote.manifest import FileEntry
 from manip_il.data.remote.remote import Advance
 
-_WORTH_A_THREAD = 2**17  # bytes that are hashed beside the writing [bytes]
+_WORTH_A_THREAD = 2**17  # that are hashed beside the writing [bytes]
+_WORTH_A_START = 2**25  # that the kernel is asked at once to bring to the disk [bytes]
 
 Fetch = Callable[[BinaryIO, int], None]  # writes the bytes from an offset on
 
@@ -31,7 +32,7 @@ class Landing:
     def once(self, fetch: Fetch) -> None:
         """Go on where the last try stopped. Raises `TransientError` where another try may help."""
         entry, part = self._entry, self._part
-        with part.open("ab", buffering=0) as file, ThreadPoolExecutor(1) as helper:
+        with part.open("ab", buffering=0) as file, ThreadPoolExecutor(2) as helper:
             digest = hasher(entry)
             offset = self._hash_what_is_there(digest)
             self._count(offset)
@@ -78,6 +79,8 @@ def is_whole(entry: FileEntry, path: Path) -> bool:
 
 
 class _Incoming(io.RawIOBase):
+    """What stores write to; they may use the memory of one write again when the next one has returned."""
+
     def __init__(
         self,
         file: io.RawIOBase,
@@ -89,7 +92,8 @@ class _Incoming(io.RawIOBase):
     ):
         super().__init__()
         self._file, self._digest, self._entry, self._count, self._helper = file, digest, entry, count, helper
-        self.position = offset
+        self._hashed: Future[None] | None = None
+        self._on_its_way = self.position = offset
 
     def writable(self) -> bool:
         return True
@@ -99,19 +103,26 @@ class _Incoming(io.RawIOBase):
         if self.position + len(chunk) > self._entry.size:
             text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
             raise HashError(f"{text}; nothing of it was kept: have it pushed anew, to an empty place")
-        hashed = self._helper.submit(self._digest.update, chunk) if len(chunk) >= _WORTH_A_THREAD else None
+        if self._hashed is not None:
+            self._hashed.result()
+        # A large one is hashed while it is written and the next one is fetched.
+        is_large = len(chunk) >= _WORTH_A_THREAD
+        self._hashed = self._helper.submit(self._digest.update, chunk) if is_large else None
+        if not is_large:
+            self._digest.update(chunk)
+        self._write(chunk)
+        self.position += len(chunk)
+        self._count(self.position)
+        return len(chunk)
+
+    def _write(self, chunk: memoryview) -> None:
         try:
             write_all(self._file, chunk)
-            if hashed is not None:
-                start_writing(self._file.fileno(), self.position, len(chunk))
+            end = self.position + len(chunk)
+            if end - self._on_its_way >= _WORTH_A_START:
+                self._helper.submit(start_writing, self._file.fileno(), self._on_its_way, end - self._on_its_way)
+                self._on_its_way = end
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise NoSpaceError("the disk is full; make room and pull again: what has come is kept") from None
             raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; look at that disk") from None
-        if hashed is None:
-            self._digest.update(chunk)
-        else:
-            hashed.result()  # before the caller uses the memory again
-        self.position += len(chunk)
-        self._count(self.position)
-        return len(chunk)

@@ -21,10 +21,10 @@ from manip_il.data.remote.object_store import ObjectRemote, wrong_when_read
 from manip_il.data.remote.remote import MANIFEST_FILE, Advance
 from manip_il.data.remote.sftp_connection import Connection, Sftp
 from manip_il.data.remote.sftp_lock import LOCK, Held, hold
+from manip_il.data.remote.sftp_reads import read_ahead
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
 
-CHUNK = 2**18  # of what is read at a time [bytes]
 REQUEST = 32_600  # of what is written at a time: with 32,768 each one would travel in two packets [bytes]
 HASH_TIME = 600.0  # the other machine may take so long over sha256sum [s]
 
@@ -56,8 +56,7 @@ class SftpBlobs:
         with self._sftp("read") as sftp:
             try:
                 with sftp.open(self._at(MANIFEST_FILE), "rb") as file:
-                    file.prefetch(min(file.stat().st_size or 0, LONGEST_TEXT + 1))
-                    data = file.read(LONGEST_TEXT + 1)
+                    data = b"".join(read_ahead(sftp, file, 0, min(file.stat().st_size or 0, LONGEST_TEXT + 1)))
             except FileNotFoundError:
                 return None
         return data, hashlib.sha256(data).hexdigest()
@@ -99,14 +98,8 @@ class SftpBlobs:
             except FileNotFoundError:
                 raise NotFoundError(f"{self._name} has no object {key[:12]}") from None
             with file:
-                size = file.stat().st_size or 0
-                file.seek(offset)
-                if size - offset > file.MAX_REQUEST_SIZE:
-                    file.prefetch(size)
-                # Never past the end, which would be one more question.
-                while offset < size and (chunk := file.read(min(CHUNK, size - offset))):
+                for chunk in read_ahead(sftp, file, offset, file.stat().st_size or 0):
                     target.write(chunk)
-                    offset += len(chunk)
 
     def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
         """Send under another name and rename; what has arrived is looked at later, for many objects at once."""
