@@ -136,7 +136,7 @@ class FileBlobs:
         return self.find(path.name for path in self._all() if not path.name.startswith("."))
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
-        """Those that are not what their name says."""
+        """Those that are missing, or are not what their name says."""
         with self._explained(f"read {self._name}"):
             digests = in_threads(self.threads, lambda key: _digest(self._path(key)), sizes)
         return {key for key, digest in digests.items() if digest != key}
@@ -207,5 +207,8 @@ class FileBlobs:
 
 def _digest(path: Path) -> str:
     digest = hashlib.sha256()
-    hash_file(path, digest)
+    try:
+        hash_file(path, digest)
+    except FileNotFoundError:
+        return ""
     return digest.hexdigest()

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.doctor.finding import NotWhole, Severity
+from manip_il.data.lerobot_layout import INFO
 from manip_il.data.remote.front import with_front
 from manip_il.data.remote.landing import is_whole
 from manip_il.data.remote.manifest import Kind, Manifest
 from manip_il.data.remote.remote import Advance, Published, Remote, Snapshot
-from manip_il.data.remote.scan import Scanned, kind_of, scan
+from manip_il.data.remote.scan import Scanned, is_left_out, kind_of, scan
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
 
@@ -37,7 +39,8 @@ def push(
 ) -> tuple[Plan, Published | None]:
     """What was to be done, and what was; nothing with `dry_run`.
 
-    A dataset that the doctor finds errors in is refused (`NotWhole`), and so is one kind over the other (`UsageError`).
+    A dataset that the doctor finds errors in is refused (`NotWhole`), in a run too; one kind over the other is not
+    pushed either (`UsageError`).
     """
     kind = check_source(source, url)
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
@@ -60,13 +63,22 @@ def check_source(source: Path, url: RemoteUrl) -> Kind:
         place = url.place
         right = f"hf://datasets/{place}" if kind == "dataset" else f"hf://{place}"
         raise UsageError(f"{source} is a {kind}, {url} is the place of a {url.kind}; push it to {right}")
-    if kind == "dataset":
-        findings = examine_folder(source)
+    for dataset in _datasets(source):
+        findings = examine_folder(dataset)
         if has_errors(findings):
             first = next(finding for finding in findings if finding.severity is Severity.ERROR)
-            text = f"{source} is not whole and was not pushed: {' '.join(str(first).split())}"
-            raise NotWhole(f"{text}; see all with manip-il doctor {source}, and repair it with --repair=true")
+            text = f"{dataset} is not whole and was not pushed: {' '.join(str(first).split())}"
+            raise NotWhole(f"{text}; see all with manip-il doctor {dataset}, and repair it with --repair=true")
     return kind
+
+
+def _datasets(source: Path) -> Iterator[Path]:
+    """Folders of datasets: `source` itself, or those of a run's rounds."""
+    for folder, names, _ in os.walk(source):
+        names[:] = sorted(name for name in names if not is_left_out(name))
+        if (Path(folder) / INFO).is_file():
+            names.clear()
+            yield Path(folder)
 
 
 def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import re
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -100,16 +100,28 @@ async def abort_old(
     client: Any, bucket: str, prefix: str, is_old: Callable[[datetime, Mapping[str, Any]], bool]
 ) -> None:
     """Abort uploads that nobody will go on with. is_old: of when one began, and the answer that told it."""
-    answer = await _asked(client.list_multipart_uploads, Bucket=bucket, Prefix=prefix)
-    for item in answer.get("Uploads", ()):
-        if item["Key"].startswith(prefix) and is_old(item["Initiated"], answer):
+    async for item, answer in _uploads(client, bucket, prefix):
+        if is_old(item["Initiated"], answer):
             await _abort(client, {"Bucket": bucket, "Key": item["Key"], "UploadId": item["UploadId"]})
+
+
+async def _uploads(client: Any, bucket: str, prefix: str) -> AsyncIterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Uploads that were begun and not ended, each with the answer that named it."""
+    more: dict[str, str] = {}
+    while True:
+        answer = await _asked(client.list_multipart_uploads, Bucket=bucket, Prefix=prefix, **more)
+        for item in answer.get("Uploads", ()):
+            if item["Key"].startswith(prefix):  # some stores do not know of prefixes here
+                yield item, answer
+        more = {name: answer[f"Next{name}"] for name in ("KeyMarker", "UploadIdMarker") if answer.get(f"Next{name}")}
+        if not answer.get("IsTruncated") or not more:
+            return
 
 
 async def _under_way(client: Any, place: Mapping[str, str]) -> str | None:
     """The newest upload of this object that was begun and not ended."""
-    answer = await _asked(client.list_multipart_uploads, Bucket=place["Bucket"], Prefix=place["Key"])
-    uploads = [item for item in answer.get("Uploads", ()) if item["Key"] == place["Key"]]
+    found = _uploads(client, place["Bucket"], place["Key"])
+    uploads = [item async for item, _ in found if item["Key"] == place["Key"]]
     return str(max(uploads, key=lambda item: item["Initiated"])["UploadId"]) if uploads else None
 
 

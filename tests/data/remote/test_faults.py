@@ -179,6 +179,14 @@ def test_a_disk_that_fills_up_meanwhile(tmp_path: Path, monkeypatch: pytest.Monk
     assert content(tmp_path / "got") == content(run)
 
 
+def test_an_object_that_is_gone_is_named(tmp_path: Path) -> None:
+    url, remote = impatient(f"file://{tmp_path}/store")
+    push(make_run(tmp_path / "run", 1), url, remote, unwatched)
+    keys = sorted(remote.read().manifest.keys)
+    (tmp_path / "store" / "objects" / keys[0][:2] / keys[0]).unlink()
+    assert remote.blobs.wrong(dict.fromkeys(keys, 0)) == {keys[0]}
+
+
 def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from manip_il.data.remote.scan import scan
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +139,27 @@ def test_only_uploads_that_were_given_up_are_cleared_away(
     left = {item["Key"] for item in client.list_multipart_uploads(Bucket=bucket)["Uploads"]}
     assert left == {"other/objects/ab/abc"} | (set() if is_old else {"demos/objects/ab/abc"})
     assert remote.warnings == ()
+
+
+@pytest.mark.parametrize("names_uploads", [True, False])
+def test_uploads_on_every_page_are_cleared_away(names_uploads: bool) -> None:
+    aborted: list[str] = []
+    uploads = [{"Key": f"demos/{n}", "UploadId": f"u{n}", "Initiated": datetime(2000, 1, 1 + n)} for n in range(5)]
+
+    class Paged:
+        """Two a page, as stores with thousands do."""
+
+        async def list_multipart_uploads(self, Bucket: str, Prefix: str, KeyMarker: str = "", **_: str):
+            rest = [item for item in uploads if item["Key"] > KeyMarker]
+            marker = {"NextUploadIdMarker": rest[1]["UploadId"]} if names_uploads and rest[1:] else {}
+            more = {"IsTruncated": True, "NextKeyMarker": rest[1]["Key"], **marker} if rest[2:] else {}
+            return {"Uploads": rest[:2], **more}
+
+        async def abort_multipart_upload(self, **place: str) -> None:
+            aborted.append(place["UploadId"])
+
+    asyncio.run(s3_upload.abort_old(Paged(), "bucket", "demos/", lambda began, answer: began.day != 4))
+    assert aborted == ["u0", "u1", "u2", "u4"]
 
 
 def _sent(proxy: Proxy) -> list[int]:

@@ -271,6 +271,17 @@ def test_a_dataset_that_is_not_whole_is_refused(tmp_path: Path, dataset: Path) -
     assert not (tmp_path / "store").exists()
 
 
+def test_a_run_with_a_dataset_that_is_not_whole_is_refused(tmp_path: Path, dataset: Path) -> None:
+    run = make_run(tmp_path / "run", 1)
+    inside = run / "round_000" / "dataset"
+    shutil.copytree(dataset, inside)
+    url, remote = impatient(f"file://{tmp_path}/store")
+    push(run, url, remote, silent)
+    (inside / TASKS).unlink()
+    with pytest.raises(NotWhole, match=r"round_000/dataset is not whole and was not pushed"):
+        push(run, url, remote, silent)
+
+
 def test_another_kind_is_not_pushed_over(place: str, tmp_path: Path, dataset: Path) -> None:
     url, remote = impatient(place)
     push(make_run(tmp_path / "run", 1), url, remote, silent)
