@@ -1,7 +1,7 @@
 """A file over SFTP from one end to the other, with many reads under way, all asked and answered by one thread.
 
 paramiko's own `prefetch` asks from a second thread. Where the reader catches up with that one, it takes the file for
-read, asks for the rest part by part and is sent everything twice: a third of the speed, by chance.
+read, asks for the rest part by part and is sent everything twice.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any
 from paramiko import SFTPClient, SFTPFile
 from paramiko.sftp import CMD_DATA, CMD_READ, CMD_STATUS, SFTPError, int64
 
-REQUEST = 2**17  # that is asked for at once; servers may send less, and every one sends 2**15 [bytes]
+REQUEST = 2**17  # that is asked for at once, where the server sends as much [bytes]
+SMALLEST = 2**15  # that every server is to send at once [bytes]
 UNDER_WAY = 2**22  # twice what ssh lets be on its way [bytes]
 
 
@@ -27,7 +28,7 @@ def read_ahead(sftp: SFTPClient, file: SFTPFile, offset: int, size: int) -> Iter
     if not first:
         return
     yield first
-    asked, most = offset + len(first), len(first)  # a server that sent less always will
+    asked, most = offset + len(first), max(len(first), SMALLEST)  # a server that sent less always will
     under_way = deque[tuple[int, int, int]]()
     while asked < size or under_way:
         while asked < size and len(under_way) * most < UNDER_WAY:

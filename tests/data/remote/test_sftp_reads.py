@@ -64,6 +64,7 @@ def test_any_part_of_any_file_comes_whole(data: st.DataObject, order: random.Ran
     server = Server(content, data.draw(st.integers(1, 200)), order)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sftp_reads, "REQUEST", 100)
+        patch.setattr(sftp_reads, "SMALLEST", 25)
         patch.setattr(sftp_reads, "UNDER_WAY", 700)
         assert read(server, offset, size) == content[offset:size]
     assert server.most_under_way <= 700 + 100
@@ -80,6 +81,13 @@ def test_a_server_that_sends_less_is_asked_for_less() -> None:
     server = Server(bytes(2**20), most=2**15)
     assert read(server, 0, 2**20) == server.content
     assert {length for _, length in server.asked[1:]} == {2**15}
+
+
+def test_a_server_that_trickles_is_not_asked_for_crumbs() -> None:
+    server = Server(bytes(2**19), most=1000)
+    assert read(server, 0, 2**19) == server.content
+    assert server.most_under_way <= UNDER_WAY + REQUEST
+    assert len(server.asked) < 2 * 2**19 / 1000
 
 
 def test_what_the_server_refuses_is_raised() -> None:
