@@ -144,7 +144,9 @@ def test_only_uploads_that_were_given_up_are_cleared_away(
 @pytest.mark.parametrize("names_uploads", [True, False])
 def test_uploads_on_every_page_are_cleared_away(names_uploads: bool) -> None:
     aborted: list[str] = []
-    uploads = [{"Key": f"demos/{n}", "UploadId": f"u{n}", "Initiated": datetime(2000, 1, 1 + n)} for n in range(5)]
+    uploads: list[dict[str, Any]] = [
+        {"Key": f"demos/{n}", "UploadId": f"u{n}", "Initiated": datetime(2000, 1, 1 + n)} for n in range(5)
+    ]
 
     class Paged:
         """Two a page, as stores with thousands do."""
