@@ -178,7 +178,9 @@ class Kills:
     def __call__(self, folder: Path) -> None:
         if self.count == KILLS:
             return
-        if self._child.run(self._do, folder, float(self._rng.uniform(0.05, 1.0)) * self._usual) != 0:
+        code = self._child.run(self._do, folder, float(self._rng.uniform(0.05, 1.0)) * self._usual)
+        assert code in (0, -signal.SIGKILL)
+        if code:
             self.count += 1
         else:
             self._usual *= 0.9  # it was slow when it was measured
