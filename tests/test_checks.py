@@ -1,0 +1,86 @@
+"""What is read from outside has its declared type afterwards, or is refused in one short line."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il import checks
+from manip_il.errors import ManipError
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+CHECKS = {
+    "name": (lambda value: checks.name("it", value), str),
+    "repo id": (lambda value: checks.repo_id("it", value), str),
+    "text": (lambda value: checks.text("it", value, 50), str),
+    "truth": (lambda value: checks.truth("it", value), bool),
+    "whole": (lambda value: checks.whole("it", value, 0, 10), int),
+    "number": (lambda value: checks.number("it", value, -1.0, 1.0), float),
+    "array": (lambda value: checks.array("it", value, 3), list),
+    "mapping": (lambda value: checks.mapping("it", value), dict),
+}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+@given(value=ANYTHING)
+def test_a_value_has_its_type_or_is_refused_in_one_short_line(check: str, value: object):
+    function, kind = CHECKS[check]
+    try:
+        checked = function(value)
+    except ManipError as error:
+        message = str(error)
+    else:
+        assert type(checked) is kind
+        return
+    assert message.startswith("it is ")
+    assert "expected" in message
+    assert len(message) < 500
+
+
+@pytest.mark.parametrize(
+    "value", ["", ".", "..", ".hidden", "a..b", "../a", "a/b", "a\\b", "a\n", "a\0", "~", "é", "a" * 101, None, 3]
+)
+def test_names_that_could_leave_a_folder_are_refused(value: object):
+    with pytest.raises(ManipError, match="camera is"):
+        checks.name("camera", value)
+
+
+@pytest.mark.parametrize("value", ["front", "wrist_2", "so-101", "v1.2", "_"])
+def test_plain_names_are_taken(value: str):
+    assert checks.name("camera", value) == value
+
+
+@pytest.mark.parametrize("value", ["../a", "a/../b", "a/b/c", "/a", "a/", "~/x", 3])
+def test_repo_ids_have_one_or_two_plain_parts(value: object):
+    with pytest.raises(ManipError):
+        checks.repo_id("repo id", value)
+    assert checks.repo_id("repo id", "user/name") == "user/name"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, '{"a": NaN}', "9" * 5_000, "{", "", b"\xff"],
+    ids=["deep", "nan", "long", "cut", "empty", "utf"],
+)
+def test_json_that_is_none_is_refused_in_one_line(text: str | bytes):
+    with pytest.raises(ManipError, match="f is not valid JSON"):
+        checks.parse_json("f", text)
+
+
+def test_a_file_larger_than_allowed_is_refused(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps({"a": "b" * 100}))
+    assert checks.read_json(path, "an x") == {"a": "b" * 100}
+    with pytest.raises(ManipError, match="more than 20 bytes"):
+        checks.read_json(path, "an x", largest=20)
+
+
+def test_a_huge_value_is_printed_short():
+    assert len(checks.shorten([["a" * 1_000] * 1_000] * 1_000)) <= 300
+    assert len(checks.shorten(10**4_000)) < 200
+    assert checks.shorten(10**5_000) == "a huge int"
