@@ -85,11 +85,11 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= sys.float_info.max or not low <= value <= high:
-        limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
-        raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
-    return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if abs(value) <= sys.float_info.max and low <= value <= high:
+            return float(value)
+    limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
+    raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
 
 
 def array(what: str, value: object, longest: int = 1_000_000) -> list[Any]:
