@@ -85,9 +85,8 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if abs(value) <= sys.float_info.max and low <= value <= high:
-            return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and _is_float(value):
+        return float(value)
     limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
     raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
 
@@ -126,6 +125,11 @@ def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, A
     if len(data) > largest:
         raise ManipError(f"{path} has more than {largest} bytes; expected {what}")
     return mapping(str(path), parse_json(str(path), data))
+
+
+def _is_float(value: float) -> bool:
+    """Whether a number is finite and no int beyond what a float holds."""
+    return abs(value) <= sys.float_info.max
 
 
 def _refuse_constant(constant: str) -> Any:

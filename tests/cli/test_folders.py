@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
@@ -139,7 +139,6 @@ def test_records_come_back_in_order(tmp_path):
     assert read_jsonl(path) == [{"round": 0, "loss": 0.5, "path": "x", "rates": [1, 2]}, {"round": 1}]
 
 
-@settings(deadline=None)
 @given(cut=st.integers(min_value=0))
 def test_a_kill_at_any_byte_costs_at_most_the_last_record(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("torn") / "metrics.jsonl"

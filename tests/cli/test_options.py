@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.cli.options import CONFIG_HEADER, Open, dump_yaml, from_layers, from_yaml, options_of, parse, to_plain
@@ -188,7 +188,6 @@ any_options = st.builds(
 )
 
 
-@settings(deadline=None)
 @given(any_options)
 def test_options_survive_yaml(tmp_path_factory, options):
     path = tmp_path_factory.mktemp("yaml") / "config.yaml"
@@ -208,7 +207,6 @@ def as_word(value: object) -> str:
             return str(value)
 
 
-@settings(deadline=None)
 @given(any_options)
 def test_options_survive_the_command_line(options):
     options = replace(options, cameras=[], note=None)  # a comma in an item, and the text "null", need YAML

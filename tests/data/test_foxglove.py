@@ -44,7 +44,6 @@ def read(data: bytes) -> list[tuple[str, int, Any]]:
     ]
 
 
-@settings(deadline=None)
 @given(hnp.arrays(np.float64, (3, 2), elements=st.floats(allow_nan=False, allow_infinity=False)))
 def test_numbers_keep_every_bit(values: np.ndarray) -> None:
     times = [0, 1, 2**62]
@@ -77,7 +76,7 @@ def test_whole_numbers_stay_whole() -> None:
     assert message == {"scalars": [{"label": "seed", "value": big}]}
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(hnp.arrays(np.uint8, st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 5), st.just(3))))
 def test_pictures_come_back_bit_for_bit(pictures: np.ndarray) -> None:
     columns = {s.IMAGES + "front": pictures, s.IMAGES + "wrist": pictures[:, ::-1]}

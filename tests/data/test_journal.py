@@ -58,7 +58,7 @@ def assert_same(left: Episode, right: Episode) -> None:
         assert mine.tobytes() == values.tobytes()  # bits: a minus zero is one
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(any_episode())
 def test_any_columns_come_back_bit_for_bit(episode: Episode) -> None:
     spec = s.RobotTaskSpec("r", "t", 30, ("a", "b", "%s"), ("ee.x", "ee.y", "ee.z"), 1, "")

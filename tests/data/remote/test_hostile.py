@@ -86,7 +86,7 @@ def store_with(folder: Path, manifest: bytes) -> str:
     return f"file://{folder}/store"
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(BAD_TREES)
 @example({"version": 1, "kind": "policy", "files": [file("../escaped.txt")]})
 def test_hostile_manifests_are_refused_and_nothing_is_written(tree: Any) -> None:
