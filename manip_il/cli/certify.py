@@ -60,6 +60,7 @@ class CertifyOptions:
         if self.cases < 1:
             raise UsageError(f"--cases is {self.cases}; expected at least 1")
         env, policy = self._who()
+        from manip_il.data.atomic import exclusive
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.certificate import FILE_NAME
         from manip_il.evaluation.certificate_table import certificate_lines
@@ -67,14 +68,14 @@ class CertifyOptions:
 
         stream_seeds("certificate", self.cases, self.seed)  # numbers out of range are said before a folder is made
         engine = Engine(self.workers, self.engine)
-
-        try:
-            prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
-        except FolderExistsError:
-            raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
-        save_options(self.output_dir, self)
-        certificate = self._certify(engine, env, policy)
-        certificate.write(self.output_dir / FILE_NAME)
+        with exclusive(self.output_dir):
+            try:
+                prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
+            except FolderExistsError:
+                raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
+            save_options(self.output_dir, self)
+            certificate = self._certify(engine, env, policy)
+            certificate.write(self.output_dir / FILE_NAME)
         for line in certificate_lines(certificate):
             say(line)
         say(f"result: {self.output_dir / FILE_NAME}")

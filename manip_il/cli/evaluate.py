@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -89,13 +90,18 @@ class EvalOptions:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
         self._check()
         seeds = self._seeds()
-        from manip_il.cli.stages import Stages
         from manip_il.engine.engine import Engine
-        from manip_il.evaluation.results import FILE_NAME
 
         engine = Engine(self.workers, self.engine)
         job = self._job(engine, len(seeds))
-        self._prepare()
+        with contextlib.ExitStack() as held:
+            self._prepare(held)
+            self._run(job, seeds, engine)
+
+    def _run(self, job: RolloutJob, seeds: range, engine: Engine) -> None:
+        from manip_il.cli.stages import Stages
+        from manip_il.evaluation.results import FILE_NAME
+
         kept = KeptEpisodes.open(self.output_dir, job, self.suite, str(self.output_dir))
         with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
             result = self._evaluate(job, seeds, engine, kept, stages)
@@ -167,9 +173,12 @@ class EvalOptions:
         task = self.task.type or (meta.task if meta else DEFAULT_TASK)
         return self.env.config(robot, task, meta.fps if meta else DEFAULT_HZ)
 
-    def _prepare(self) -> None:
-        """Make the folder, before the first episode."""
+    def _prepare(self, held: contextlib.ExitStack) -> None:
+        """Make the folder, before the first episode, and hold it for as long as `held` is open."""
+        from manip_il.data.atomic import exclusive
+
         try:
+            held.enter_context(exclusive(self.output_dir))
             prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
             if self.resume:
                 check_same_options(self.output_dir, self, FREE, may_grow="eval.n_episodes")

@@ -32,6 +32,7 @@ class MergeOptions:
 
     def run(self) -> None:
         """Read all, merge, write, print the table."""
+        from manip_il.data.atomic import exclusive
         from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.evaluation.eval_report import EvalReport, eval_page
         from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
@@ -51,14 +52,15 @@ class MergeOptions:
         (first, one), *others = parts.items()
         for name, other in others:
             warn(compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
-        try:
-            prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
-        except FolderExistsError:
-            raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
-        save_options(self.output_dir, self)
-        merged.write(self.output_dir / FILE_NAME)
-        report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))
-        write_page(self.output_dir / REPORT_FILE, eval_page(report))
+        with exclusive(self.output_dir):
+            try:
+                prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
+            except FolderExistsError:
+                raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
+            save_options(self.output_dir, self)
+            merged.write(self.output_dir / FILE_NAME)
+            report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))
+            write_page(self.output_dir / REPORT_FILE, eval_page(report))
         print_table(evaluation_table(merged))
         for line in evaluation_lines(merged):
             say(line)

@@ -70,6 +70,7 @@ class TrainOptions:
 
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
+        from manip_il.data.atomic import exclusive
         from manip_il.data.lerobot_io import read_fingerprint, read_spec
 
         if not _is_first_process():
@@ -77,11 +78,13 @@ class TrainOptions:
         config = self._config()
         spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
         check_dataset(self.dataset.root, spec, fingerprint)
-        if _is_first_process():
-            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-            if self.resume:
-                check_same_options(self.output_dir, self, _FREE)
-        path = self._fit(config, spec, fingerprint)
+        with contextlib.ExitStack() as held:
+            if _is_first_process():
+                held.enter_context(exclusive(self.output_dir))
+                prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+                if self.resume:
+                    check_same_options(self.output_dir, self, _FREE)
+            path = self._fit(config, spec, fingerprint)
         if _is_first_process():
             say(f"checkpoint: {path}")
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import fcntl
 import os
 import shutil
@@ -54,19 +55,43 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 def exclusive(folder: Path) -> Generator[None]:
     """Hold `folder`, which need not exist, for this process; others see a file `.<name>.lock` beside it.
 
-    Raises `FolderBusyError`, with the holder's process id, where another process holds it. The kernel lets go of what
-    a killed process held.
+    Where nothing may be written beside it (a container's volume), the folder itself is what is held. Raises
+    `FolderBusyError`, with the holder's process id, where another process holds it. The kernel lets go of what a killed
+    process held.
     """
     folder = folder.absolute()
     path = folder.with_name(f".{folder.name}.lock")
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle = _lock(folder, path)
+    try:
+        handle = _lock(folder, path)
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
+            raise
+        with _holding_itself(folder):
+            yield
+        return
     try:
         os.ftruncate(handle, 0)
         os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
         path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _holding_itself(folder: Path) -> Generator[None]:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise FolderBusyError(folder, "unknown") from error
+    except OSError:
+        pass  # a network file system may know no locks
+    try:
+        yield
+    finally:
         os.close(handle)
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from functools import partial
-from multiprocessing import get_context, parent_process, resource_tracker
+from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 
 import numpy as np
 from numpy.lib import format as npy
 
+from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.data.frame_source import FrameSource, Part
 from manip_il.errors import ManipError
 
@@ -57,9 +57,9 @@ def _written(write: Callable[[Part], int], parts: Sequence[Part], workers: int) 
     if workers == 1:
         yield from map(write, parts)
         return
-    pool = ProcessPoolExecutor(min(workers, len(parts)), get_context("spawn"), initializer=_end_with_parent)
+    pool = ProcessPoolExecutor(min(workers, len(parts)), get_context("spawn"), initializer=initialize_worker)
     try:
-        with _interrupts_held():  # starts the processes
+        with _interrupts_held(), bound_to_this_process():  # starts the processes
             futures = [pool.submit(write, part) for part in parts]
         for future in as_completed(futures):
             yield future.result()
@@ -95,14 +95,3 @@ def _interrupts_held() -> Generator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def _end_with_parent() -> None:
-    """Without this a worker whose parent was killed would wait for work forever."""
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def _wait_for_parent() -> None:
-    if (parent := parent_process()) is not None:
-        parent.join()
-        os._exit(1)

@@ -11,6 +11,7 @@ from collections.abc import Generator, Iterator
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 
+from manip_il.child_processes import bound_to_this_process, watch_parent
 from manip_il.engine.engine import Event, Task, portable, run_task
 from manip_il.mdp import Episode
 
@@ -30,7 +31,7 @@ def start_server(learned: bool) -> None:
     threads = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:
-        with _without_interrupts():
+        with _without_interrupts(), bound_to_this_process():
             resource_tracker.ensure_running()  # first, as its own start would undo the mask
             forkserver.ensure_running()
     finally:
@@ -130,6 +131,7 @@ class _Worker:
 
 def _serve(connection: Connection) -> None:
     """A worker's life: tasks in, episodes out, until the other end goes away."""
+    watch_parent()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
             for message in _answer(connection.recv_bytes()):

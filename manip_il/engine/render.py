@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.data import schema
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.lerobot_io import (
@@ -123,11 +123,12 @@ def render_episodes(
         for episode in episodes:
             yield _with_pictures(episode, render(episode.columns[schema.SIM_STATE]))
         return
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_leave_interrupts_alone)
+    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=initialize_worker)
     waiting: deque[tuple[Episode, Future[Pictures]]] = deque()
     try:
         for episode in episodes:
-            waiting.append((episode, pool.submit(render, episode.columns[schema.SIM_STATE])))
+            with bound_to_this_process():  # it starts processes as they are needed
+                waiting.append((episode, pool.submit(render, episode.columns[schema.SIM_STATE])))
             if len(waiting) > workers:
                 yield _next(waiting)
         while waiting:
@@ -164,7 +165,3 @@ def _with_pictures(episode: Episode, pictures: Pictures) -> Episode:
 def _next(waiting: deque[tuple[Episode, Future[Pictures]]]) -> Episode:
     episode, pictures = waiting.popleft()
     return _with_pictures(episode, pictures.result())
-
-
-def _leave_interrupts_alone() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one

@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
+from manip_il.child_processes import bound_to_this_process
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName
 from manip_il.learn.observation import OBSERVATIONS
@@ -92,7 +93,8 @@ class ManipILEnv(EnvConfig):
         mode = AutoresetMode.SAME_STEP  # LeRobot reads an episode's last `info` in the step that ends it
         if use_async_envs and n_envs > 1:
             _preload()
-            envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
+            with bound_to_this_process():
+                envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
         else:
             envs = SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
         return {self.type: {0: envs}}

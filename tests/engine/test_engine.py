@@ -120,18 +120,21 @@ def test_what_a_worker_raises_arrives_and_the_engine_goes_on(two_processes, tmp_
 @pytest.mark.slow
 def test_workers_end_with_the_process_that_started_them():
     code = (
+        "from multiprocessing import forkserver, resource_tracker\n"
         "from manip_il.engine.engine import *\n"
         "from manip_il.sim.env import EnvConfig\n"
         "engine = Engine(2)\n"
         "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
-        "    print([worker._process.pid for worker in engine._place._busy.values()], flush=True)\n"
+        "    pids = [worker._process.pid for worker in engine._place._busy.values()]\n"
+        "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
+        "    print(pids, flush=True)\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     pids = [int(pid) for pid in parent.stdout.readline().strip("[]\n").split(",")]
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while any(alive(pid) for pid in pids):
         assert time.monotonic() < deadline
         time.sleep(0.05)

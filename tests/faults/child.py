@@ -5,13 +5,53 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from multiprocessing import util
+from typing import Any
 
 
-def run_command(words: Sequence[str], log: str) -> None:
-    """In a child: one command, as from a shell, with all that it says in the file `log`."""
+def run_command(words: Sequence[str], log: str, warm: bool = False) -> None:
+    """In a child: one command, as from a shell, in a session of its own, with all that it says in the file `log`.
+
+    warm: what its workers are forked from has loaded everything, as this process has.
+    """
     from manip_il.cli.main import main
 
+    os.setsid()
     handle = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
+    if warm:
+        vars(util)["spawnv_passfds"] = _fork_what_would_be_spawned
     sys.exit(main(words))
+
+
+def living(session: int) -> list[int]:
+    """Processes of a session, without those that only wait for their parent to look at how they ended."""
+    return [int(pid) for pid in os.listdir("/proc") if pid.isdecimal() and _is_alive_in(pid, session)]
+
+
+def _is_alive_in(pid: str, session: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            state, _, _, its_session, *_ = file.read().rpartition(")")[2].split()
+    except OSError:
+        return False
+    return int(its_session) == session and state not in "ZX"
+
+
+def _fork_what_would_be_spawned(path: bytes, words: Sequence[Any], handles: Sequence[int]) -> int:
+    """`multiprocessing.util.spawnv_passfds` for a `python -c CODE` whose imports are done: seconds are saved."""
+    from manip_il.child_processes import obey_parent
+
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        low = 3
+        for handle in (*sorted(handles), os.sysconf("SC_OPEN_MAX")):
+            os.closerange(low, handle)
+            low = handle + 1
+        obey_parent()
+        exec(words[-1], {})
+    finally:
+        os._exit(0)

@@ -15,6 +15,13 @@ from child import run_command
 _PRELOAD = [
     "manip_il.cli.record",
     "manip_il.cli.stages",
+    "manip_il.cli.dagger",
+    "manip_il.cli.evaluate",
+    "manip_il.cli.shown",
+    "manip_il.dagger.loop",
+    "manip_il.evaluation.eval_report",
+    "manip_il.learn.policy",
+    "manip_il.learn.train",
     "manip_il.dagger.collect",
     "manip_il.engine.local",
     "pyarrow.parquet",
@@ -27,8 +34,8 @@ def start(tmp_path_factory) -> Callable[..., ForkServerProcess]:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOAD)
 
-    def begin(*words: str, log: Path) -> ForkServerProcess:
-        process = context.Process(target=run_command, args=(words, str(log)))
+    def begin(*words: str, log: Path, warm: bool = False) -> ForkServerProcess:
+        process = context.Process(target=run_command, args=(words, str(log), warm))
         process.start()
         return process
 
