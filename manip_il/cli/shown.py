@@ -62,14 +62,13 @@ def chosen_seeds(result: EvalResult, count: int) -> list[int]:
 
 def film_episode(job: RolloutJob, episode: Episode) -> Film:
     """The episode as it looked. Raises `RenderError` where there is no OpenGL."""
-    from manip_il.evaluation.film import encode_mp4, film
-    from manip_il.evaluation.report_data import Film
+    from manip_il.evaluation.film import film, make_film
     from manip_il.sim.conditions import NOMINAL, draw
 
     met = draw(job.conditions or (NOMINAL,), episode.seed)
     frames = film(episode, job.env, every=FILM_EVERY, appearance=met.appearance)
-    mp4 = encode_mp4(frames, job.env.control_hz // FILM_EVERY or 1)
-    return Film(caption(job, episode).capitalize(), mp4, success=episode.success)
+    fps = job.env.control_hz // FILM_EVERY or 1
+    return make_film(caption(job, episode).capitalize(), frames, fps, success=episode.success)
 
 
 def caption(job: RolloutJob, episode: Episode) -> str:

@@ -21,7 +21,7 @@ from manip_il.data.lerobot_io import read_table
 from manip_il.engine.describe import env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import RenderError
-from manip_il.evaluation.film import encode_mp4, film, paths, run_states, strip
+from manip_il.evaluation.film import film, make_film, paths, run_states, strip
 from manip_il.evaluation.report_data import Film, Kind, Paths, Strip
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -140,7 +140,7 @@ def _show(name: str, episode: Episode, env: EnvConfig, stages: Stages) -> tuple[
     fps = env.control_hz // FILM_EVERY or 1
     stages.step()
     caption = _caption(episode)
-    return Film(name, encode_mp4(frames, fps), caption), Strip(name, strip(frames, fps), caption)
+    return make_film(name, frames, fps, caption), Strip(name, strip(frames, fps), caption)
 
 
 def _caption(episode: Episode) -> str:

@@ -17,6 +17,7 @@ Kind = Literal["expert", "dagger", "cloning", "baseline"]
 Cost = Literal["labels", "episodes", "seconds"]
 COSTS: tuple[Cost, ...] = ("labels", "episodes", "seconds")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+JPEG_MAGIC = b"\xff\xd8\xff"
 
 
 @dataclass(frozen=True)
@@ -137,16 +138,22 @@ class Strip:
 
 @dataclass(frozen=True)
 class Film:
-    """One episode, or several in a row, of one policy as an MP4 (H.264). success: None where nothing says."""
+    """One episode, or several in a row, of one policy as an MP4 (H.264).
+
+    success: None where nothing says. poster: a JPEG that stands in its place until it plays.
+    """
 
     policy: str
     mp4: bytes
     caption: str = ""
     success: bool | None = None
+    poster: bytes = b""
 
     def __post_init__(self) -> None:
         if self.mp4[4:8] != b"ftyp":
             raise ManipError(f"film of {self.policy}: no MP4 (starts {self.mp4[:8]!r})")
+        if self.poster and not self.poster.startswith(JPEG_MAGIC):
+            raise ManipError(f"film of {self.policy}: the poster is no JPEG (starts {self.poster[:8]!r})")
 
 
 @dataclass(frozen=True, eq=False)

@@ -194,9 +194,11 @@ def _how_measured(report: Report) -> str:
 
 
 def _film(film: Film) -> str:
+    """It plays by itself, without sound and again and again; browsers that refuse to show the poster until asked."""
+    poster = f'poster="data:image/jpeg;base64,{_base64(film.poster)}" ' if film.poster else ""
     return _figure(
         film.policy,
-        f'<video controls muted loop playsinline aria-label="{escape(film.policy)}" '
+        f'<video muted autoplay loop playsinline controls aria-label="{escape(film.policy)}" {poster}'
         f'src="data:video/mp4;base64,{_base64(film.mp4)}"></video>',
         film.caption,
     )

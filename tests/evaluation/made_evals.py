@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from manip_il.evaluation.comparison import Arm, Comparison, Measured
-from manip_il.evaluation.film import encode_mp4
+from manip_il.evaluation.film import make_film
 from manip_il.evaluation.report_data import Film
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import Rule, choose, history
@@ -66,7 +66,7 @@ def small_film(number: int, success: bool | None) -> Film:
     frames = np.full((12, 48, 64, 3), 230, dtype=np.uint8)
     for index, frame in enumerate(frames):
         frame[10:30, 4 * index : 4 * index + 14] = (200, 40 * number % 255, 60)
-    return Film("policy", encode_mp4(list(frames), 12), f"seed {FIRST_SEED + number}", success)
+    return make_film("policy", list(frames), 12, f"seed {FIRST_SEED + number}", success)
 
 
 def _arm(name: str, fails: Fails, seeds: int, successes: tuple[float, ...]) -> Arm:

@@ -43,6 +43,13 @@ PLAY = """async (video) => {
     video.pause();
     return {at: video.currentTime, duration: video.duration, width: video.videoWidth, error: video.error};
 }"""
+STARTED = "video => video.muted && video.loop && !video.paused && video.played.length > 0 && video.played.end(0) > 0"
+POSTER = """async (video) => {
+    const poster = new Image();
+    poster.src = video.poster;
+    await poster.decode();
+    return [poster.naturalWidth, poster.naturalHeight];
+}"""
 
 
 @dataclass(frozen=True)
@@ -137,6 +144,15 @@ def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path)
             assert caption in film.evaluate("film => film.closest('figure').innerText")
             heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
             assert success is None or heading == ("Successes" if success else "Failures")
+        assert (seen.told, seen.asked) == ([], [])
+
+
+def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, case: Case, file: Path):
+    with opened(browser, file, 1280) as seen:
+        for film in seen.page.query_selector_all("video"):
+            film.scroll_into_view_if_needed()  # browsers wait with those that are out of sight
+            assert seen.page.wait_for_function(STARTED, arg=film, timeout=60_000)
+            assert film.evaluate(POSTER) == [64, 48]
         assert (seen.told, seen.asked) == ([], [])
 
 

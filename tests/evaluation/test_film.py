@@ -11,7 +11,7 @@ from manip_il.data import schema
 from manip_il.engine.describe import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
-from manip_il.evaluation.film import encode_mp4, film, paths, run_states, shown_steps, strip
+from manip_il.evaluation.film import encode_mp4, film, make_film, paths, run_states, shown_steps, strip
 from manip_il.sim.env import EnvConfig
 
 JOB = RolloutJob(EnvConfig(), "expert", labels="last")
@@ -57,6 +57,15 @@ def test_an_mp4_is_h264_for_browsers_with_its_index_in_front():
 def test_what_cannot_be_a_film_is_refused(pictures, words):
     with pytest.raises(ManipError, match=words):
         encode_mp4(pictures, 10)
+
+
+def test_a_films_poster_is_its_last_frame():
+    pictures = frames(12)
+    made = make_film("policy", pictures, 10, "seed 7", success=False)
+    poster = np.asarray(Image.open(io.BytesIO(made.poster), formats=["jpeg"]))
+    assert poster.shape == pictures[-1].shape
+    assert np.allclose(poster, pictures[-1], atol=3)
+    assert (made.policy, made.caption, made.success, made.mp4[4:8]) == ("policy", "seed 7", False, b"ftyp")
 
 
 def test_a_strip_goes_from_the_first_to_the_last_frame():

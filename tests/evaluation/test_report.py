@@ -1,5 +1,6 @@
 """The report is one file that reaches nothing outside, escapes what it is given, and shows the inputs' numbers."""
 
+import base64
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -26,6 +27,7 @@ from manip_il.evaluation.statistics import Proportion
 from manip_il.evaluation.svg import Axis, axis_for
 
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 20
+JPEG = b"\xff\xd8\xff\xe0" + b"\0" * 20
 MP4 = b"\0\0\0\x18ftypisom" + b"\0" * 20
 VOID = {"meta", "link", "img", "br", "hr", "input"}
 
@@ -46,7 +48,7 @@ REPORT = Report(
     command="manip-il quickstart --seed=3",
     rows=ROWS,
     curve=CURVE,
-    films=(Film("DAgger", MP4),),
+    films=(Film("DAgger", MP4, poster=JPEG),),
     strips=(Strip("Cloning", ((0.0, PNG), (0.5, PNG))),),
     paths=(Paths("Expert", HAND, HAND - 0.01, HAND[-1], dt=0.05),),
     config={"policy": {"hidden": 256, "name": None}},
@@ -129,8 +131,9 @@ def test_bars_are_as_long_as_the_rates(page: Page):
 def test_pictures_and_films_are_inside(page: Page):
     assert sum(tag == "img" for tag, _ in page.tags) == 2
     video = next(attributes for tag, attributes in page.tags if tag == "video")
-    assert {"controls", "muted", "loop", "playsinline"} <= set(video)
+    assert {"controls", "muted", "autoplay", "loop", "playsinline"} <= set(video)
     assert (video["src"] or "").startswith("data:video/mp4;base64,")
+    assert (video["poster"] or "") == "data:image/jpeg;base64," + base64.b64encode(JPEG).decode()
 
 
 def test_whatever_comes_from_outside_is_escaped():
@@ -170,6 +173,8 @@ def test_what_cannot_be_shown_is_refused_by_name():
         Strip("p", ((0.0, b"GIF89a"),))
     with pytest.raises(ManipError, match="no MP4"):
         Film("p", b"")
+    with pytest.raises(ManipError, match="the poster is no JPEG"):
+        Film("p", MP4, poster=PNG)
     with pytest.raises(ManipError, match=r"\(4, 3\).*\(5, 3\)"):
         Paths("p", np.zeros((4, 3)), np.zeros((5, 3)), np.zeros(3))
     with pytest.raises(ManipError, match="not finite"):
