@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,11 @@ import numpy as np
 import PIL
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from PIL import Image
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.doctor.info import Feature, Info, read_info
 from manip_il.data.doctor.shards import UNREADABLE, find_shards, floats, integers
+from manip_il.data.picture import open_picture
 from manip_il.data.video_read import VideoReader
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
@@ -211,7 +210,7 @@ def _pieces(source: FrameSource) -> Iterator[Part]:
 def _decode(content: bytes | None) -> Pictures:
     if content is None:
         raise ValueError("a picture is not in the file")
-    with Image.open(BytesIO(content)) as picture:
+    with open_picture(content) as picture:
         if picture.mode != "RGB":
             raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
         return np.asarray(picture)

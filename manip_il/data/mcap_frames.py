@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from PIL import Image
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_read import read_frames
+from manip_il.data.picture import open_picture
 from manip_il.errors import ManipError
 
 U8 = NDArray[np.uint8]
@@ -60,9 +59,9 @@ def decode_message(schema: str, message: Any) -> U8:
 
 
 def decode_bytes(data: bytes) -> U8:
-    """A PNG, JPEG or other still picture as RGB (height, width, 3). Raises `ManipError` for anything else."""
+    """A PNG or JPEG as RGB (height, width, 3). Raises `ManipError` for anything else."""
     try:
-        with Image.open(io.BytesIO(data)) as picture:
+        with open_picture(data) as picture:
             if picture.mode not in _COLOURS:
                 raise ManipError(f"a picture of mode {picture.mode}; expected 8-bit colours without transparency")
             return np.asarray(picture.convert("RGB"))

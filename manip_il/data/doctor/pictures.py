@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.doctor.dataset import Dataset
@@ -15,6 +13,7 @@ from manip_il.data.doctor.finding import Finding, error, plural
 from manip_il.data.doctor.info import Feature
 from manip_il.data.doctor.pixels import Brightness, check_brightness
 from manip_il.data.doctor.shards import UNREADABLE, Shard
+from manip_il.data.picture import open_picture
 
 _BATCH = 64  # pictures held at once
 _SAMPLE = 20  # of so many, one is looked at
@@ -55,7 +54,7 @@ def _problem(cell: Any, feature: Feature, brightness: Brightness | None) -> str:
     if not isinstance(data, bytes):
         return "is not in the file"
     try:
-        with Image.open(io.BytesIO(data)) as picture:
+        with open_picture(data) as picture:
             picture.load()
             size = picture.height, picture.width
             if brightness is not None and feature.channels == 3:

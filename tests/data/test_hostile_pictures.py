@@ -1,0 +1,123 @@
+"""Pictures from outside are PNG or JPEG of a bounded size, and no other program ever sees them."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.doctor.dataset import Dataset
+from manip_il.data.doctor.pictures import check_pictures
+from manip_il.data.frame_source import ParquetPart
+from manip_il.data.lerobot_io import write_dataset
+from manip_il.data.mcap_frames import DatasetFrames, decode_bytes
+from manip_il.data.picture import open_picture
+from manip_il.errors import ManipError
+from manip_il.mdp import Episode
+
+from .damage import edit_json
+
+KEY = "observation.images.front"
+EPS = b"""%!PS-Adobe-3.0 EPSF-3.0
+%%BoundingBox: 0 0 8 8
+%%EndComments
+0 0 8 8 rectfill
+showpage
+%%EOF
+"""
+
+
+def png(width: int, height: int) -> bytes:
+    """One that says so, and holds a single row."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    rows = zlib.compress(bytes(1 + 3 * width))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def saved(picture: np.ndarray, kind: str) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, kind)
+    return stream.getvalue()
+
+
+@pytest.fixture
+def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What a Ghostscript on the path would leave behind."""
+    program, marker = tmp_path / "bin" / "gs", tmp_path / "marker"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {marker}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent), prepend=":")
+    from PIL import EpsImagePlugin
+
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)  # it looks for the program once
+    return marker
+
+
+@pytest.fixture
+def pictured(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    """A dataset with a column of pictures whose first one is no PNG."""
+    root = tmp_path / "lift"
+    write_dataset(episodes, root, spec, repo_id="a/lift", fingerprint={})
+    path = next(root.glob(layout.DATA_FILES))
+    table = pq.read_table(path)
+    fine = saved(np.zeros((8, 8, 3), np.uint8), "PNG")
+    cells = [{"bytes": EPS if row == 0 else fine, "path": None} for row in range(len(table))]
+    pq.write_table(table.append_column(KEY, pa.array(cells)), path)
+    feature: dict[str, Any] = {"dtype": "image", "shape": [8, 8, 3], "names": ["height", "width", "channels"]}
+    edit_json(root / layout.INFO, lambda info: info["features"].update({KEY: feature}))
+    return root
+
+
+def test_the_attack_is_one(marker: Path) -> None:
+    with pytest.raises(Image.UnidentifiedImageError), Image.open(io.BytesIO(EPS)) as picture:  # what the program wrote
+        picture.load()
+    assert marker.exists()
+
+
+def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) -> None:
+    found = [str(finding) for finding in check_pictures(Dataset(pictured))]
+    assert any("the picture in row 0 cannot be decoded: it is no PNG or JPEG (1 row like this)" in one for one in found)
+    name = next(pictured.glob(layout.DATA_FILES)).relative_to(pictured).as_posix()
+    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+        list(ParquetPart(name, 0).read(pictured, KEY, 20))
+    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+        list(DatasetFrames(pictured, {KEY: "image"}).read(KEY, 0, 1))
+    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+        decode_bytes(EPS)
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "WEBP"])
+def test_other_formats_are_refused(kind: str) -> None:
+    with pytest.raises(ValueError, match="no PNG or JPEG"):
+        open_picture(saved(np.zeros((8, 8, 3), np.uint8), kind))
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+def test_a_picture_of_a_robots_camera_is_read(kind: str) -> None:
+    level = np.full((1080, 1920, 3), 90, np.uint8)
+    assert (decode_bytes(saved(level, kind)) == 90).all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(5_000, 5_000), (10_000, 10_000), (60_000, 60_000)])
+def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(width: int, height: int) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nor does Pillow's own warning appear
+        with pytest.raises(ManipError, match="pixels"):
+            decode_bytes(png(width, height))
