@@ -9,7 +9,7 @@ from typing import ClassVar
 from manip_il.cli.folders import require_ours
 from manip_il.cli.groups import option, warn
 from manip_il.cli.progress import say
-from manip_il.cli.record import left_out
+from manip_il.cli.record import left_out, require_repo_id
 from manip_il.errors import ManipError, UsageError
 
 
@@ -35,6 +35,8 @@ class BuildOptions:
             if not self.overwrite:
                 raise UsageError(f"{self.dataset} exists already; replace it by --overwrite=true")
             require_ours(self.dataset)
+        if self.repo_id is not None:
+            require_repo_id("--repo_id", self.repo_id)
         from manip_il.data.atomic import exclusive
         from manip_il.data.build import build
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from manip_il import checks
 from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import (
     ENGINE_HELP,
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from manip_il.engine.jobs import RolloutJob
 
 HOLD = 10  # control steps that a demonstration goes on for after success
-_REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 
 @dataclass
@@ -99,8 +98,7 @@ class RecordOptions:
     def _check(self) -> None:
         if self.dataset.num_episodes < 1:
             raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
-        if not _REPO_ID.fullmatch(self._repo_id()):
-            raise UsageError(f"--dataset.repo_id is {self._repo_id()!r}; expected USER/NAME")
+        require_repo_id("--dataset.repo_id", self._repo_id())
 
     def _repo_id(self) -> str:
         return self.dataset.repo_id or f"local/{self.robot.type}_{self.task.type}"
@@ -143,6 +141,16 @@ class RecordOptions:
             info, failed = record(episodes, journals, root, job, recording, replace=self.resume)
         say(f"recorded {info.episodes:,} successful episodes, {info.frames:,} frames; {left_out(failed)}")
         say(f"dataset: {root} (its episodes one by one, to open in Foxglove: {journals})")
+
+
+def require_repo_id(option: str, value: str) -> None:
+    """Raise `UsageError` unless the value is USER/NAME: a folder is named by it."""
+    try:
+        checks.repo_id(option, value)
+    except ManipError as error:
+        raise UsageError(str(error)) from None
+    if "/" not in value:
+        raise UsageError(f"{option} is {value!r}; expected USER/NAME")
 
 
 def left_out(failed: int) -> str:

@@ -32,6 +32,7 @@ class RenderOptions:
         if cameras is None:
             raise UsageError("--cameras names none; expected front, wrist or both")
         from manip_il.data.atomic import exclusive
+        from manip_il.data.build import local_id
         from manip_il.data.lerobot_io import dataset_info
         from manip_il.engine.engine import default_workers
         from manip_il.engine.render import open_source, render_dataset
@@ -43,7 +44,7 @@ class RenderOptions:
                 source,
                 self.target,
                 cameras,
-                repo_id=f"local/{self.target.name}",
+                repo_id=local_id(self.target.name),
                 workers=self.workers or default_workers(),
                 replace=self.overwrite,
                 on_episode=lambda _: bar.advance(),

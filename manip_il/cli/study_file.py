@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from manip_il import checks
 from manip_il.cli.compare import TrialGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.folders import atomic_write
@@ -107,17 +108,24 @@ def _check_numbers(path: Path, file: StudyFile) -> None:
     if not 0 < file.target <= 1:
         raise UsageError(f"{path}: target is {file.target}; expected a share above 0 and up to 1, such as 0.95")
     for name in file.arms:
-        if not ARM_NAME.fullmatch(name) or name == FOLDER:
+        if not _is_arm_name(name):
             raise UsageError(
-                f"{path}: an arm is named {name!r}, which becomes a folder; expected letters, digits, _ . and -"
-                f"{', and not ' + FOLDER if name == FOLDER else ''}"
+                f"{path}: an arm is named {checks.shorten(name)}, which becomes a folder; expected letters, digits, "
+                f"_ . and -, at most {checks.LONGEST_NAME}{', and not ' + FOLDER if name == FOLDER else ''}"
             )
+
+
+def _is_arm_name(name: object) -> bool:
+    is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
+    return bool(is_name) and ".." not in str(name) and name != FOLDER
 
 
 def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
     differences = file.arms[name]
     if not isinstance(differences, dict | None):
-        raise UsageError(f"{path}: arms.{name}: expected a mapping of options of manip-il dagger, got {differences!r}")
+        raise UsageError(
+            f"{path}: arms.{name}: expected a mapping of options of manip-il dagger, got {checks.shorten(differences)}"
+        )
     layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
     for where, tree in layers:
         for own in OWN:

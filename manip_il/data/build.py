@@ -6,12 +6,14 @@ import dataclasses
 import itertools
 import json
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.data.episodes import count_labels, first_labels, parts
 from manip_il.data.fingerprint import compare_fingerprints
@@ -23,6 +25,7 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
+_LARGEST = 16 * 1024 * 1024  # of a recording.json [bytes]
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Recording:
     only_labelled: those without a sound label are. episodes: at most so many, the first in seed order; None: all.
     labels: at most so many sound ones; what comes after the last has `label_valid` 0, episodes beyond it are left out.
     provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it.
+    Raises `ManipError` naming what is wrong.
     """
 
     repo_id: str
@@ -43,11 +47,21 @@ class Recording:
     only_labelled: bool = False
     labels: int | None = None
 
+    def __post_init__(self) -> None:
+        checks.repo_id("repo_id", self.repo_id)
+        for what in ("only_successes", "only_labelled"):
+            checks.truth(what, getattr(self, what))
+        for what in ("episodes", "labels"):
+            if getattr(self, what) is not None:
+                checks.whole(what, getattr(self, what), 0, checks.LARGEST_SEED)
+        checks.mapping("provenance", self.provenance)
+        VideoConfig.from_json(self.video)
+
     def open(
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
     ) -> AbstractContextManager[DatasetWriter]:
         """The dataset's writer; raises what `new_dataset` raises."""
-        video = VideoConfig(**self.video)
+        video = VideoConfig.from_json(self.video)
         return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
 
     def write(self, journals: Path) -> None:
@@ -60,12 +74,21 @@ class Recording:
         """The folder's own; where it has none, one that takes every episode."""
         path = journals / RECORDING
         if not path.is_file():
-            return cls(f"local/{journals.name.removesuffix('.journals') or 'journals'}")
+            return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
+        data = checks.read_json(path, "what a recording's journals become", _LARGEST)
+        known = {one.name: data[one.name] for one in fields(cls) if one.name in data}
+        if "repo_id" not in known:
+            raise ManipError(f"{path} lacks repo_id; expected what `manip-il record` writes")
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**{one.name: data[one.name] for one in fields(cls) if one.name in data})
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise ManipError(f"cannot read {path}: {type(error).__name__}: {error}") from error
+            return cls(**known)
+        except ManipError as error:
+            raise ManipError(f"{path}: {error}") from error
+
+
+def local_id(folder: str) -> str:
+    """Return the repository's id, `local/NAME`, of a dataset in a folder of this name, whatever characters it has."""
+    name = re.sub(r"\.{2,}", ".", re.sub(r"[^A-Za-z0-9_.\-]+", "_", folder)).lstrip(".")
+    return f"local/{name[: checks.LONGEST_NAME] or 'dataset'}"
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from manip_il.checks import shorten
 from manip_il.errors import ManipError
 
+_LONGEST = 80  # characters of a value in a warning
 _PACKAGES = ("manip_il", "mujoco", "mink", "lerobot", "torch", "numpy")
 _MEANING = {
     "model_sha256": "compiled MuJoCo model",
@@ -83,5 +85,7 @@ def _version(package: str) -> str:
 
 
 def _short(value: object) -> str:
-    text = str(value)
-    return f"{text[:12]}..." if len(text) == hashlib.sha256().digest_size * 2 else text
+    text = value if isinstance(value, str) else shorten(value)
+    if len(text) == hashlib.sha256().digest_size * 2:
+        return f"{text[:12]}..."
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

@@ -24,6 +24,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.foxglove_episode import channels, frame_times
@@ -33,7 +34,9 @@ from manip_il.mdp import Episode
 
 _FORMAT = "1"
 _RECORD = "manip_il"  # name of our metadata record
+_HEADER_KEYS = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")
 _NPY = ".npy"
+MOST_FRAMES = 10_000_000  # of an episode
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FOOTER_TAIL = 4 + 8  # the footer's own checksum and the closing magic [bytes]
@@ -218,15 +221,18 @@ def _header(records: list[Any]) -> Header:
     if len(ours) != 1:
         raise ValueError(f"it holds {len(ours)} metadata records {_RECORD!r}; expected one")
     data = ours[0]
-    if data["format"] != _FORMAT:
-        raise ValueError(f"its format is {data['format']!r}; this version reads {_FORMAT!r}")
+    if (found := data.get("format")) != _FORMAT:
+        raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
+    if missing := [key for key in _HEADER_KEYS if key not in data]:
+        raise ValueError(f"its header lacks {', '.join(missing)}")
+    said = {key: checks.parse_json(f"its {key}", data[key]) for key in _HEADER_KEYS}
     return Header(
-        int(data["seed"]),
-        json.loads(data["success"]),
-        json.loads(data["success_at_end"]),
-        int(data["frames"]),
-        RobotTaskSpec.from_json(json.loads(data["spec"])),
-        json.loads(data["fingerprint"]),
+        checks.whole("its seed", said["seed"], 0, checks.LARGEST_SEED),
+        checks.truth("its success", said["success"]),
+        checks.truth("its success_at_end", said["success_at_end"]),
+        checks.whole("its number of frames", said["frames"], 1, MOST_FRAMES),
+        RobotTaskSpec.from_json(said["spec"]),
+        checks.mapping("its fingerprint", said["fingerprint"]),
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -16,8 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.doctor.info import LARGEST_META, info_problems
 from manip_il.data.video_read import DatasetPictures
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
@@ -131,7 +132,7 @@ def read_spec(root: Path) -> s.RobotTaskSpec:
     """
     ours = _read_ours(root)
     if ours:
-        return s.RobotTaskSpec.from_json(ours["spec"])
+        return _spec(root, ours)
     info = _read_info(root)
     try:
         return s.RobotTaskSpec(
@@ -144,7 +145,7 @@ def read_spec(root: Path) -> s.RobotTaskSpec:
             instruction=_instruction(root),
             **_cameras(info),
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, IndexError) as error:
         raise ManipError(f"{root} lacks columns that this project's datasets have: {error}") from error
 
 
@@ -162,6 +163,7 @@ def dataset_info(root: Path) -> DatasetInfo:
     """Counts and names. Raises `ManipError` for a folder that is no dataset."""
     info = _read_info(root)
     ours = _read_ours(root)
+    spec = _spec(root, ours) if ours else None
     success = at_end = None
     if s.SUCCESS in info["features"]:
         columns = read_table(root, [s.SUCCESS, layout.EPISODE_INDEX])
@@ -171,8 +173,8 @@ def dataset_info(root: Path) -> DatasetInfo:
     return DatasetInfo(
         root=root,
         robot=str(info["robot_type"]),
-        task=ours["spec"]["task"] if ours else UNKNOWN_TASK,
-        instruction=ours["spec"]["instruction"] if ours else _instruction(root),
+        task=spec.task if spec else UNKNOWN_TASK,
+        instruction=spec.instruction if spec else _instruction(root),
         fps=int(info["fps"]),
         episodes=int(info["total_episodes"]),
         frames=int(info["total_frames"]),
@@ -184,6 +186,13 @@ def dataset_info(root: Path) -> DatasetInfo:
 def camera_keys(root: Path) -> list[str]:
     """Names of the columns that are pictures."""
     return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in _PICTURES]
+
+
+def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:
+    try:
+        return s.RobotTaskSpec.from_json(ours["spec"])
+    except ManipError as error:
+        raise ManipError(f"{root / layout.OURS}: {error}") from error
 
 
 def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
@@ -221,13 +230,16 @@ def _read_info(root: Path) -> dict[str, Any]:
     path = root / layout.INFO
     if not path.is_file():
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {layout.INFO}")
-    info = _read_json(path)
+    info = checks.read_json(path, "a LeRobot dataset's description", LARGEST_META)
     version = info.get("codebase_version")
     if version != layout.VERSION:
-        raise ManipError(f"{root} is a dataset of version {version}; this program reads {layout.VERSION}")
+        found = version if isinstance(version, str) and len(version) < 20 else checks.shorten(version)
+        raise ManipError(f"{root} is a dataset of version {found}; this program reads {layout.VERSION}")
     missing = {"fps", "features", "total_episodes", "total_frames", "robot_type"} - info.keys()
     if missing:
         raise ManipError(f"{path} lacks {', '.join(sorted(missing))}")
+    for problem in info_problems(info):
+        raise ManipError(f"{path}: {problem}")
     return info
 
 
@@ -236,20 +248,12 @@ def _read_ours(root: Path) -> dict[str, Any]:
     if not path.is_file():
         _read_info(root)
         return {}
-    ours = _read_json(path)
+    ours = checks.read_json(path, "what this program says of its datasets", LARGEST_META)
     if missing := {"spec", "fingerprint", "provenance"} - ours.keys():
         raise ManipError(f"{path} lacks {', '.join(sorted(missing))}")
+    for key in ("spec", "fingerprint", "provenance"):
+        checks.mapping(f"{path}: {key}", ours[key])
     return ours
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ManipError(f"cannot read {path}: {error}") from error
-    if not isinstance(data, dict):
-        raise ManipError(f"{path} holds {type(data).__name__}; expected an object")
-    return data
 
 
 def _data_files(root: Path) -> list[Path]:

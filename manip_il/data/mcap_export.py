@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import foxglove, mcap_frames
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
@@ -52,7 +53,7 @@ class Source:
 def open_source(root: Path) -> Source:
     """Look at a dataset. Raises `ManipError` for what is none, or a column that MCAP gets no place for here."""
     dataset_info(root)
-    info = json.loads((root / layout.INFO).read_text(encoding="utf-8"))
+    info = checks.read_json(root / layout.INFO, "a LeRobot dataset's description")
     features = {key: feature for key, feature in info["features"].items() if key not in INDEX_COLUMNS}
     for key, feature in features.items():
         if feature["dtype"] not in (*NUMBERS, TEXT, *_PICTURES):

@@ -30,16 +30,21 @@ from typing import Any
 
 import yaml
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.mcap_path import FieldPath, parse_path
 from manip_il.data.resample import Method
+from manip_il.data.schema import MOST_FPS
 from manip_il.data.yaml_file import read_yaml
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError
 
 TEXT = "string"  # LeRobot's dtype of text
 _WHOLE = tuple(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64))
 NUMBERS = ("bool", *_WHOLE, "float16", "float32", "float64")
 INDEX_COLUMNS = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
+
+_MOST_VALUES = 1_000_000  # in one frame of a column
+_MOST_AXES = 32  # as many as an array of numpy's has
 
 _METHODS = typing.get_args(Method)
 _VALUE_KEYS = ("topic", "field", "dtype", "names", "shape", "resample", "tolerance")
@@ -80,8 +85,11 @@ class Values(Source):
         if self.resample == "interpolate" and not self.dtype.startswith("float"):
             raise UsageError(f"resample is interpolate, which {self.dtype} cannot be; expected nearest or hold")
         sizes = self.shape or (1,)
-        is_shape = all(isinstance(size, int) and not isinstance(size, bool) and size > 0 for size in sizes)
-        _require("shape", self.shape, "a list of whole numbers", is_shape)
+        is_shape = all(
+            isinstance(size, int) and not isinstance(size, bool) and 0 < size <= _MOST_VALUES for size in sizes
+        )
+        is_shape = is_shape and len(sizes) <= _MOST_AXES and math.prod(sizes) <= _MOST_VALUES
+        _require("shape", self.shape, f"a list of whole numbers, in all at most {_MOST_VALUES:,} values", is_shape)
 
     @property
     def width(self) -> int | None:
@@ -114,11 +122,15 @@ class Mapping:
     features: dict[str, Values | Camera]
 
     def __post_init__(self) -> None:
-        is_rate = isinstance(self.fps, int) and not isinstance(self.fps, bool) and self.fps > 0
-        _require("fps", self.fps, "a whole number above 0", is_rate)
-        _require("robot_type", self.robot_type, "text or null", isinstance(self.robot_type, str | None))
-        _require("task", self.task, "text or a topic", isinstance(self.task, Values) or bool(self.task))
+        is_rate = isinstance(self.fps, int) and not isinstance(self.fps, bool) and 0 < self.fps <= MOST_FPS
+        _require("fps", self.fps, f"a whole number above 0 and up to {MOST_FPS}", is_rate)
+        is_robot = self.robot_type is None or _is_text(self.robot_type, checks.LONGEST_NAME)
+        _require("robot_type", self.robot_type, "text or null", is_robot)
+        is_task = isinstance(self.task, Values) or (bool(self.task) and _is_text(self.task, checks.LONGEST_TEXT))
+        _require("task", self.task, "text or a topic", is_task)
         _require("features", self.features, "at least one feature", bool(self.features))
+        for key in self.features:
+            _require_column(key)
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -191,7 +203,7 @@ def _task(value: Any) -> str | Values:
 
 def _feature(item: tuple[Any, Any]) -> Values | Camera:
     key, value = item
-    _require("a column's name", key, "text without a slash", isinstance(key, str) and key and "/" not in key)
+    _require_column(key)
     if key in INDEX_COLUMNS:
         raise UsageError(f"LeRobot counts {key} itself; leave it out")
     if isinstance(value, dict) and "video" in value:
@@ -214,7 +226,7 @@ def _paths(value: Any) -> tuple[FieldPath, ...]:
 def _table(value: Any, keys: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Any]:
     """A mapping with all of the keys and no others."""
     if not isinstance(value, dict):
-        raise UsageError(f"got {value!r}; expected a mapping of {', '.join(keys)}")
+        raise UsageError(f"got {checks.shorten(value)}; expected a mapping of {', '.join(keys)}")
     for key in value:
         if key not in keys:
             raise UnknownName("key", str(key), keys)
@@ -226,7 +238,19 @@ def _table(value: Any, keys: Iterable[str], optional: Iterable[str] = ()) -> dic
 
 def _require(what: str, value: Any, expected: str, is_right: Any) -> None:
     if not is_right:
-        raise UsageError(f"{what} is {value!r}; expected {expected}")
+        raise UsageError(f"{what} is {checks.shorten(value)}; expected {expected}")
+
+
+def _require_column(key: Any) -> None:
+    """Raise `UsageError` for a column that no file or folder may be named by."""
+    try:
+        checks.name("a column's name", key)
+    except ManipError as error:
+        raise UsageError(str(error)) from None
+
+
+def _is_text(value: Any, longest: int) -> bool:
+    return isinstance(value, str) and len(value) <= longest
 
 
 def _plain(source: Source, keys: Iterable[str]) -> Table[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.mdp import Episode, require_finite
 
@@ -28,10 +29,21 @@ SEED = "seed"
 ROUND = "round"
 BETA = "beta"
 
+MOST_FPS = 10_000  # control steps a second
+MOST_NAMES = 10_000  # joints, or numbers that the environment's state has
+MOST_CAMERAS = 100
+LONGEST_SIDE = 8192  # of a picture [pixels]
+MOST_PIXELS = 4096 * 4096  # of a picture
+_LONGEST_LIST = 200  # of names in a message [characters]
+_LARGEST_STATE = 1_000_000  # numbers in a `sim_state`
+
 
 @dataclass(frozen=True)
 class RobotTaskSpec:
-    """What a dataset is about: names, sizes and rate that dataset, policy and environment must share."""
+    """What a dataset is about: names, sizes and rate that dataset, policy and environment must share.
+
+    Robot, task and cameras may become parts of paths. Raises `ManipError` naming what is wrong.
+    """
 
     robot: str
     task: str
@@ -45,6 +57,22 @@ class RobotTaskSpec:
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
 
+    def __post_init__(self) -> None:
+        checks.name("robot", self.robot)
+        checks.name("task", self.task)
+        checks.whole("fps", self.fps, 1, MOST_FPS)
+        checks.whole("sim_state_size", self.sim_state_size, 0, _LARGEST_STATE)
+        for what in ("joint_names", "environment_state_names"):
+            for one in checks.array(what, getattr(self, what), MOST_NAMES):
+                checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
+        for what in ("instruction", "action_meaning"):
+            checks.text(what, getattr(self, what))
+        for camera in checks.array("cameras", self.cameras, MOST_CAMERAS):
+            checks.name("a camera", camera)
+        if len(set(self.cameras)) < len(self.cameras):
+            raise ManipError(f"cameras are {checks.shorten(self.cameras)}; expected each once")
+        check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
+
     def to_json(self) -> dict[str, Any]:
         """As JSON knows it."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
@@ -52,10 +80,11 @@ class RobotTaskSpec:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
         """The inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
+        checks.mapping("a robot-task spec", data)
         known = {field.name for field in fields(cls)}
         needed = {field.name for field in fields(cls) if field.default is MISSING}
         if odd := sorted((needed - set(data)) | (set(data) - known)):
-            raise ManipError(f"a robot-task spec with wrong keys: {', '.join(odd)} missing or unknown")
+            raise ManipError(f"a robot-task spec with wrong keys: {', '.join(odd)[:_LONGEST_LIST]} missing or unknown")
         values: dict[str, Any] = {key: tuple(one) if isinstance(one, list) else one for key, one in data.items()}
         return cls(**values)
 
@@ -63,6 +92,17 @@ class RobotTaskSpec:
     def image_keys(self) -> dict[str, str]:
         """Column -> camera."""
         return {IMAGES + camera: camera for camera in self.cameras}
+
+
+def check_picture_size(what: str, size: object, least: int = 1) -> tuple[int, int]:
+    """Return height and width [pixels] of a picture: each at least `least`, in all at most `MOST_PIXELS`."""
+    sides = checks.array(what, size, 2)
+    if len(sides) != 2:
+        raise ManipError(f"{what} is {checks.shorten(size)}; expected height and width [pixels]")
+    height, width = (checks.whole(what, side, least, LONGEST_SIDE) for side in sides)
+    if height * width > MOST_PIXELS:
+        raise ManipError(f"{what} is {height} x {width} pixels; expected at most {MOST_PIXELS:,} in all")
+    return height, width
 
 
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:

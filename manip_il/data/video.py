@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +23,7 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
 from manip_il.data.video_read import count_packets
@@ -33,6 +34,7 @@ from manip_il.errors import ManipError, UnknownName, UsageError
 CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
 QUEUE_BYTES = 128 * 1024 * 1024  # of pictures that wait to be encoded; an episode that is alone may be larger
 _MIB = 1024 * 1024
+_MOST_SETTING = 1_000_000  # no codec knows a larger one
 
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
@@ -41,7 +43,8 @@ Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 class VideoConfig:
     """How pictures are compressed, by the names of LeRobot's `RGBEncoderConfig`; `libsvtav1` also has its defaults.
 
-    Raises `UnknownName` for the codec, `UsageError` for g; what a codec makes of the rest, only `check` can tell.
+    Raises `UnknownName` for the codec, `UsageError` for g, `ManipError` for a value of another type; what a codec makes
+    of the rest, only `check` can tell.
     """
 
     vcodec: str = "h264"
@@ -51,13 +54,30 @@ class VideoConfig:
     preset: int | str | None = None  # the codec's own
 
     def __post_init__(self) -> None:
+        checks.text("vcodec", self.vcodec, checks.LONGEST_NAME)
+        checks.name("pix_fmt", self.pix_fmt)
         if self.vcodec not in CODECS:
             raise UnknownName("video codec", self.vcodec, CODECS)
-        if self.g is not None and self.g < 1:
+        if self.g is not None and checks.whole("video setting g", self.g, -_MOST_SETTING, _MOST_SETTING) < 1:
             raise UsageError(f"video setting g={self.g}; expected 1 or more frames from one key frame to the next")
+        if self.crf is not None:
+            checks.number("video setting crf", self.crf, -_MOST_SETTING, _MOST_SETTING)
+        if isinstance(self.preset, str):
+            checks.name("video setting preset", self.preset)
+        elif self.preset is not None:
+            checks.whole("video setting preset", self.preset, -_MOST_SETTING, _MOST_SETTING)
         crf, preset = CODECS[self.vcodec]
         object.__setattr__(self, "crf", crf if self.crf is None else self.crf)
         object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> VideoConfig:
+        """Return the settings in a JSON object; raises `UnknownName` for a key that is none of them."""
+        known = [field.name for field in fields(cls)]
+        for key in checks.mapping("video", data):
+            if key not in known:
+                raise UnknownName("video setting", checks.text("a video setting", key, checks.LONGEST_NAME), known)
+        return cls(**data)
 
     def options(self) -> dict[str, str]:
         """The codec's own options. One thread: a second saves no work, and of h264 it changes the bytes."""

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il import checks
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
 from manip_il.sim.look import PLAIN, Appearance
 from manip_il.sim.world import CAMERAS, CUBE_HALF_SIZE
@@ -70,6 +71,7 @@ class Condition:
     light_turn: Range | None = None
 
     def __post_init__(self) -> None:
+        _require_name("a condition's name", self.name)
         for name in _BOUNDS:
             given = getattr(self, name)
             if given is not None:
@@ -105,7 +107,7 @@ class Condition:
         """Ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
         for key in tree:
             if key not in _BOUNDS:
-                raise UnknownName(f"key in {name}:", str(key), _BOUNDS)
+                raise UnknownName(f"key in {name}:", str(key)[: checks.LONGEST_NAME], _BOUNDS)
         return cls(name, **{key: _as_range(f"{name}: {key}", value) for key, value in tree.items()})
 
     def __str__(self) -> str:
@@ -177,8 +179,17 @@ def _vector(rng: np.random.Generator, lengths: Range) -> list[float]:
     return [float(value) for value in rng.uniform(*lengths) * direction / np.linalg.norm(direction)]
 
 
+def _require_name(what: str, name: object) -> None:
+    try:
+        checks.name(what, name)
+    except ManipError as error:
+        raise UsageError(str(error)) from None
+
+
 def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:
-    low, high = given
+    if not isinstance(given, Sequence) or len(given) != 2:
+        raise UsageError(f"{what} is {checks.shorten(given)}; expected (low, high)")
+    low, high = (_end(what, end) for end in given)
     if not bounds[0] <= low <= high <= bounds[1]:
         raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {bounds[0]} to {bounds[1]}")
     if whole and (low % 1 or high % 1):
@@ -187,9 +198,17 @@ def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> No
 
 def _as_range(what: str, value: Any) -> Range:
     ends = value if isinstance(value, list) else [value, value]
-    if len(ends) != 2 or not all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends):
-        raise UsageError(f"{what} is {value!r}; expected a number, or [low, high]")
-    return float(ends[0]), float(ends[1])
+    if len(ends) != 2:
+        raise UsageError(f"{what} is {checks.shorten(value)}; expected a number, or [low, high]")
+    return _end(what, ends[0]), _end(what, ends[1])
+
+
+def _end(what: str, value: Any) -> float:
+    """One end of a range; an int beyond what a float holds is none."""
+    try:
+        return checks.number(what, value)
+    except ManipError:
+        raise UsageError(f"{what} is {checks.shorten(value)}; expected a number, or [low, high]") from None
 
 
 def _words(range_: Range) -> str:

@@ -103,7 +103,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     ("key", "value", "text"),
     [
         ("codebase_version", "v2.1", "'v2.1'; expected 'v3.0'; LeRobot converts"),
-        ("fps", 0, "fps is 0; expected a positive number"),
+        ("fps", 0, "fps is 0; expected a number of at least 1"),
         ("fps", "20", "fps is '20'"),
         ("total_frames", -1, "total_frames is -1; expected a count"),
         ("features", [], "features is []"),

@@ -307,7 +307,7 @@ def test_broken_json_and_other_versions_are_named(root: Path) -> None:
     with pytest.raises(ManipError, match=r"version v2\.1"):
         read_table(root)
     (root / layout.INFO).write_text("{")
-    with pytest.raises(ManipError, match=r"cannot read .*info\.json"):
+    with pytest.raises(ManipError, match=r"info\.json is not valid JSON"):
         read_table(root)
 
 

@@ -72,7 +72,7 @@ def test_the_example_loads() -> None:
         ({"features": {"timestamp": tree()["features"]["action"]}}, "LeRobot counts timestamp itself"),
         (
             {"features": {"a/b": tree()["features"]["action"]}},
-            "a column's name is 'a/b'; expected text without a slash",
+            "a column's name is 'a/b'; expected a name of letters, digits and _ . -",
         ),
         ({"features": {"a": 1}}, "features: a: got 1; expected a mapping of topic, field, dtype"),
     ],

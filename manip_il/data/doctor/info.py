@@ -10,8 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.doctor.finding import Finding, error
+from manip_il.data.schema import LONGEST_SIDE
+from manip_il.errors import ManipError
 
 PICTURES = ("video", "image")
 NUMBERS = (
@@ -19,6 +22,10 @@ NUMBERS = (
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "bool"),
 )
 INDEX_FEATURES = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
+
+LARGEST_META = 16 * 1024 * 1024  # of a JSON file in `meta` [bytes]
+_LONGEST_PATH = 1_000  # [characters]
+_MOST_AXES = 32  # as many as an array of numpy's has
 
 # the placeholders that LeRobot fills in, and nothing that `str.format` could be made to do beside that
 _TEMPLATE = re.compile(r"(?:[^{}/]|/(?!/)|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
@@ -85,7 +92,7 @@ def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
         return None, [error(layout.INFO, f"codebase_version is {version!r}; expected {layout.VERSION!r}{older}")]
-    findings = [error(layout.INFO, text) for text in _problems(raw)]
+    findings = [error(layout.INFO, text) for text in info_problems(raw)]
     if findings:
         return None, findings
     info = Info(
@@ -103,32 +110,61 @@ def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
 
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON object. Raises `OSError`, or `ValueError` for anything else."""
-    data = json.loads(path.read_text(encoding="utf-8"))
+    with path.open("rb") as file:
+        content = file.read(LARGEST_META + 1)
+    if len(content) > LARGEST_META:
+        raise ValueError(f"it has more than {LARGEST_META:,} bytes")
+    try:
+        data = json.loads(content)
+    except RecursionError as problem:
+        raise ValueError("it is nested too deeply") from problem
     if not isinstance(data, dict):
         raise ValueError(f"it holds {type(data).__name__}; expected an object")
     return cast(dict[str, Any], data)
 
 
-def _problems(raw: dict[str, Any]) -> Iterator[str]:
+def info_problems(raw: dict[str, Any]) -> Iterator[str]:
+    """What of the file's content no reader may rely on, one line each: values of other types, paths that lead out."""
     fps: Any = raw.get("fps")
-    if not _is_number(fps) or not 0 < fps < 1e6:
-        yield f"fps is {fps!r}; expected a positive number"
+    if not _is_number(fps) or not 1 <= fps < 1e6:
+        yield f"fps is {checks.shorten(fps)}; expected a number of at least 1"
     for key in ("total_episodes", "total_frames"):
         if not _is_count(raw.get(key)):
-            yield f"{key} is {raw.get(key)!r}; expected a count"
+            yield f"{key} is {checks.shorten(raw.get(key))}; expected a count"
     if not _is_count(raw.get("total_tasks", 0)):
-        yield f"total_tasks is {raw['total_tasks']!r}; expected a count"
+        yield f"total_tasks is {checks.shorten(raw['total_tasks'])}; expected a count"
+    robot: Any = raw.get("robot_type")
+    if robot is not None and (not isinstance(robot, str) or len(robot) > checks.LONGEST_NAME):
+        yield f"robot_type is {checks.shorten(robot)}; expected a name or null"
     for key in ("data_path", "video_path"):
-        path = raw.get(key) or layout.DATA_PATH
-        if not isinstance(path, str) or not _TEMPLATE.fullmatch(path) or ".." in path or path.startswith("/"):
-            yield f"{key} is {path!r}; expected a path with {{chunk_index:03d}} and {{file_index:03d}}"
+        path: Any = raw.get(key) or layout.DATA_PATH
+        if not _is_template(path):
+            text = f"{key} is {checks.shorten(path)}"
+            yield f"{text}; expected a path with {{chunk_index:03d}} and {{file_index:03d}}"
     features = raw.get("features")
     if not isinstance(features, dict) or not features:
-        yield f"features is {features!r}; expected a table of columns"
+        yield f"features is {checks.shorten(features)}; expected a table of columns"
         return
     for key, value in cast(dict[str, Any], features).items():
-        if not _is_feature(value):
-            yield f"feature {key!r} is {str(value)[:100]}; expected dtype and shape"
+        yield from _feature_problems(key, value)
+
+
+def _is_template(path: Any) -> bool:
+    if not isinstance(path, str) or len(path) > _LONGEST_PATH or ".." in path or path.startswith("/"):
+        return False
+    return _TEMPLATE.fullmatch(path) is not None
+
+
+def _feature_problems(key: str, value: Any) -> Iterator[str]:
+    try:
+        checks.name("a feature", key)  # LeRobot names folders and files by it
+    except ManipError as problem:
+        yield str(problem)
+    if not _is_feature(value):
+        yield f"feature {checks.shorten(key)} is {checks.shorten(value)}; expected dtype and shape"
+    elif value["dtype"] in PICTURES and max(value["shape"], default=0) > LONGEST_SIDE:
+        text = f"feature {checks.shorten(key)} has shape {checks.shorten(value['shape'])}"
+        yield f"{text}; expected at most {LONGEST_SIDE:,} pixels a side"
 
 
 def _is_feature(value: Any) -> bool:
@@ -136,7 +172,11 @@ def _is_feature(value: Any) -> bool:
         return False
     table = cast(dict[str, Any], value)
     shape = table.get("shape")
-    if not isinstance(table.get("dtype"), str) or not isinstance(shape, list):
+    if (
+        not isinstance(table.get("dtype"), str)
+        or not isinstance(shape, list)
+        or len(cast(list[Any], shape)) > _MOST_AXES
+    ):
         return False
     return all(_is_count(size) for size in cast(list[Any], shape)) and math.prod(cast(list[int], shape)) < 2**31
 

@@ -87,13 +87,19 @@ def _in_place(dataset: Dataset, findings: Sequence[Finding], kept: Path) -> Iter
     if any(one.remedy is Remedy.STATISTICS for one in findings) and dataset.reads_all_rows:
         yield _compute_statistics(dataset, kept)
     for place in dict.fromkeys(one.place for one in findings if one.remedy is Remedy.MOVE):
-        _move(*_way(dataset, place, kept))
+        source, target = _way(dataset, place, kept)
+        if not _is_inside(dataset.root, source, beside=place.startswith(BESIDE)):
+            yield f"not moved, as a link leads to it from outside the dataset: {place}"
+            continue
+        _move(source, target)
         yield f"moved away: {place}"
 
 
 def _compute_statistics(dataset: Dataset, kept: Path) -> str:
     """Statistics of every column of numbers; those of pictures stay as they are."""
     path = dataset.root / layout.STATS
+    if not _is_inside(dataset.root, path):
+        return f"not computed again, as {layout.STATS} lies outside the dataset: a link leads there"
     if path.exists():
         (kept / layout.STATS).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, kept / layout.STATS)
@@ -122,6 +128,12 @@ def _way(dataset: Dataset, place: str, kept: Path) -> tuple[Path, Path]:
     if place.startswith(BESIDE):
         return dataset.root.with_name(Path(place).name), kept / Path(place).name
     return dataset.root / place, kept / place
+
+
+def _is_inside(root: Path, path: Path, *, beside: bool = False) -> bool:
+    """Whether a file or folder stands in the dataset itself, or beside it; links to other folders do not count."""
+    folder, home = path.parent.resolve(), root.resolve()
+    return folder == home.parent if beside else folder.is_relative_to(home)
 
 
 def _move(source: Path, target: Path) -> None:

@@ -1,0 +1,265 @@
+"""Names from journals and datasets never lead out of the folder that they stand in."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manip_il.checks import LONGEST_NAME
+from manip_il.cli.main import main
+from manip_il.data import journal
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.build import RECORDING, Recording, build, local_id
+from manip_il.data.doctor.dataset import Dataset
+from manip_il.data.doctor.repair import repair
+from manip_il.data.lerobot_io import camera_keys, dataset_info, read_frames, read_spec, write_dataset
+from manip_il.data.mcap_export import open_source
+from manip_il.errors import ManipError, UsageError
+from manip_il.mdp import Episode
+from manip_il.sim.conditions import Condition
+
+from .damage import edit_json, findings, lines
+from .pictures import numbered_episodes, with_cameras
+from .test_doctor_repair import digests
+
+MakeEpisode = Callable[..., Episode]
+HOSTILE = "x/../../../victim/videos/observation.images.front"
+FRONT = s.IMAGES + "front"
+
+
+@pytest.fixture(scope="module")
+def seen(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
+    return with_cameras(spec, "front")
+
+
+@pytest.fixture(scope="module")
+def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, seen: s.RobotTaskSpec) -> Path:
+    root = tmp_path_factory.mktemp("filmed") / "victim"
+    write_dataset(numbered_episodes(make_episode, seen), root, seen, repo_id="a/victim", fingerprint={})
+    return root
+
+
+@pytest.fixture
+def victim(tmp_path: Path, filmed_once: Path) -> Path:
+    shutil.copytree(filmed_once, tmp_path / "victim")
+    return tmp_path / "victim"
+
+
+def renamed(spec: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> s.RobotTaskSpec:
+    """A spec that another program made up: nothing checks it."""
+    with monkeypatch.context() as patch:
+        patch.setattr(s.RobotTaskSpec, "__post_init__", lambda self: None)
+        return replace(spec, **changes)
+
+
+@pytest.fixture
+def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Journals whose only camera has a path for its name."""
+    plain = numbered_episodes(make_episode, seen, 1)[0]
+    columns = {key.replace(FRONT, s.IMAGES + HOSTILE): column for key, column in plain.columns.items()}
+    spec = renamed(seen, monkeypatch, cameras=(HOSTILE,))
+    journal.write_episode(tmp_path / "lift.journals", replace(plain, columns=columns), spec, {})
+    return tmp_path / "lift.journals"
+
+
+def test_a_camera_named_as_a_path_overwrites_no_other_dataset(
+    attack: Path, victim: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = digests(victim)
+    assert main(["build", str(attack), str(attack.with_name("lift"))]) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.count("\n") == 0
+    assert "a camera is 'x/../../../victim" in error
+    assert digests(victim) == before
+    assert not attack.with_name("lift").exists()
+
+
+def test_neither_does_a_repair_from_such_journals(
+    attack: Path, victim: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = shutil.copytree(victim, attack.with_name("lift"))
+    (root / layout.TASKS).unlink()  # so that a repair would build it again
+    before = digests(victim)
+    assert main(["doctor", str(root), "--repair=true"]) == 1
+    assert "a camera is 'x/../../../victim" in capsys.readouterr().out
+    assert digests(victim) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"robot": "../panda"}, "robot is '../panda'"),
+        ({"robot": None}, "robot is None"),
+        ({"task": "a/b"}, "task is 'a/b'"),
+        ({"task": "x" * (LONGEST_NAME + 1)}, "task is 'xxx"),
+        ({"fps": "20"}, "fps is '20'; expected a whole number"),
+        ({"fps": 0}, "fps is 0"),
+        ({"fps": 10**9}, "fps is 1000000000"),
+        ({"sim_state_size": 10**12}, "sim_state_size is"),
+        ({"joint_names": "abc"}, "joint_names is 'abc'; expected a list"),
+        ({"joint_names": [1]}, "a name in joint_names is 1"),
+        ({"environment_state_names": ["x"] * 20_000}, "environment_state_names is"),
+        ({"cameras": [".."]}, "a camera is '..'"),
+        ({"cameras": ["front\n"]}, "a camera is 'front\\n'"),
+        ({"cameras": ["a", "a"], "image_size": [8, 8]}, "expected each once"),
+        ({"cameras": ["a"], "image_size": [0, 0]}, "image_size is 0"),
+        ({"image_size": [8192, 8192]}, "image_size is 8192 x 8192 pixels; expected at most"),
+        ({"image_size": [8]}, "expected height and width"),
+        ({"instruction": {}}, "instruction is {}"),
+        ({"instruction": "x" * 100_000}, "instruction is 'xxx"),
+    ],
+)
+def test_a_spec_refuses_what_it_cannot_be(spec: s.RobotTaskSpec, change: dict[str, Any], words: str) -> None:
+    with pytest.raises(ManipError) as error:
+        s.RobotTaskSpec.from_json(spec.to_json() | change)
+    assert words in str(error.value)
+    assert len(str(error.value)) < 500
+
+
+def test_a_spec_is_an_object() -> None:
+    with pytest.raises(ManipError, match="a robot-task spec is 3"):
+        s.RobotTaskSpec.from_json(3)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"repo_id": "../../victim"}, "repo_id is '../../victim'"),
+        ({"repo_id": None}, "repo_id is None"),
+        ({"only_successes": "yes"}, "only_successes is 'yes'; expected true or false"),
+        ({"episodes": "3"}, "episodes is '3'"),
+        ({"labels": -1}, "labels is -1"),
+        ({"provenance": []}, "provenance is []"),
+        ({"video": {"g": "2"}}, "video setting g is '2'"),
+        ({"video": {"preset": "../x"}}, "video setting preset is '../x'"),
+        ({"video": {"vcodec": []}}, "vcodec is []"),
+        ({"video": {"colour": 1}}, "unknown video setting 'colour'"),
+        ({"video": None}, "video is None"),
+    ],
+)
+def test_a_recording_is_checked_and_its_file_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    Recording("a/b").write(tmp_path)
+    edit_json(tmp_path / RECORDING, lambda data: data.update(change))
+    with pytest.raises(ManipError) as error:
+        Recording.read(tmp_path)
+    assert words in str(error.value)
+    assert str(tmp_path / RECORDING) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "wanted"),
+    [("my demos", "local/my_demos"), ("...", "local/dataset"), ("é", "local/_"), ("a..b", "local/a.b")],
+)
+def test_a_folder_of_any_name_gives_a_repository_id(folder: str, wanted: str, tmp_path: Path) -> None:
+    assert local_id(folder) == wanted
+    assert Recording(local_id(folder)).repo_id == wanted
+
+
+@pytest.mark.parametrize("field", ["fingerprint", "spec"])
+def test_a_journal_whose_header_holds_null_is_refused(
+    tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = json.dumps
+    wrong = {"fingerprint": {"mark": 1}, "spec": spec.to_json()}[field]
+    monkeypatch.setattr(journal.json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
+    path = journal.write_episode(tmp_path, episodes[0], spec, {"mark": 1})
+    for read in (journal.read_header, journal.read_journal):
+        with pytest.raises(ManipError, match=r"None; expected an object"):
+            read(path)
+
+
+def lie(root: Path, **changes: Any) -> None:
+    edit_json(root / layout.INFO, lambda info: info.update(changes))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"data_path": "../victim/{chunk_index:03d}/{file_index:03d}.parquet"}, "data_path is"),
+        ({"data_path": "/etc/{chunk_index}{file_index}"}, "data_path is"),
+        ({"video_path": "{video_key.__class__}/{chunk_index}"}, "video_path is"),
+        ({"video_path": "videos/{chunk_index:9999999999d}"}, "video_path is"),
+        ({"video_path": ["x"]}, "video_path is"),
+        ({"data_path": "x" * 10_000}, "data_path is"),
+        ({"fps": "20"}, "fps is '20'"),
+        ({"fps": 0.001}, "fps is 0.001"),
+        ({"robot_type": {"a": 1}}, "robot_type is"),
+        ({"total_frames": "9"}, "total_frames is '9'"),
+        ({"total_episodes": 2**60}, "total_episodes is"),
+        ({"features": None}, "features is None"),
+    ],
+)
+def test_what_info_says_is_checked_by_every_reader(victim: Path, change: dict[str, Any], words: str) -> None:
+    lie(victim, **change)
+    assert any(words in line for line in lines(victim))
+    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, FRONT, 0)):
+        with pytest.raises(ManipError) as error:
+            read(victim)
+        assert words in str(error.value)
+
+
+def test_a_feature_named_as_a_path_leads_nowhere(victim: Path, tmp_path: Path) -> None:
+    secret = shutil.copytree(victim / "videos" / FRONT, tmp_path / "secret")
+    key = "../../secret"
+    assert (victim / "videos" / key).resolve() == secret
+    edit_json(victim / layout.INFO, lambda info: info["features"].update({key: info["features"].pop(FRONT)}))
+    assert any("a feature is '../../secret'" in line for line in lines(victim))
+    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, key, 0)):
+        with pytest.raises(ManipError, match=r"a feature is '\.\./\.\./secret'"):
+            read(victim)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fingerprint": None}, "fingerprint is None"),
+        ({"provenance": 3}, "provenance is 3"),
+        ({"spec": []}, "spec is []"),
+        ({"spec": {"robot": "r"}}, "missing or unknown"),
+    ],
+)
+def test_our_own_file_is_checked(victim: Path, change: dict[str, Any], words: str) -> None:
+    edit_json(victim / layout.OURS, lambda ours: ours.update(change))
+    for read in (dataset_info, read_spec):
+        with pytest.raises(ManipError) as error:
+            read(victim)
+        assert words in str(error.value)
+        assert "manip_il.json" in str(error.value)
+
+
+def test_a_repair_writes_and_moves_nothing_through_a_link(victim: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    shutil.move(victim / "meta", outside)
+    (victim / "meta").symlink_to(outside)
+    edit_json(outside / "stats.json", lambda stats: stats.pop(s.ACTION))  # it would be computed again
+    (outside / "left.tmp.partial").write_bytes(b"x")  # it would be moved away
+    before = digests(outside)
+    said = list(repair(Dataset(victim), findings(victim)))
+    assert digests(outside) == before
+    assert any("lies outside the dataset" in line for line in said)
+    assert any(line.startswith("not moved, as a link leads to it") for line in said)
+
+
+@pytest.mark.parametrize("name", ["../x", "a b", "", ".hidden", "x" * 200])
+def test_a_condition_is_named_so_that_a_file_may_be(name: str) -> None:
+    with pytest.raises(UsageError, match="a condition's name is"):
+        Condition(name)
+
+
+def test_a_range_beyond_what_a_float_holds_is_refused() -> None:
+    with pytest.raises(UsageError, match="expected a number"):
+        Condition.from_mapping("mine", {"mass": 10**400})
+
+
+def test_a_whole_journal_is_still_built(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec) -> None:
+    for episode in numbered_episodes(make_episode, seen):
+        journal.write_episode(tmp_path / "my demos.journals", episode, seen, {})
+    assert build(tmp_path / "my demos.journals", tmp_path / "d").info.episodes == 3
+    assert json.loads((tmp_path / "d" / layout.OURS).read_text())["repo_id"] == "local/my_demos"
