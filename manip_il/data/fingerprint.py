@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import platform
@@ -13,6 +14,8 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from numpy._core._multiarray_umath import __cpu_features__  # pyright: ignore[reportMissingImports, reportAttributeAccessIssue]
+from threadpoolctl import threadpool_info
 
 from manip_il.checks import shorten
 from manip_il.errors import ManipError
@@ -27,17 +30,33 @@ _MEANING = {
 
 
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
-    """Versions of what computes, and SHA-256 of the compiled model and of the config's canonical JSON.
+    """Versions of what computes, the processor, and SHA-256 of the compiled model and of the config's canonical JSON.
 
-    Nothing is imported for it: a missing package is `absent`. Raises `ManipError` for a config that JSON cannot hold.
+    Two equal fingerprints promise equal bytes. No package is imported for it: a missing one is `absent`. Raises
+    `ManipError` for a config that JSON cannot hold.
     """
     versions = {name: _version(name) for name in _PACKAGES}
     return {
         "python": platform.python_version(),
         **versions,
+        "processor": processor(),
         "model_sha256": hashlib.sha256(model_bytes).hexdigest(),
         "config_sha256": hashlib.sha256(canonical_json(config).encode()).hexdigest(),
     }
+
+
+@functools.cache
+def processor() -> str:
+    """Return what decides the last bits of float arithmetic: vector extensions, BLAS and its kernels, the C library.
+
+    For example `x86_64 AVX512_ICL, openblas 0.3.29 SkylakeX, glibc 2.36`.
+    """
+    extensions = [name for name, found in __cpu_features__.items() if found]
+    libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    # Other packages may have brought a BLAS of their own into this process.
+    numpys = [one for one in libraries if "numpy" in one["filepath"]] or libraries or [{}]
+    blas = " ".join(str(numpys[0].get(key, "")) for key in ("internal_api", "version", "architecture"))
+    return f"{platform.machine()} {extensions[-1] if extensions else ''}, {blas}, {' '.join(platform.libc_ver())}"
 
 
 def compare_fingerprints(

@@ -59,7 +59,7 @@ def test_a_fingerprint_names_versions_and_hashes_what_it_is_given() -> None:
     print_ = environment_fingerprint(b"model", {"b": 1, "a": [1, 2]})
     assert print_["numpy"] == np.__version__
     assert set(print_) == {
-        *("python", "manip_il", "mujoco", "mink", "lerobot", "torch", "numpy"),
+        *("python", "manip_il", "mujoco", "mink", "lerobot", "torch", "numpy", "processor"),
         *("model_sha256", "config_sha256"),
     }
     assert environment_fingerprint(b"model", {"a": (1, 2), "b": 1}) == print_  # order means nothing

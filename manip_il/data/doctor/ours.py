@@ -52,8 +52,8 @@ def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
     if not isinstance(fingerprint, dict) or not fingerprint:
         yield warning(layout.OURS, "has no fingerprint: what the dataset was recorded with is not known")
         return
-    theirs = {str(key): value for key, value in fingerprint.items() if not str(key).endswith(_HASH)}
-    here = {key: value for key, value in environment_fingerprint(b"", {}).items() if not key.endswith(_HASH)}
+    theirs = {str(key): value for key, value in fingerprint.items() if _is_version(str(key))}
+    here = {key: value for key, value in environment_fingerprint(b"", {}).items() if _is_version(key)}
     for text in compare_fingerprints("the dataset", theirs, "this installation", here):
         yield warning(layout.OURS, text)
 
@@ -66,6 +66,11 @@ def read_spec(dataset: Dataset) -> s.RobotTaskSpec:
     if not isinstance(ours["spec"], dict):
         raise ValueError(f"its spec is {type(ours['spec']).__name__}; expected an object")
     return s.RobotTaskSpec.from_json(ours["spec"])
+
+
+def _is_version(key: str) -> bool:
+    """Whether an entry of a fingerprint names a program: another processor is nothing amiss with a dataset."""
+    return not key.endswith(_HASH) and key != "processor"
 
 
 def _check_feature(key: str, wanted: dict[str, Any], info: Info) -> Iterator[Finding]:
