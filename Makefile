@@ -1,9 +1,9 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup gl browser sshd demo test test-fast lint format docker docker-test bench lock clean
+.PHONY: help setup demo test test-fast lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
-PYTHON     ?= python3.12
+PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
 export UV_PYTHON_DOWNLOADS := never
 export UV_LINK_MODE ?= copy
 
@@ -14,7 +14,8 @@ BIN := .venv/bin
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "make %-11s %s\n", $$1, $$2}'
 
-setup: .venv/.installed  ## the environment, in .venv
+setup: .venv/.installed  ## the environment, in .venv; as root also OpenGL and FFmpeg's libraries
+	@.ci/system gl ffmpeg
 
 .tools/bin/uv:
 	$(PYTHON) -m venv .tools
@@ -26,20 +27,12 @@ setup: .venv/.installed  ## the environment, in .venv
 	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
 	touch $@
 
-demo: setup gl  ## the whole story, small: runs/quickstart/report.html
-	$(BIN)/manip-il quickstart --output_dir=runs/quickstart
-
-gl:  ## the system's OpenGL, where it is missing and this is root
-	@.ci/gl
-
-browser:  ## a headless Chromium for the tests of reports, where it is missing and this is root
-	@.ci/browser
-
-sshd:  ## Debian's sshd for the tests of sftp://, where it is missing and this is root
-	@.ci/sshd
+demo: setup  ## the whole story, small: runs/quickstart/report.html
+	$(BIN)/manip-il quickstart --output_dir=runs/quickstart $(DEMO)
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
-test: setup gl browser sshd  ## every test
+test: setup  ## every test
+	@.ci/system browser sshd
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL
@@ -58,7 +51,7 @@ format: setup  ## put the code into shape
 docker:  ## the image manip-il; TORCH_BACKEND=cpu for a small one without CUDA
 	docker build --build-arg TORCH_BACKEND=$(TORCH_BACKEND) --tag manip-il .
 
-docker-test: setup gl  ## build the image, evaluate in it, compare with here
+docker-test: setup  ## build the image, evaluate in it, compare with here
 	.ci/docker
 
 # One by one: two at a time would measure each other.

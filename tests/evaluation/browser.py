@@ -32,7 +32,7 @@ class Opened:
 def chromium() -> Iterator[Browser]:
     """One Chromium of the machine; `AssertionError` says what to install where there is none."""
     found = next(filter(None, map(shutil.which, NAMES)), None)
-    assert found, f"no Chromium ({', '.join(NAMES)}) on the PATH; .ci/browser installs Debian's where it is run as root"
+    assert found, f"no Chromium ({', '.join(NAMES)}) on the PATH; as root: .ci/system browser"
     with sync_playwright() as playwright:
         # Its sandbox cannot be had as root, nor in most containers; the pages are our own.
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])

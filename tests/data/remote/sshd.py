@@ -48,7 +48,7 @@ class Sshd:
 def running_sshd(folder: Path, more: str = "") -> Iterator[Sshd]:
     """more: lines of sshd_config."""
     if not Path(SSHD).is_file():
-        raise RuntimeError(f"{SSHD} is missing: run .ci/sshd as root (it installs Debian's openssh-server)")
+        raise RuntimeError(f"{SSHD} is missing: as root: .ci/system sshd")
     keygen = shutil.which("ssh-keygen") or "ssh-keygen"
     for name in ("host_key", "user_key"):
         subprocess.run([keygen, "-q", "-t", "ed25519", "-N", "", "-f", str(folder / name)], check=True)
