@@ -6,6 +6,9 @@ UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
 export UV_PYTHON_DOWNLOADS := never
 export UV_LINK_MODE ?= copy
+export UV_SYSTEM_CERTS ?= true
+# Hundreds of processes import torch and LeRobot: the first one's bytecode is for all.
+unexport PYTHONDONTWRITEBYTECODE
 
 # uv is taken from the machine, else brought into .tools (a folder of the project's own).
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo .tools/bin/uv)
