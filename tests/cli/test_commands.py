@@ -136,7 +136,7 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     while not list((tmp_path / "d.journals").glob("episode-*")):
         time.sleep(0.01)
     os.kill(process.pid, signal.SIGINT)
-    err = process.communicate(timeout=60)[1]
+    err = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     assert "kept: every finished episode" in err
     assert err.rstrip().endswith("--workers=1 --resume=true")

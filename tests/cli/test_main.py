@@ -135,7 +135,7 @@ def test_a_reader_that_goes_away_is_no_error():
     assert process.stderr is not None
     assert process.stdout.readline() == b"line\n"
     process.stdout.close()
-    assert process.wait(timeout=30) == 141
+    assert process.wait(timeout=120) == 141
     assert process.stderr.read() == b""
     process.stderr.close()
 
@@ -162,5 +162,5 @@ program.script()
 
 
 def test_ctrl_c_does_not_wait_for_what_threads_send():
-    done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (130, "manip-il: interrupted\n")

@@ -119,7 +119,7 @@ def running_proxy(endpoint: str) -> Iterator[Proxy]:
             self.wfile.write(text)
 
         def _forward(self, headers: dict[str, str], body: bytes, what: str) -> None:
-            connection = http.client.HTTPConnection(host, timeout=30)
+            connection = http.client.HTTPConnection(host, timeout=120)
             try:
                 connection.request(self.command, self.path, body, headers)
                 answer = connection.getresponse()

@@ -70,11 +70,11 @@ def running_sshd(folder: Path, more: str = "") -> Iterator[Sshd]:
         yield Sshd(port, home, getpass.getuser() if "USER" in os.environ or os.getuid() else "root")
     finally:
         server.terminate()
-        server.wait(10)
+        server.wait(120)
 
 
 def _wait_for(port: int, server: subprocess.Popen[bytes], log: Path) -> None:
-    last = time.monotonic() + 10
+    last = time.monotonic() + 120
     while time.monotonic() < last and server.poll() is None:
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.2):
             return

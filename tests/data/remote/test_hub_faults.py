@@ -160,7 +160,7 @@ class Child:
 
     def close(self) -> str:
         """What it said."""
-        return self._process.communicate(timeout=20)[1]
+        return self._process.communicate(timeout=120)[1]
 
 
 def _kill(pid: int) -> None:

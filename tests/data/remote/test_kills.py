@@ -39,7 +39,7 @@ def killer(place: str) -> Iterator[Killer]:
     killer = Killer()  # after the environment says where the store is
     yield killer
     killer.process.stdin.close()
-    killer.process.wait(30)
+    killer.process.wait(120)
 
 
 @pytest.mark.slow
