@@ -74,6 +74,12 @@ def test_pictures_need_the_packages_that_errors_name(dockerfile):
     assert PACKAGES in final_stage(dockerfile)
 
 
-@pytest.mark.parametrize("script", ["docker", "docker-daemon", "run", "gl"])
+@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / ".ci").iterdir()))
 def test_the_scripts_are_sound_bash(script):
     subprocess.run(["bash", "-n", str(ROOT / ".ci" / script)], check=True)
+
+
+def test_make_brings_the_packages_that_errors_name():
+    from manip_il.sim.gl import PACKAGES
+
+    assert f"({PACKAGES})" in (ROOT / ".ci" / "system").read_text()
