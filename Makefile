@@ -63,7 +63,7 @@ bench: setup  ## every speed ratio
 
 lock: | $(filter .tools%,$(UV))  ## choose the versions anew
 	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
-	    --python $(PYTHON) --extra dev --extra ray --extra tensorboard pyproject.toml -o requirements.lock
+	    --python $(PYTHON) --extra dev --extra ray --extra tensorboard --extra export pyproject.toml -o requirements.lock
 
 clean:  ## remove what tools left behind; keeps .venv, runs and datasets
 	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache
