@@ -51,6 +51,7 @@ COMMANDS = {
     "health": Command("manip_il.cli.health:HealthOptions", "whether this machine can evaluate: draws, counts, checks"),
     "push": Command("manip_il.cli.push:PushOptions", "a dataset or policy to the Hub, S3, another machine, a folder"),
     "pull": Command("manip_il.cli.pull:PullOptions", "a dataset or policy from there, every file verified"),
+    "export": Command("manip_il.cli.export:ExportOptions", "a policy as ONNX or TorchScript, for a robot"),
     "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "a dataset as MCAP files, for Foxglove and others"),
     "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "MCAP files as a dataset, by a mapping file"),
     "quickstart": Command("manip_il.cli.quickstart:QuickstartOptions", "the whole story, small: watch it learn"),

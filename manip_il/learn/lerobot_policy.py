@@ -56,6 +56,11 @@ class EpisodePolicy:
         self._shared = _shared(policy)
         self._memories: dict[int, _Memory] = {}
 
+    @property
+    def module(self) -> PreTrainedPolicy:
+        """LeRobot's policy, which has seen no episode."""
+        return self._fresh
+
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """One action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget(self._memories.keys() - set(episodes))

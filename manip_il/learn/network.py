@@ -79,14 +79,14 @@ class MLPNetwork(nn.Module):
         rows = len(inputs)
         padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
         padded[:rows] = inputs
-        return torch.cat([self._act_rows(chunk) for chunk in padded.split(ROWS)])[:rows]
+        return torch.cat([self.actions(chunk) for chunk in padded.split(ROWS)])[:rows]
 
-    def _act_rows(self, inputs: Tensor) -> Tensor:
+    def actions(self, inputs: Tensor) -> Tensor:
+        """The same of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so neither shall the learner's, wherever it is.
-        action = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
-        action[:, :-1] += inputs[:, : self.n - 1]
-        return action
+        target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
+        return torch.cat([inputs[:, : self.n - 1] + target[:, :-1], target[:, -1:]], dim=1)
 
 
 def _perceptron(inputs: int, outputs: int, shape: Shape) -> nn.Sequential:

@@ -28,6 +28,11 @@ LIKELIHOODS = ("mixture", "categorical")  # losses whose spread depends on the s
 class Chooser(Protocol):
     """What turns a batch into actions, and remembers what must be remembered."""
 
+    @property
+    def module(self) -> torch.nn.Module:
+        """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
+        ...
+
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """One action (n,) a row; `episodes` says whose row each is. Other episodes have ended."""
         ...
@@ -76,6 +81,11 @@ class LearnedPolicy:
     def cameras(self) -> tuple[str, ...]:
         """Whose pictures it looks at."""
         return tuple(self.interface.pictures)
+
+    @property
+    def module(self) -> torch.nn.Module:
+        """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
+        return self._chooser.module
 
     @property
     def observation(self) -> str:
@@ -191,6 +201,11 @@ class _Perceptron:
             line = " ".join(str(error).split())
             raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {line}") from error
         self._network.to(device).eval()
+
+    @property
+    def module(self) -> MLPNetwork:
+        """The network."""
+        return self._network
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """One action a row. The mlp's processors are the identity (see MLPConfig), so there is nothing else to do."""

@@ -1,0 +1,75 @@
+"""`manip-il export`: a policy in one file that runs without this package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from manip_il.cli.folders import atomic_write
+from manip_il.cli.groups import find_policy, option, warn
+from manip_il.cli.progress import say
+from manip_il.errors import ManipError, UsageError
+
+EXPORTABLE = ("mlp", "cnn")
+SUFFIXES = {"onnx": ".onnx", "torchscript": ".pt"}
+ONNX_PACKAGES = ("onnx", "onnxruntime")
+
+
+@dataclass
+class ExportOptions:
+    """Write an mlp or cnn policy as one file that runs without this package.
+
+    Observations go in raw, by LeRobot's names; joint targets [rad] and the gripper command [m] come out. The file is
+    run and compared with the checkpoint before it is written. docs/export.md shows how to run it.
+    """
+
+    example: ClassVar[str] = "manip-il export runs/dagger --format=onnx --output=policy.onnx"
+    policy: Path = field(metadata={"help": "a run, a checkpoint or a pretrained_model folder", "positional": True})
+    format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
+    output: Path | None = field(default=None, metadata={"help": "the file; by default policy.onnx or policy.pt"})
+    overwrite: bool = option(False, "replace a file that is there")
+
+    def run(self) -> None:
+        """Export, compare, write."""
+        output = self._output()
+        path = find_policy(self.policy)
+        self._check(path)
+        from manip_il.engine.describe import policy_sha256
+        from manip_il.learn.export import export_onnx, export_torchscript
+
+        write = export_onnx if self.format == "onnx" else export_torchscript
+        exported = write(path, policy_sha256(path))
+        atomic_write(output, exported.data)
+        if "robot" not in exported.metadata:
+            warn([f"{path} was written by another tool: the file does not say robot, task, control rate and names"])
+        say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
+        say("\n".join(_lines(exported.metadata)))
+        say(f"exported: {output} ({len(exported.data):,} bytes)")
+
+    def _output(self) -> Path:
+        """Where the file goes; `UsageError` where it may not."""
+        output = self.output or Path(f"policy{SUFFIXES[self.format]}")
+        if output.is_dir():
+            raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
+        if output.exists() and not self.overwrite:
+            raise UsageError(f"{output} exists already; replace it by --overwrite=true, or choose another --output")
+        return output
+
+    def _check(self, path: Path) -> None:
+        """Raise before anything heavy is imported where this policy cannot be exported, or not on this machine."""
+        from manip_il.learn.pretrained import read_config
+
+        kind = read_config(path)["type"]
+        if kind not in EXPORTABLE:
+            raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
+        if self.format == "onnx" and (missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]):
+            raise ManipError(f"--format=onnx needs {' and '.join(missing)}: pip install 'manip_il[export]'")
+
+
+def _lines(metadata: Mapping[str, Any]) -> list[str]:
+    """The file's inputs and outputs, a line each."""
+    sides = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
+    return [f"{side:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})" for side, one in sides]

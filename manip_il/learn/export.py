@@ -1,0 +1,245 @@
+"""A policy in one file that runs without this package: ONNX, for onnxruntime, or TorchScript, for torch.
+
+Observations go in by LeRobot's names, raw; absolute actions come out. Everything between, units and clipping too, is
+in the file. What names, shapes and units mean is in its metadata.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, override
+from zipfile import ZipFile, ZipInfo
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from manip_il.checks import mapping, shorten
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.augment import to_float
+from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.network import MLPNetwork
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.pretrained import CONFIG, read_config
+
+EXTRA_FILE = "manip_il.json"  # in a TorchScript file: its metadata
+TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
+_OPSET = 17
+_ROWS = 64  # observations on which file and checkpoint are compared
+_UNITS = {"x": "m", "y": "m", "z": "m", "tilt": "rad"}
+_UNITLESS = re.compile(r"r[xyz][xyz]|cos.*|sin.*")
+
+Arrays = dict[str, NDArray[Any]]
+Run = Callable[[Arrays], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file's content and metadata. difference: the largest from the checkpoint's actions over random observations."""
+
+    data: bytes
+    metadata: dict[str, Any]
+    difference: float
+
+
+class PolicyFunction(nn.Module):
+    """A policy as a function of one moment: observations by name in, absolute actions (B, n) out.
+
+    Joint state (B, n) and environment state (B, k) are float32, pictures uint8 (B, H, W, 3), as cameras give them.
+    """
+
+    def __init__(self, policy: LearnedPolicy) -> None:
+        super().__init__()
+        module = policy.module
+        self.numbers = [key for key in (STATE, ENVIRONMENT_STATE) if key in policy.interface.numbers]
+        if isinstance(module, MLPNetwork):
+            self.network, self.cameras, self.encoders = module, list[str](), nn.ModuleList()
+        else:
+            from manip_il.learn.cnn.modeling_cnn import CNNPolicy
+
+            assert isinstance(module, CNNPolicy)
+            self.network, self.cameras, self.encoders = module.model, module.cameras, module.encoders
+        self.requires_grad_(False).eval()
+
+    @property
+    def inputs(self) -> list[str]:
+        """The observations' names, in order."""
+        return [*self.numbers, *self.cameras]
+
+    @override
+    def forward(self, observation: dict[str, Tensor]) -> Tensor:
+        pictures = [to_float(observation[key].permute(0, 3, 1, 2)) for key in self.cameras]
+        seen = [encoder(picture) for encoder, picture in zip(self.encoders, pictures, strict=True)]
+        return self.network.actions(torch.cat([*(observation[key] for key in self.numbers), *seen], dim=1))
+
+
+class _InOrder(nn.Module):
+    """The same function of observations in the order of `PolicyFunction.inputs`, as ONNX wants it."""
+
+    def __init__(self, function: PolicyFunction) -> None:
+        super().__init__()
+        self.function = function
+
+    @override
+    def forward(self, *observations: Tensor) -> Tensor:
+        return self.function(dict(zip(self.function.inputs, observations, strict=True)))
+
+
+def export_onnx(path: Path, policy_sha256: str) -> Exported:
+    """The policy in a `pretrained_model` folder as ONNX.
+
+    Raises `ManipError` where the file would act otherwise than the checkpoint, and what `LearnedPolicy.load` raises.
+    """
+    import onnx
+    import onnxruntime
+
+    policy, function, metadata = _load(path, policy_sha256)
+    example = _tensors(_observations(policy, function, rows=2))
+    content = io.BytesIO()
+    with warnings.catch_warnings():
+        # The exporter that torch prefers needs two packages more, and gives the same graph.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            _InOrder(function),
+            tuple(example.values()),
+            content,  # pyright: ignore[reportArgumentType]  # it takes what can be written to
+            input_names=list(example),
+            output_names=[ACTION],
+            dynamic_axes={name: {0: "batch"} for name in (*example, ACTION)},
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+    model = onnx.load_model_from_string(content.getvalue())
+    model.graph.output[0].type.tensor_type.shape.dim[1].dim_value = policy.interface.action
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in metadata.items()}
+    onnx.helper.set_model_props(model, texts)
+    onnx.checker.check_model(model, full_check=True)
+    data = model.SerializeToString()
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    difference = _checked(path, policy, function, lambda observation: np.asarray(session.run(None, observation)[0]))
+    return Exported(data, metadata, difference)
+
+
+def export_torchscript(path: Path, policy_sha256: str) -> Exported:
+    """The same as TorchScript: a module whose one argument is a dict of observations."""
+    policy, function, metadata = _load(path, policy_sha256)
+    content = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch has a younger format, which needs the whole of torch to read
+        example = _tensors(_observations(policy, function, rows=2))
+        traced = torch.jit.trace(function, (example,), check_trace=False)
+        torch.jit.save(traced, content, _extra_files={EXTRA_FILE: json.dumps(metadata)})
+        data = _without_source_paths(content.getvalue())
+        loaded = torch.jit.load(io.BytesIO(data))
+    difference = _checked(path, policy, function, lambda observation: loaded(_tensors(observation)).numpy())
+    return Exported(data, metadata, difference)
+
+
+def _without_source_paths(archive: bytes) -> bytes:
+    """A TorchScript file without its debug records, which name this machine's files."""
+    content = io.BytesIO()
+    with ZipFile(io.BytesIO(archive)) as source, ZipFile(content, "w") as target:  # uncompressed, as torch wants it
+        for name in source.namelist():
+            if not name.endswith(".debug_pkl"):
+                target.writestr(ZipInfo(name), source.read(name))
+    return content.getvalue()
+
+
+def describe(policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str) -> dict[str, Any]:
+    """A file's metadata: what policy it is, for what, and its inputs and outputs. What is not known is left out."""
+    meta, n = policy.meta, policy.interface.action
+    outputs = [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))]
+    told: dict[str, Any] = {
+        "robot": meta.robot if meta else None,
+        "task": meta.task if meta else None,
+        "control_rate_hz": meta.fps if meta else None,
+        "action_meaning": meta.action_meaning if meta else None,
+        "inputs": [_input(policy, key, meta) for key in inputs],
+        "outputs": outputs,
+        "policy_type": config["type"],
+        "policy_loss": config.get("loss"),
+        "policy_sha256": sha256,
+    }
+    return {key: value for key, value in told.items() if value is not None}
+
+
+def _input(policy: LearnedPolicy, key: str, meta: CheckpointMeta | None) -> dict[str, Any]:
+    if key.startswith(IMAGES):
+        height, width = policy.interface.pictures[key.removeprefix(IMAGES)]
+        shape = ["batch", height, width, 3]
+        return {"name": key, "dtype": "uint8", "shape": shape, "names": ["red", "green", "blue"], "units": "0 to 255"}
+    size = policy.interface.numbers[key]
+    if key == STATE:
+        return _numbers(key, size, meta.joint_names if meta else None, _joint_units(size))
+    names = meta.environment_state_names if meta else None
+    return _numbers(key, size, names, [_unit(name) for name in names] if names else None)
+
+
+def _numbers(key: str, size: int, names: Sequence[str] | None, units: Sequence[str | None] | None) -> dict[str, Any]:
+    if names and len(names) != size:
+        raise MismatchError(f"numbers in {key}", META_FILE, len(names), CONFIG, size)
+    told = {"name": key, "dtype": "float32", "shape": ["batch", size]}
+    told |= {"names": list(names)} if names else {}
+    return told | ({"units": list(units)} if units else {})
+
+
+def _joint_units(n: int) -> list[str]:
+    """Of joint state and action: the arm's joints, then the gripper's opening."""
+    return ["rad"] * (n - 1) + ["m"]
+
+
+def _unit(name: str) -> str | None:
+    """Of a number of the environment state, by its name; None where that does not say."""
+    leaf = name.rpartition(".")[2]
+    return "1" if _UNITLESS.fullmatch(leaf) else _UNITS.get(leaf)
+
+
+def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction, dict[str, Any]]:
+    config = read_config(path)
+    modes = config.get("normalization_mapping", {})
+    if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
+        raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
+    policy = LearnedPolicy.load(path)
+    function = PolicyFunction(policy)
+    return policy, function, describe(policy, config, function.inputs, policy_sha256)
+
+
+def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:
+    """Random observations, spread as the training data were."""
+    rng = np.random.default_rng(0)
+    widths = [policy.interface.numbers[key] for key in function.numbers]
+    network, size = function.network, sum(widths)
+    mean, scale = network.input_mean[:size].numpy(), network.input_scale[:size].numpy()
+    deviation = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+    numbers = (mean + deviation * rng.normal(size=(rows, size))).astype(np.float32)
+    parts = np.split(numbers, np.cumsum(widths)[:-1], axis=1)
+    sizes = {key: policy.interface.pictures[key.removeprefix(IMAGES)] for key in function.cameras}
+    pictures = {key: rng.integers(256, size=(rows, *size, 3), dtype=np.uint8) for key, size in sizes.items()}
+    return dict(zip(function.numbers, parts, strict=True)) | pictures
+
+
+def _tensors(observation: Arrays) -> dict[str, Tensor]:
+    return {key: torch.from_numpy(values) for key, values in observation.items()}
+
+
+def _checked(path: Path, policy: LearnedPolicy, function: PolicyFunction, run: Run) -> float:
+    """The largest difference from the checkpoint's actions over random observations; `ManipError` if too large."""
+    observation = _observations(policy, function, _ROWS)
+    images = {key.removeprefix(IMAGES): observation[key] for key in function.cameras}
+    states = observation[STATE]
+    around = observation.get(ENVIRONMENT_STATE, np.empty((_ROWS, 0), np.float32))
+    difference = float(np.abs(run(observation) - policy.act(states, around, images)).max())
+    if not difference <= TOLERANCE:
+        raise ManipError(
+            f"{path}: the exported file's actions differ by up to {difference:.2g} from the checkpoint's; expected at "
+            f"most {TOLERANCE:g}, so nothing was written"
+        )
+    return difference

@@ -1,0 +1,154 @@
+"""`manip-il export`: one file, refused early where it cannot be, and run without this package as the docs show."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import manip_il.cli.export as command
+from manip_il.cli.main import main
+from manip_il.engine.describe import env_spec, policy_sha256
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.sim.env import EnvConfig
+
+from ..learn.tiny_policies import write_checkpoint
+
+DOCS = Path(__file__).parents[2] / "docs" / "export.md"
+SNIPPETS = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+SPEC = env_spec(EnvConfig("panda", "pick_place"))
+# Before a snippet: these packages cannot be imported, as if they were not installed.
+WITHOUT = "import sys; sys.modules |= dict.fromkeys({names})\n"
+
+
+def write_run(folder: Path, kind: str = "mlp", observation: str = "state") -> Path:
+    """A run with a policy where `train` leaves it; returns that policy's folder."""
+    spec = SPEC if observation == "state" else replace(SPEC, cameras=("front",), image_size=(32, 48))
+    meta = CheckpointMeta.of(spec, observation=observation)
+    place = folder / "checkpoints" / "last" / "pretrained_model"
+    return write_checkpoint(place, kind, spec, observation, meta=meta)
+
+
+def complaint(capsys) -> str:
+    """The one line on standard error."""
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    return err.removeprefix("manip-il: error: ").strip()
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("format_", "name"), [("onnx", "policy.onnx"), ("torchscript", "policy.pt")])
+def test_it_tells_what_goes_in_and_out_and_how_near_the_checkpoint_is(here, capsys, format_, name):
+    policy = write_run(here / "run", "cnn", "both")
+    assert main(["export", "run", f"--format={format_}"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    first, *rest = out.splitlines()
+    difference = re.fullmatch(rf"largest difference from {policy.relative_to(here)} over random .*: (\S+)", first)
+    assert difference
+    assert float(difference[1]) <= 1e-5
+    assert rest == [
+        " in: observation.state float32 (batch, 8)",
+        " in: observation.environment_state float32 (batch, 24)",
+        " in: observation.images.front uint8 (batch, 32, 48, 3)",
+        "out: action float32 (batch, 8)",
+        f"exported: {name} ({(here / name).stat().st_size:,} bytes)",
+    ]
+    assert policy_sha256(policy).encode() in (here / name).read_bytes()
+
+
+def test_a_file_that_is_there_stays_unless_told_otherwise(here, capsys):
+    write_run(here / "run")
+    (here / "mine.pt").write_bytes(b"mine")
+    words = ["export", "run", "--format=torchscript", "--output=mine.pt"]
+    assert main(words) == 2
+    assert complaint(capsys) == "mine.pt exists already; replace it by --overwrite=true, or choose another --output"
+    assert (here / "mine.pt").read_bytes() == b"mine"
+    assert main([*words, "--overwrite=true"]) == 0
+    assert (here / "mine.pt").read_bytes().startswith(b"PK")
+    assert sorted(path.name for path in here.iterdir()) == ["mine.pt", "run"]
+
+
+def test_a_folder_is_no_file(here, capsys):
+    write_run(here / "run")
+    assert main(["export", "run", "--output=run"]) == 2
+    assert complaint(capsys) == "--output is run, a folder; expected a file such as run/policy.onnx"
+
+
+def test_other_policies_are_refused_by_their_type(here, capsys):
+    policy = write_run(here / "run", "act")
+    assert main(["export", "run"]) == 1
+    assert (
+        complaint(capsys) == f"{policy.relative_to(here)} is a policy of type 'act'; only mlp and cnn can be exported"
+    )
+
+
+def test_a_missing_package_is_named_with_what_installs_it(here, capsys, monkeypatch):
+    write_run(here / "run")
+    monkeypatch.setattr(command, "find_spec", lambda name: None if name == "onnxruntime" else object())
+    assert main(["export", "run"]) == 1
+    assert complaint(capsys) == "--format=onnx needs onnxruntime: pip install 'manip_il[export]'"
+    assert main(["export", "run", "--format=torchscript"]) == 0
+
+
+def test_a_policy_of_another_tool_is_exported_with_a_warning(here, capsys):
+    write_checkpoint(here / "theirs", "mlp", SPEC)
+    assert main(["export", "theirs"]) == 0
+    assert "theirs was written by another tool: the file does not say robot, task" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mistake", ["no_run", "act", "there"])
+def test_mistakes_are_found_before_anything_heavy_is_imported(here, mistake):
+    write_run(here / "run", "act" if mistake == "act" else "mlp")
+    if mistake == "there":
+        (here / "policy.onnx").write_bytes(b"")
+    script = (
+        "import sys; from manip_il.cli.main import main; code = main(sys.argv[1:])\n"
+        "assert not {'torch', 'lerobot', 'mujoco', 'onnx', 'onnxruntime'} & sys.modules.keys(), sys.modules.keys()\n"
+        "sys.exit(code)"
+    )
+    words = ["export", "nothing" if mistake == "no_run" else "run"]
+    done = subprocess.run([sys.executable, "-c", script, *words], cwd=here, capture_output=True, text=True, timeout=300)
+    assert done.returncode in (1, 2), done.stderr
+    assert done.stderr.startswith("manip-il: error: ")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("snippet", "format_", "absent", "kind", "observation"),
+    [
+        (0, "onnx", ("manip_il", "lerobot", "torch", "onnx"), "mlp", "state"),
+        (0, "onnx", ("manip_il", "lerobot", "torch", "onnx"), "cnn", "images"),
+        (1, "torchscript", ("manip_il", "lerobot", "onnx", "onnxruntime"), "cnn", "both"),
+    ],
+)
+@pytest.mark.slow
+def test_the_docs_snippets_run_it_without_this_package(here, snippet, format_, absent, kind, observation):
+    policy = LearnedPolicy.load(write_run(here / "run", kind, observation))
+    assert main(["export", "run", f"--format={format_}"]) == 0
+    code = SNIPPETS[snippet]
+    assert code.count("\n") <= 15
+    (here / "snippet.py").write_text(WITHOUT.format(names=absent) + code)
+    done = subprocess.run([sys.executable, "-I", "snippet.py"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    said = [line.rsplit(" ", 2) for line in done.stdout.splitlines()]
+    assert [(name.removesuffix(":"), unit) for name, _, unit in said] == [
+        (name, "rad" if number < 7 else "m") for number, name in enumerate(SPEC.joint_names)
+    ]
+    images = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in policy.cameras}
+    expected = policy.act(np.zeros((1, 8), np.float32), np.zeros((1, 24), np.float32), images)[0]
+    assert np.abs(np.array([float(value) for _, value, _ in said]) - expected).max() <= 1.1e-5
+    assert np.abs(expected).max() > 1e-3

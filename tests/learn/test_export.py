@@ -1,0 +1,217 @@
+"""Exported policies act as the checkpoint does, for any number of rows, and say what their numbers mean."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+
+from manip_il.data.lerobot_io import read_spec, read_table
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn import export
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.export import EXTRA_FILE, TOLERANCE, Exported, export_onnx, export_torchscript
+from manip_il.learn.losses import LOSSES
+from manip_il.learn.mlp import MLPConfig
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.train import TrainConfig, fit
+
+from .tiny_policies import edit_config, write_checkpoint
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+SIDES = (48, 64)  # height and width of pictures
+WRITERS = {"onnx": export_onnx, "torchscript": export_torchscript}
+Observation = dict[str, NDArray[Any]]
+
+
+@cache
+def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
+    columns = [STATE, ENVIRONMENT_STATE, "action", "label_valid", "episode_index", "frame_index"]
+    return read_spec(SAMPLE), read_table(SAMPLE, columns)
+
+
+@pytest.fixture(params=LOSSES)
+def mlp(request, tmp_path) -> Path:
+    """A few steps of training, so that units, ranges and weights are those of real data."""
+    spec, table = sample()
+    config = TrainConfig(steps=20, batch_size=32, policy=MLPConfig(loss=request.param, width=64))
+    return fit(table, config, tmp_path / "run", spec=spec)
+
+
+def write_cnn(folder: Path, spec: RobotTaskSpec, observation: str = "images", **options: Any) -> Path:
+    seen = replace(spec, cameras=("wrist", "front"), image_size=SIDES)
+    return write_checkpoint(
+        folder, "cnn", seen, observation, meta=CheckpointMeta.of(seen, observation=observation), **options
+    )
+
+
+def drawn(spec: RobotTaskSpec, rows: int, pictures: bool = False) -> Observation:
+    """Noise, and beside it in every second picture a small bright thing on black, which keypoints are sharp on."""
+    rng = np.random.default_rng(1)
+    observation = {
+        STATE: rng.normal(size=(rows, len(spec.joint_names))).astype(np.float32),
+        ENVIRONMENT_STATE: rng.normal(size=(rows, len(spec.environment_state_names))).astype(np.float32),
+    }
+    for camera in ("front", "wrist") if pictures else ():
+        seen = rng.integers(256, size=(rows, *SIDES, 3), dtype=np.uint8)
+        seen[::2] = 0
+        for row in range(0, rows, 2):
+            y, x = rng.integers(40, size=2)
+            seen[row, y : y + 4, x : x + 4] = rng.integers(256, size=3)
+        observation[IMAGES + camera] = seen
+    return observation
+
+
+def lerobot_actions(checkpoint: Path, observation: Observation) -> NDArray[np.float32]:
+    """What `select_action` and LeRobot's processors make of observations."""
+    policy = get_policy_class(json.loads((checkpoint / "config.json").read_text())["type"]).from_pretrained(checkpoint)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+    batch = {key: torch.from_numpy(values) for key, values in observation.items()}
+    for key in batch:
+        if key.startswith(IMAGES):
+            batch[key] = batch[key].permute(0, 3, 1, 2).contiguous().float() / 255
+    with torch.inference_mode():
+        return after(policy.select_action(before(batch))).numpy()
+
+
+def run(kind: str, exported: Exported, observation: Observation) -> NDArray[np.float32]:
+    """The file's actions, its own inputs taken from an observation."""
+    taken = {one["name"]: observation[one["name"]] for one in exported.metadata["inputs"]}
+    if kind == "onnx":
+        return np.asarray(onnxruntime.InferenceSession(exported.data).run(["action"], taken)[0])
+    module = torch.jit.load(io.BytesIO(exported.data))
+    return module({key: torch.from_numpy(values) for key, values in taken.items()}).numpy()
+
+
+def check_equal(checkpoint: Path, observations: list[Observation]) -> None:
+    for kind, write in WRITERS.items():
+        exported = write(checkpoint, "")
+        for observation in observations:
+            expected = lerobot_actions(checkpoint, observation)
+            actions = run(kind, exported, observation)
+            assert actions.dtype == np.float32
+            assert actions.shape == expected.shape
+            assert np.abs(actions - expected).max() <= TOLERANCE
+
+
+def test_an_mlp_acts_as_its_checkpoint_on_real_and_random_observations(mlp):
+    spec, table = sample()
+    real = {key: table[key].copy() for key in (STATE, ENVIRONMENT_STATE)}
+    assert len(real[STATE]) > 300
+    check_equal(mlp, [real, drawn(spec, 1), drawn(spec, 130)])
+
+
+@pytest.mark.parametrize("observation", ["images", "both"])
+def test_a_cnn_acts_as_its_checkpoint_whatever_the_number_of_pictures(observation, spec, tmp_path):
+    checkpoint = write_cnn(tmp_path / "cnn", spec, observation, loss="mixture")
+    check_equal(checkpoint, [drawn(spec, 1, pictures=True), drawn(spec, 21, pictures=True)])
+
+
+def test_cameras_are_not_mixed_up(spec, tmp_path):
+    seen = drawn(spec, 4, pictures=True)
+    swapped = seen | {IMAGES + "front": seen[IMAGES + "wrist"], IMAGES + "wrist": seen[IMAGES + "front"]}
+    checkpoint = write_cnn(tmp_path / "cnn", spec)
+    for kind, write in WRITERS.items():
+        exported = write(checkpoint, "")
+        assert np.abs(run(kind, exported, seen) - run(kind, exported, swapped)).max() > 100 * TOLERANCE
+
+
+def metadata_in(kind: str, data: bytes) -> dict[str, Any]:
+    if kind == "onnx":
+        texts = {one.key: one.value for one in onnx.load_model_from_string(data).metadata_props}
+        return texts | {key: json.loads(texts[key]) for key in ("inputs", "outputs", "control_rate_hz") if key in texts}
+    files = {EXTRA_FILE: ""}
+    torch.jit.load(io.BytesIO(data), _extra_files=files)
+    return json.loads(files[EXTRA_FILE])
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_the_metadata_name_every_number_with_its_unit(kind, tmp_path):
+    spec, _ = sample()
+    checkpoint = write_cnn(tmp_path / "cnn", spec, "both")
+    told = metadata_in(kind, WRITERS[kind](checkpoint, "abc").data)
+    assert {key: value for key, value in told.items() if key not in ("inputs", "outputs")} == {
+        "robot": "panda",
+        "task": "pick_place",
+        "control_rate_hz": 20,
+        "action_meaning": "joint position targets [rad], gripper opening command [m]",
+        "policy_type": "cnn",
+        "policy_loss": "mse",
+        "policy_sha256": "abc",
+    }
+    state, around, front, wrist = told["inputs"]
+    joints = {"dtype": "float32", "shape": ["batch", 8], "names": list(spec.joint_names), "units": ["rad"] * 7 + ["m"]}
+    assert state == {"name": STATE} | joints
+    assert told["outputs"] == [{"name": "action"} | joints]
+    units = dict(zip(around["names"], around["units"], strict=True))
+    assert tuple(units) == spec.environment_state_names
+    chosen = ("ee.x", "ee.rxy", "object.cos4yaw", "object.tilt", "goal_from_object.z")
+    assert [units[name] for name in chosen] == ["m", "1", "1", "rad", "m"]
+    assert None not in units.values()
+    assert [(one["name"], one["dtype"], one["shape"]) for one in (front, wrist)] == [
+        (f"{IMAGES}{camera}", "uint8", ["batch", *SIDES, 3]) for camera in ("front", "wrist")
+    ]
+
+
+def test_onnx_declares_the_shapes_that_its_metadata_tell(spec, tmp_path):
+    exported = export_onnx(write_cnn(tmp_path / "cnn", spec), "")
+    session = onnxruntime.InferenceSession(exported.data)
+    for declared, told in (
+        (session.get_inputs(), exported.metadata["inputs"]),
+        (session.get_outputs(), exported.metadata["outputs"]),
+    ):
+        assert [(one.name, one.shape) for one in declared] == [(one["name"], one["shape"]) for one in told]
+
+
+def test_a_checkpoint_of_another_tool_gives_what_it_knows(spec, tmp_path):
+    told = export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec), "").metadata
+    assert "robot" not in told
+    assert "names" not in told["inputs"][0]
+    assert told["inputs"][0]["shape"] == ["batch", 4]
+
+
+def test_torchscript_names_no_file_of_this_machine(spec, tmp_path):
+    data = export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec), "").data
+    with ZipFile(io.BytesIO(data)) as archive:
+        for name in archive.namelist():
+            assert str(Path(export.__file__).parent).encode() not in archive.read(name), name
+
+
+def test_normalisation_outside_the_network_is_refused(spec, tmp_path):
+    checkpoint = write_checkpoint(tmp_path / "mlp", "mlp", spec)
+    edit_config(checkpoint, normalization_mapping={"STATE": "MEAN_STD", "ACTION": "IDENTITY"})
+    with pytest.raises(ManipError, match=r"normalization_mapping is .*MEAN_STD.*; expected IDENTITY"):
+        export_torchscript(checkpoint, "")
+
+
+def test_names_that_are_too_few_are_refused(spec, tmp_path):
+    meta = replace(CheckpointMeta.of(spec), joint_names=("a", "b"))
+    with pytest.raises(MismatchError, match=r"manip_il.json has 2, config.json has 4"):
+        export_torchscript(write_checkpoint(tmp_path / "mlp", "mlp", spec, meta=meta), "")
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_file_that_acts_otherwise_is_refused(kind, spec, tmp_path, monkeypatch):
+    checkpoint = write_checkpoint(tmp_path / "mlp", "mlp", spec)
+    other = write_checkpoint(tmp_path / "other", "mlp", spec)
+    weights = load_file(other / "model.safetensors")
+    weights["model.target_mean"] += 2 * TOLERANCE
+    save_file(weights, other / "model.safetensors")
+    policy, make = LearnedPolicy.load(other), export.PolicyFunction
+    monkeypatch.setattr(export, "PolicyFunction", lambda _: make(policy))
+    with pytest.raises(ManipError, match=r"differ by up to 2e-05 from the checkpoint's; expected at most 1e-05"):
+        WRITERS[kind](checkpoint, "")
