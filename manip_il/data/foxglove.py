@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,12 +21,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.records import Channel as ChannelRecord
-from mcap.records import McapRecord
-from mcap.records import Message as MessageRecord
+from mcap.opcode import Opcode
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
+
+from manip_il.checks import shorten
+from manip_il.data.mcap_records import Record, to_channel, to_message
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -160,18 +162,35 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
             writer.add_message(channel_id, time, message, time, frame)
 
 
-def read_images(records: Iterable[McapRecord]) -> dict[str, U8]:
-    """Every camera's pictures (T, height, width, 3) as `images` wrote them, from a file's records in stored order."""
-    cameras: dict[int, str] = {}
-    pictures: dict[str, list[U8]] = {}
+def read_images(records: Iterable[Record], cameras: Sequence[str], shape: tuple[int, ...]) -> dict[str, U8]:
+    """Every camera's pictures as `images` wrote them, from a file's records in stored order.
+
+    shape: of what each camera has, (T, height, width, 3). Raises `ValueError` for another camera, another size, and for
+    fewer or more pictures.
+    """
+    topics: dict[int, str] = {}
+    pictures: dict[str, U8] = {}
+    counts: Counter[str] = Counter()
     for record in records:
-        if isinstance(record, ChannelRecord) and record.topic.startswith(IMAGE_TOPICS):
-            cameras[record.id] = record.topic.removeprefix(IMAGE_TOPICS)
-        elif isinstance(record, MessageRecord) and record.channel_id in cameras:
-            message = RawImage.FromString(record.data)
-            picture = np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
-            pictures.setdefault(cameras[record.channel_id], []).append(picture)
-    return {camera: np.stack(frames) for camera, frames in pictures.items()}
+        if record.opcode == Opcode.CHANNEL:
+            channel = to_channel(record.body)
+            if (camera := channel.topic.removeprefix(IMAGE_TOPICS)) != channel.topic:
+                if camera not in cameras:
+                    raise ValueError(f"it holds pictures of {shorten(camera)}; its header names {shorten(cameras)}")
+                topics[channel.id] = camera
+        elif record.opcode == Opcode.MESSAGE and (camera := topics.get(int.from_bytes(record.body[:2], "little"))):
+            message = RawImage.FromString(to_message(record.body).data)
+            if (message.height, message.width, 3) != shape[1:] or counts[camera] == shape[0]:
+                found = f"picture {counts[camera]} of {camera}, {message.height} x {message.width}"
+                raise ValueError(f"{found}, is not one of {shape[0]} of {shape[1]} x {shape[2]} pixels")
+            if camera not in pictures:
+                pictures[camera] = np.empty(shape, np.uint8)
+            pictures[camera][counts[camera]] = np.frombuffer(message.data, np.uint8).reshape(shape[1:])
+            counts[camera] += 1
+    for camera, count in counts.items():
+        if count != shape[0]:
+            raise ValueError(f"it holds {count} pictures of {camera}; expected {shape[0]}")
+    return pictures
 
 
 def _stamp(timestamp: Timestamp, time: int) -> None:

@@ -8,27 +8,37 @@ from __future__ import annotations
 
 import io
 import json
+import math
+import os
 import re
-import zlib
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
-from mcap.records import Attachment, Chunk, DataEnd, Footer, McapRecord, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import foxglove
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.foxglove_episode import channels, frame_times
-from manip_il.data.schema import IMAGES, RobotTaskSpec
+from manip_il.data.mcap_records import (
+    MIB,
+    Budget,
+    check_both_sums,
+    chunk_records,
+    read_records,
+    to_attachment,
+    unpack,
+)
+from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -36,10 +46,16 @@ _FORMAT = "1"
 _RECORD = "manip_il"  # name of our metadata record
 _HEADER_KEYS = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")
 _NPY = ".npy"
-MOST_FRAMES = 10_000_000  # of an episode
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
-_FOOTER_TAIL = 4 + 8  # the footer's own checksum and the closing magic [bytes]
+LARGEST_EPISODE = 640 * MIB  # all columns and pictures [bytes]: 6,800 frames of two cameras of 128 x 128 pixels
+_LARGEST_RATIO = 256  # or so many times the file's size, where that is more: rendered frames reach about 50
+_MOST_COLUMNS = 1_000
+_LONGEST_NPY_HEADER = 20_000  # [bytes]; numpy refuses what is longer than 10,000
+_NPY_HEADERS: dict[tuple[int, int], Callable[[io.BytesIO], Any]] = {
+    (1, 0): npy.read_array_header_1_0,
+    (2, 0): npy.read_array_header_2_0,
+}
 
 
 @dataclass(frozen=True)
@@ -102,21 +118,36 @@ def read_episode(path: Path) -> Episode:
 
 def read_journal(path: Path) -> tuple[Header, Episode]:
     """What `read_header` and `read_episode` give, in one reading. Raises `ManipError` naming the file."""
-    with _explain(path):
-        records = _checked_records(path.read_bytes())
-        header = _header(records)
-        attachments = [record for record in records if isinstance(record, Attachment)]
-        columns = {record.name.removesuffix(_NPY): _from_npy(record.data) for record in attachments}
+    with _explain(path), path.open("rb") as stream:
+        check_both_sums(stream)
+        header = _header(stream)
+        budget = Budget(path.stat().st_size, LARGEST_EPISODE, _LARGEST_RATIO)
+        columns: dict[str, NDArray[Any]] = {}
+        for record in read_records(stream, Opcode.ATTACHMENT):
+            budget.take(len(record.body))
+            name, data = to_attachment(record.body)
+            columns[name.removesuffix(_NPY)] = _from_npy(data)
+            if len(columns) > _MOST_COLUMNS:
+                raise ValueError(f"it holds more than {_MOST_COLUMNS} columns")
         if header.spec.cameras:  # else nothing in the messages is needed
-            messages = (one for record in records if isinstance(record, Chunk) for one in breakup_chunk(record))
-            columns |= {IMAGES + camera: pictures for camera, pictures in foxglove.read_images(messages).items()}
-        return header, Episode(header.seed, columns, header.success, header.success_at_end)
+            columns |= _read_pictures(stream, header, budget)
+        episode = Episode(header.seed, columns, header.success, header.success_at_end)
+        if len(episode) != header.frames:
+            raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
+        return header, episode
+
+
+def check_header(path: Path) -> Header:
+    """Give what `read_header` gives, once both checksums of the file fit. Raises `ManipError` naming the file."""
+    with _explain(path), path.open("rb") as stream:
+        check_both_sums(stream)
+        return _header(stream)
 
 
 def read_header(path: Path) -> Header:
     """Seed, success, spec and fingerprint without reading the columns. Raises `ManipError` naming the file."""
     with _explain(path), path.open("rb") as stream:
-        return _header(list(make_reader(stream).iter_metadata()))
+        return _header(stream)
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -196,28 +227,35 @@ def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _from_npy(data: bytes) -> NDArray[Any]:
-    return np.load(io.BytesIO(data), allow_pickle=False)
+def _from_npy(data: memoryview) -> NDArray[Any]:
+    """The array in a file of numpy's format; what its header declares must be what is there."""
+    head = io.BytesIO(data[:_LONGEST_NPY_HEADER])
+    version = npy.read_magic(head)
+    if version not in _NPY_HEADERS:
+        raise ValueError(f"a column in numpy's format {version}; expected one of {list(_NPY_HEADERS)}")
+    shape, is_fortran, dtype = _NPY_HEADERS[version](head)
+    content = data[head.tell() :]
+    if dtype.hasobject or not dtype.itemsize:
+        raise ValueError(f"a column of {dtype}; expected numbers")
+    if math.prod(shape) * dtype.itemsize != len(content):
+        raise ValueError(f"a column declares shape {checks.shorten(shape)} of {dtype} and has {len(content):,} bytes")
+    return np.ndarray(shape, dtype, bytearray(content), order="F" if is_fortran else "C")
 
 
-def _checked_records(data: bytes) -> list[McapRecord]:
-    """All records, chunks of messages as they are, once both halves of the file fit their checksums.
-
-    The library's reader checks the first half (data), and only if it meets its closing record.
-    """
-    records = list(StreamReader(io.BytesIO(data), validate_crcs=True, emit_chunks=True).records)
-    ends = [record for record in records if isinstance(record, DataEnd)]
-    if len(ends) != 1 or ends[0].data_section_crc == 0:
-        raise ValueError("no checksum over its data")
-    footer = records[-1]
-    summary = data[footer.summary_start : -_FOOTER_TAIL] if isinstance(footer, Footer) else b""
-    if not isinstance(footer, Footer) or zlib.crc32(summary) != footer.summary_crc:
-        raise ValueError("its summary does not fit its checksum")
-    return records
+def _read_pictures(stream: BinaryIO, header: Header, budget: Budget) -> dict[str, NDArray[Any]]:
+    """Columns of pictures, uint8 (T, height, width, 3)."""
+    spec = header.spec
+    budget.take(len(spec.cameras) * header.frames * math.prod(spec.image_size) * 3)
+    packed = Budget(os.fstat(stream.fileno()).st_size, 2 * LARGEST_EPISODE, 2 * _LARGEST_RATIO)
+    chunks = read_records(stream, Opcode.CHUNK)
+    messages = (one for chunk in chunks for one in chunk_records(unpack(chunk, packed, check=False), packed))
+    pictures = foxglove.read_images(messages, spec.cameras, (header.frames, *spec.image_size, 3))
+    return {IMAGES + camera: frames for camera, frames in pictures.items()}
 
 
-def _header(records: list[Any]) -> Header:
-    ours = [record.metadata for record in records if isinstance(record, Metadata) and record.name == _RECORD]
+def _header(stream: BinaryIO) -> Header:
+    notes = [Metadata.read(ReadDataStream(io.BytesIO(record.body))) for record in read_records(stream, Opcode.METADATA)]
+    ours = [note.metadata for note in notes if note.name == _RECORD]
     if len(ours) != 1:
         raise ValueError(f"it holds {len(ours)} metadata records {_RECORD!r}; expected one")
     data = ours[0]
@@ -243,5 +281,5 @@ def _explain(path: Path) -> Generator[None]:
     except FileNotFoundError as error:
         raise ManipError(f"no such episode file: {path}") from error
     except Exception as error:  # a damaged file can make a parser raise anything
-        why = "it ends too early" if isinstance(error, EndOfFile) else str(error) or type(error).__name__
+        why = str(error) or type(error).__name__
         raise ManipError(f"{path} is not a whole episode: {why}; --resume=true records it anew") from error

@@ -18,6 +18,7 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.mcap_mapping import TEXT, Camera, Mapping, Source, Values
 from manip_il.data.mcap_read import Topics, read_pictures, read_topics
 from manip_il.data.resample import I64, NANOSECONDS, Pick, frame_times, pick
+from manip_il.data.schema import MOST_FRAMES
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
 
 Column = list[str] | NDArray[Any]
@@ -54,11 +55,10 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Im
 
     Raises `FolderExistsError` where `root` holds something, and what `read_import` and `frames_of` raise.
     """
-    from manip_il.data.lerobot_library import write_with_library  # imports torch
-
     accounts: list[Import] = []
     first = read_import(paths[0], mapping)
     features = features_of(mapping, first)
+    from manip_il.data.lerobot_library import write_with_library  # imports torch
 
     def episodes() -> Iterator[Iterator[dict[str, Any]]]:
         for number, path in enumerate(paths):
@@ -153,6 +153,11 @@ def _times(topics: Topics, fps: int) -> I64:
         raise ManipError(
             f"{topics.path}: {first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts; "
             "expected topics that overlap in time"
+        )
+    if (end - start) * fps > MOST_FRAMES * NANOSECONDS:
+        raise ManipError(
+            f"{topics.path}: its topics overlap for {(end - start) / NANOSECONDS:g} s, at {fps} frames a second more "
+            f"than {MOST_FRAMES:,} frames; expected one episode a file"
         )
     return frame_times(start, end, fps)
 

@@ -3,25 +3,39 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.reader import NonSeekingReader
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message as Proto
 from mcap.records import Channel, Message, Schema
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from manip_il.data.mcap_frames import decode_message
 from manip_il.data.mcap_mapping import Values
+from manip_il.data.mcap_records import MIB, Budget, read_messages
 from manip_il.errors import ManipError, nearest
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+
+LARGEST_FILE = 2048 * MIB  # messages and pictures, unpacked [bytes]
+_LARGEST_RATIO = 1000  # or so many times the file's size, where that is more: a dark JPEG reaches 200
+LARGEST_NUMBERS = 8 * MIB  # a message of JSON, or of protobuf that is no picture [bytes]
+LARGEST_DECODED = 512 * MIB  # all of those that are decoded [bytes]
+LARGEST_ROWS = 256 * MIB  # the values that are kept until the file is read to its end, as Python has them [bytes]
+_ROW_BYTES = 100  # of an empty row
+
+
+_PICTURES: dict[str, Any] = {"foxglove.RawImage": RawImage, "foxglove.CompressedImage": CompressedImage}
 
 
 class Reading(NamedTuple):
@@ -51,7 +65,8 @@ def read_topics(path: Path, topics: Iterable[str], values: dict[str, Values]) ->
     """
     found = Topics(path, rows={key: [] for key in values})
     stamps: dict[str, list[int]] = {topic: [] for topic in topics}
-    for reading in _readings(path, stamps, found.counts):
+    decoded, kept = {source.topic for source in values.values()}, 0
+    for reading in _readings(path, stamps, found.counts, decoded):
         mine = stamps[reading.topic]
         if mine and reading.stamp <= mine[-1]:
             raise ManipError(
@@ -61,7 +76,11 @@ def read_topics(path: Path, topics: Iterable[str], values: dict[str, Values]) ->
         mine.append(reading.stamp)
         for key, source in values.items():
             if source.topic == reading.topic:
-                found.rows[key].append(_row(path, key, source, reading))
+                row = _row(path, key, source, reading)
+                kept += _ROW_BYTES + sum(map(sys.getsizeof, row))
+                if kept > LARGEST_ROWS:
+                    raise ManipError(f"{path}: its values take more than {LARGEST_ROWS // MIB} MiB; cut it in episodes")
+                found.rows[key].append(row)
     for topic, mine in stamps.items():
         if not mine:
             hint = nearest(topic, found.counts)
@@ -76,7 +95,8 @@ def read_pictures(path: Path, topic: str, chosen: I64) -> Iterator[U8]:
 
     Raises `ManipError` naming file, topic and stamp for a message that holds no picture.
     """
-    readings = enumerate(_readings(path, [topic], Counter()))
+    budget = Budget(path.stat().st_size, LARGEST_FILE, _LARGEST_RATIO)
+    readings = enumerate(_readings(path, [topic], Counter(), [topic]))
     at, picture = -1, np.empty((0, 0, 3), np.uint8)
     for number in chosen.tolist():
         while at < number:
@@ -84,7 +104,8 @@ def read_pictures(path: Path, topic: str, chosen: I64) -> Iterator[U8]:
             if at == number:
                 try:
                     picture = decode_message(reading.schema, reading.content)
-                except ManipError as error:
+                    budget.take(picture.nbytes)
+                except (ManipError, ValueError) as error:
                     raise ManipError(f"{path}, topic {topic} at {reading.stamp} ns: {error}") from error
         yield picture
 
@@ -92,6 +113,8 @@ def read_pictures(path: Path, topic: str, chosen: I64) -> Iterator[U8]:
 def _row(path: Path, key: str, source: Values, reading: Reading) -> list[Any]:
     try:
         row = [value for one in source.field for value in one.values(reading.content)]
+        if any(isinstance(value, dict | list | Proto) for value in row):
+            raise ManipError("a value that has fields or elements of its own; choose one by .name, [0] or [:]")
         wanted = source.width
         if wanted is not None and len(row) != wanted:
             raise ManipError(f"{len(row)} values, {key} has {wanted}")
@@ -100,25 +123,47 @@ def _row(path: Path, key: str, source: Values, reading: Reading) -> list[Any]:
         raise ManipError(f"{path}, topic {source.topic} at {reading.stamp} ns: {error}") from error
 
 
-def _readings(path: Path, topics: Iterable[str], counts: Counter[str]) -> Iterator[Reading]:
-    """The topics' messages as stored; `counts` grows by those of every topic."""
-    wanted = set(topics)
+def _readings(path: Path, topics: Iterable[str], counts: Counter[str], decoded: Collection[str]) -> Iterator[Reading]:
+    """The topics' messages as stored, of `decoded` ones with their content; `counts` grows by those of every topic."""
+    wanted, numbers = set(topics), Budget(0, LARGEST_DECODED, 0)
     decoders: dict[int, Callable[[bytes], Any]] = {}
-    factories: list[Any] = [DecoderFactory(), _JsonFactory()]
+    factories: list[Any] = [_PictureFactory(), DecoderFactory(), _JsonFactory()]
     with _explain(path), path.open("rb") as stream:
-        reader = NonSeekingReader(stream, validate_crcs=True)
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
+        budget = Budget(path.stat().st_size, LARGEST_FILE, _LARGEST_RATIO)
+        for schema, channel, message in read_messages(stream, budget):
             counts[channel.topic] += 1
             if channel.topic not in wanted:
                 continue
-            if channel.id not in decoders:
-                decoders[channel.id] = _decoder(path, factories, schema, channel)
-            yield Reading(
-                channel.topic,
-                schema.name if schema else "",
-                message.log_time,
-                _decoded(path, decoders[channel.id], channel, message),
-            )
+            content = None
+            if channel.topic in decoded:
+                if not _is_picture(schema):
+                    _check_size(path, channel, message, numbers)
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(path, factories, schema, channel)
+                content = _decoded(path, decoders[channel.id], channel, message)
+            yield Reading(channel.topic, schema.name if schema else "", message.log_time, content)
+
+
+def _is_picture(schema: Schema | None) -> bool:
+    return schema is not None and schema.name in _PICTURES
+
+
+def _check_size(path: Path, channel: Channel, message: Message, numbers: Budget) -> None:
+    """Refuse what would take many times its size once it is decoded: a list of empty lists takes twenty times."""
+    size = len(message.data)
+    if size > LARGEST_NUMBERS:
+        where = f"{path}, topic {channel.topic} at {message.log_time} ns"
+        raise ManipError(f"{where}: a message of {size:,} bytes; expected at most {LARGEST_NUMBERS:,}")
+    numbers.take(size)
+
+
+class _PictureFactory:
+    """Pictures by the schemas that we know, whatever a file says that they are."""
+
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if message_encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
+            return None
+        return _PICTURES[schema.name].FromString if schema.name in _PICTURES else None
 
 
 class _JsonFactory:

@@ -29,6 +29,7 @@ SEED = "seed"
 ROUND = "round"
 BETA = "beta"
 
+MOST_FRAMES = 1_000_000  # of an episode
 MOST_FPS = 10_000  # control steps a second
 MOST_NAMES = 10_000  # joints, or numbers that the environment's state has
 MOST_CAMERAS = 100

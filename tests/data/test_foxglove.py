@@ -12,12 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import foxglove, foxglove_episode
 from manip_il.data import schema as s
+from manip_il.data.mcap_records import Budget, chunk_records
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -82,7 +84,10 @@ def test_pictures_come_back_bit_for_bit(pictures: np.ndarray) -> None:
     columns = {s.IMAGES + "front": pictures, s.IMAGES + "wrist": pictures[:, ::-1]}
     episode = Episode(1, columns, True, True)
     data = written(list(foxglove_episode.channels(episode, SPEC)), foxglove_episode.frame_times(episode, SPEC))
-    found = foxglove.read_images(StreamReader(io.BytesIO(data)).records)
+    chunks = (one for one in StreamReader(io.BytesIO(data), emit_chunks=True).records if isinstance(one, Chunk))
+    unpacked = (get_chunk_data_stream(chunk)[0].read(2**30) for chunk in chunks)
+    records = (one for data in unpacked for one in chunk_records(data, Budget(0, 2**30, 0)))
+    found = foxglove.read_images(records, ("front", "wrist"), pictures.shape)
     assert list(found) == ["front", "wrist"]
     for camera, frames in found.items():
         assert frames.dtype == np.uint8

@@ -1,0 +1,295 @@
+"""The records of an MCAP file one by one, bounded before they are unpacked and while they are.
+
+The library's readers unpack a chunk to whatever its bytes make of it, by the size that a file declares or by none, and
+hold all of its messages at once: 262 kB became 9 GB. Here a declaration is a limit that is kept, and a chunk's messages
+are cut out as they are taken.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from typing import Any, BinaryIO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message, Schema
+
+MIB = 1024 * 1024
+LARGEST_CHUNK = 128 * MIB  # unpacked [bytes]; writers close a chunk behind the message that takes it over a few MB
+LARGEST_MESSAGE = 64 * MIB  # a raw picture of 4096 x 4096 pixels has 48 [bytes]
+LARGEST_ATTACHMENT = 128 * MIB  # [bytes]
+LARGEST_NOTE = 1 * MIB  # of a schema, a channel or a metadata record [bytes]
+MOST_RECORDS = 5_000_000  # in the chunks of a file: an hour of 14 topics at 100 Hz
+LARGEST_NOTES = 16 * MIB  # of all schemas and channels of a file [bytes]
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEAD = struct.Struct("<BQ")  # opcode, size of the body
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_ATTACHMENT_TIMES = 16  # [bytes]
+_FOOTER = struct.Struct("<BQQQI")  # opcode, size, where the summary starts, where its offsets start, checksum
+_DATA_END = struct.Struct("<BQI")  # opcode, size, checksum
+_PIECE = MIB  # read at a time where nothing is kept [bytes]
+_PACKED = LARGEST_CHUNK + MIB  # of a chunk as it lies in the file [bytes]: what cannot be compressed is a little longer
+_LIMITS = {
+    Opcode.CHUNK: _PACKED,
+    Opcode.MESSAGE: LARGEST_MESSAGE,
+    Opcode.ATTACHMENT: LARGEST_ATTACHMENT,
+    Opcode.SCHEMA: LARGEST_NOTE,
+    Opcode.CHANNEL: LARGEST_NOTE,
+    Opcode.METADATA: LARGEST_NOTE,
+}
+
+
+class Budget:
+    """What a file may unpack to in all [bytes]: `least`, or `ratio` times its size where that is more."""
+
+    def __init__(self, path_size: int, least: int, ratio: int):
+        self._limit = self._left = max(least, ratio * path_size)
+        self._most = self._records = MOST_RECORDS
+
+    def count(self) -> None:
+        """Count a record of a chunk. Raises `ValueError` where they are too many."""
+        self._records -= 1
+        if self._records < 0:
+            raise ValueError(f"it holds more than {self._most:,} messages")
+
+    def take(self, size: int) -> None:
+        """Count `size` bytes before they are unpacked. Raises `ValueError` where they are too many."""
+        self._left -= size
+        if self._left < 0:
+            raise ValueError(f"it unpacks to more than {self._limit:,} bytes")
+
+
+class Record(NamedTuple):
+    """One record as it lies in the file. opcode: of a wanted kind."""
+
+    opcode: int
+    body: bytes
+
+
+def read_records(stream: BinaryIO, *wanted: Opcode, check: bool = False) -> Iterator[Record]:
+    """Yield the wanted records in order, up to the footer.
+
+    check: compare the checksum over the data section, where the file has one. Raises `ValueError` for what is no MCAP
+    file, ends too early, does not fit its checksum, or holds a wanted record beyond its kind's limit.
+    """
+    size = os.fstat(stream.fileno()).st_size
+    stream.seek(0)
+    if (magic := stream.read(len(_MAGIC))) != _MAGIC:
+        raise ValueError("it is no MCAP file")
+    at, checksum = len(magic), zlib.crc32(magic)
+    while True:
+        if len(head := stream.read(_HEAD.size)) < _HEAD.size:
+            raise ValueError("it ends too early")
+        opcode, length = _HEAD.unpack(head)
+        at += _HEAD.size + length
+        if at > size:
+            raise ValueError("it ends too early")
+        if opcode == Opcode.FOOTER:
+            return
+        if opcode == Opcode.DATA_END:
+            _compare_checksum(stream.read(length), checksum, check=check)
+            continue
+        if opcode in wanted:
+            _refuse_large(f"a {Opcode(opcode).name.lower()} record", length, _LIMITS[Opcode(opcode)])
+            body = stream.read(length)
+            yield Record(opcode, body)
+            pieces = iter((head, body))
+        elif check:
+            pieces = _pieces(stream, head, length)
+        else:
+            stream.seek(length, os.SEEK_CUR)
+            continue
+        if check:
+            for piece in pieces:
+                checksum = zlib.crc32(piece, checksum)
+
+
+def read_messages(stream: BinaryIO, budget: Budget) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """Yield every message as stored, with its channel and schema. All checksums that the file has are compared.
+
+    Raises `ValueError` for what `read_records`, `unpack` or `budget` refuse, and for a channel that is not there.
+    """
+    known = _Channels()
+    for record in read_records(stream, Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, check=True):
+        for one in chunk_records(unpack(record, budget), budget) if record.opcode == Opcode.CHUNK else (record,):
+            if one.opcode == Opcode.MESSAGE:
+                message = to_message(one.body)
+                yield (*known.of(message), message)
+            else:
+                known.add(one)
+
+
+def unpack(record: Record, budget: Budget, *, check: bool = True) -> bytes:
+    """Return what a chunk holds. check: compare its own checksum, where it has one.
+
+    Raises `ValueError` for one that unpacks to more than `LARGEST_CHUNK`, to another size than it declares, or does not
+    fit its checksum.
+    """
+    chunk: Chunk = Chunk.read(ReadDataStream(BytesIO(record.body)))
+    size = chunk.uncompressed_size
+    _refuse_large("a chunk, unpacked,", size, LARGEST_CHUNK)
+    budget.take(size)
+    try:
+        data = _unpacker(chunk.compression)(chunk.data, size)
+    except (zstandard.ZstdError, RuntimeError) as error:  # lz4 raises the latter
+        raise ValueError(f"a chunk that cannot be unpacked: {error}") from error
+    if len(data) != size:
+        raise ValueError(f"a chunk unpacks to {len(data):,} bytes or more; it declares {size:,}")
+    if check and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        raise ValueError("a chunk does not fit its checksum")
+    return data
+
+
+def chunk_records(data: bytes, budget: Budget) -> Iterator[Record]:
+    """Yield the schemas, channels and messages of an unpacked chunk, each cut out as it is taken.
+
+    Raises `ValueError` where a record does not fit in the chunk or its kind's limit, and what `budget.count` raises.
+    """
+    at = 0
+    while at < len(data):
+        budget.count()
+        if at + _HEAD.size > len(data):
+            raise ValueError("a chunk ends too early")
+        opcode, length = _HEAD.unpack_from(data, at)
+        start, at = at + _HEAD.size, at + _HEAD.size + length
+        if at > len(data):
+            raise ValueError("a chunk ends too early")
+        if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+            _refuse_large(f"a {Opcode(opcode).name.lower()} record", length, _LIMITS[Opcode(opcode)])
+            if opcode == Opcode.MESSAGE and length < _MESSAGE.size:
+                raise ValueError("a message record ends too early")
+            yield Record(opcode, data[start:at])
+
+
+def to_message(body: bytes) -> Message:
+    """A message record's content. Raises `ValueError` where it is too short."""
+    if len(body) < _MESSAGE.size:
+        raise ValueError("a message record ends too early")
+    channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
+    return Message(channel, log_time, body[_MESSAGE.size :], publish_time, sequence)
+
+
+def to_channel(body: bytes) -> Channel:
+    """A channel record's content."""
+    return Channel.read(ReadDataStream(BytesIO(body)))
+
+
+def to_attachment(body: bytes) -> tuple[str, memoryview]:
+    """An attachment's name and data. Raises `ValueError` where its sizes do not fit the record."""
+    view, at = memoryview(body), _ATTACHMENT_TIMES
+    texts: list[str] = []
+    for _ in ("name", "media type"):
+        length = int.from_bytes(view[at : at + 4], "little")
+        texts.append(str(view[at + 4 : at + 4 + length], "utf-8"))
+        at += 4 + length
+    length = int.from_bytes(view[at : at + 8], "little")
+    if at + 8 + length + 4 != len(body):  # the data's size before, its checksum behind
+        raise ValueError("an attachment whose sizes do not fit its record")
+    return texts[0], view[at + 8 : at + 8 + length]
+
+
+def check_both_sums(stream: BinaryIO) -> None:
+    """Compare the checksums over data and summary, as this program's own files have both.
+
+    Raises `ValueError` where one is missing or differs; nothing of the file is kept.
+    """
+    size = os.fstat(stream.fileno()).st_size
+    end = size - len(_MAGIC) - _FOOTER.size
+    stream.seek(max(end, 0))
+    footer, magic = stream.read(_FOOTER.size), stream.read()
+    if end < len(_MAGIC) or magic != _MAGIC:
+        raise ValueError("it ends too early")
+    opcode, _, summary, _, summary_sum = _FOOTER.unpack(footer)
+    data_end = summary - _DATA_END.size
+    if opcode != Opcode.FOOTER or not len(_MAGIC) <= data_end < summary <= end:
+        raise ValueError("its footer is damaged")
+    stream.seek(data_end)
+    opcode, _, data_sum = _DATA_END.unpack(stream.read(_DATA_END.size))
+    if opcode != Opcode.DATA_END or data_sum == 0:
+        raise ValueError("no checksum over its data")
+    if _sum_of(stream, 0, data_end) != data_sum:
+        raise ValueError("its data does not fit its checksum")
+    if _sum_of(stream, summary, size - len(_MAGIC) - 4) != summary_sum:
+        raise ValueError("its summary does not fit its checksum")
+
+
+class _Channels:
+    """Schemas and channels of a file, the first of every number: writers may repeat them, but not change them."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._size = 0
+
+    def add(self, record: Record) -> None:
+        number = int.from_bytes(record.body[:2], "little")
+        table: dict[int, Any] = self._schemas if record.opcode == Opcode.SCHEMA else self._channels
+        if number in table:
+            return
+        self._size += len(record.body)
+        _refuse_large("its schemas and channels together", self._size, LARGEST_NOTES)
+        kind: Any = Schema if record.opcode == Opcode.SCHEMA else Channel
+        table[number] = kind.read(ReadDataStream(BytesIO(record.body)))
+
+    def of(self, message: Message) -> tuple[Schema | None, Channel]:
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
+            raise ValueError(f"a message of channel {message.channel_id}, which it does not hold")
+        if channel.schema_id and channel.schema_id not in self._schemas:
+            raise ValueError(f"channel {channel.topic} has schema {channel.schema_id}, which it does not hold")
+        return self._schemas.get(channel.schema_id), channel
+
+
+def _unpacker(compression: str) -> Callable[[bytes, int], bytes]:
+    """What unpacks data to at most one byte more than a size."""
+    table = {"zstd": _unpack_zstd, "lz4": _unpack_lz4, "": lambda data, size: data}
+    if compression not in table:
+        raise ValueError(f"a chunk compressed by {compression[:20]!r}; expected zstd, lz4 or none")
+    return table[compression]
+
+
+def _unpack_zstd(data: bytes, size: int) -> bytes:
+    declared = zstandard.frame_content_size(data)  # -1: the frame does not say
+    if declared not in (-1, size):
+        raise ValueError(f"a chunk declares {size:,} bytes, its zstd frame {declared:,}")
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
+
+
+def _unpack_lz4(data: bytes, size: int) -> bytes:
+    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+
+
+def _compare_checksum(body: bytes, found: int, *, check: bool) -> None:
+    declared = int.from_bytes(body[:4], "little")
+    if check and declared not in (0, found):
+        raise ValueError("its data does not fit its checksum")
+
+
+def _pieces(stream: BinaryIO, head: bytes, length: int) -> Iterator[bytes]:
+    yield head
+    while length > 0:
+        piece = stream.read(min(length, _PIECE))
+        if not piece:
+            raise ValueError("it ends too early")
+        length -= len(piece)
+        yield piece
+
+
+def _sum_of(stream: BinaryIO, start: int, stop: int) -> int:
+    stream.seek(start)
+    checksum = 0
+    for piece in _pieces(stream, b"", stop - start):
+        checksum = zlib.crc32(piece, checksum)
+    return checksum
+
+
+def _refuse_large(what: str, size: int, limit: int) -> None:
+    if size > limit:
+        raise ValueError(f"{what} has {size:,} bytes; expected at most {limit:,}")
