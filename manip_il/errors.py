@@ -6,7 +6,11 @@ The command line turns every `ManipError` into one line on standard error and it
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+_FEW = 3  # names that an error offers
+_BEGINNING = 3  # characters of a name that tell it from others
+_LONGEST_NAME = 200  # [characters] of a name that is compared or printed
 
 
 class ManipError(Exception):
@@ -20,7 +24,7 @@ class ManipError(Exception):
 
 
 class UsageError(ManipError):
-    """The words were off: an unknown name, option or value (exit code 2)."""
+    """The command line was invalid: an unknown name, option or value (exit code 2)."""
 
     exit_code = 2
 
@@ -28,9 +32,11 @@ class UsageError(ManipError):
 class UnknownName(UsageError):
     """A name that is not in a table of names; says which names are, and the nearest."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]):
+    def __init__(self, kind: str, name: str, known: Iterable[str], where: str = ""):
+        """Take the table's names, and for a long table what lists them; then the nearest few are named alone."""
         known = sorted(known)
-        super().__init__(f"unknown {kind} {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+        near = did_you_mean(nearest_names(name, known, most=_FEW if where else 1))
+        super().__init__(f"unknown {kind} {shorten(name)}{near}; {where or f'known: {", ".join(known)}'}")
 
 
 class MismatchError(ManipError):
@@ -74,5 +80,23 @@ def _with_message(kind: type[ManipError], message: str) -> ManipError:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)`, or nothing where no known name is near."""
-    match = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f" (did you mean {match[0]!r}?)" if match else ""
+    return did_you_mean(nearest_names(name, known, most=1))
+
+
+def nearest_names(name: str, known: Iterable[str], most: int = _FEW) -> list[str]:
+    """Return the known names that `name` may stand for, at most `most`: those that it begins, then the most alike."""
+    known, name = list(known), name[:_LONGEST_NAME]
+    begun = [one for one in known if len(name) >= _BEGINNING and one.startswith(name)]
+    alike = difflib.get_close_matches(name, known, n=most, cutoff=0.6 if len(name) > _BEGINNING else 0.5)
+    return list(dict.fromkeys([*begun, *alike]))[:most]
+
+
+def did_you_mean(names: Sequence[str]) -> str:
+    """Return ` (did you mean 'x', 'y' or 'z'?)`, or nothing without names."""
+    *others, last = map(repr, names) if names else ("",)
+    return f" (did you mean {', '.join(others)}{' or ' if others else ''}{last}?)" if last else ""
+
+
+def shorten(text: str) -> str:
+    """Return a text in quotes, cut where it is longer than a line."""
+    return repr(text if len(text) <= _LONGEST_NAME else f"{text[:_LONGEST_NAME]}...")

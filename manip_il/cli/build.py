@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from manip_il.cli.folders import require_ours
 from manip_il.cli.groups import option, warn
+from manip_il.cli.paths import require_folder
 from manip_il.cli.progress import say
 from manip_il.cli.record import left_out, require_repo_id
 from manip_il.errors import ManipError, UsageError
@@ -27,16 +28,18 @@ class BuildOptions:
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
     overwrite: bool = option(False, "replace a dataset that is there")
 
-    def run(self) -> None:
-        """Build."""
-        if not self.journals.is_dir():
-            raise UsageError(f"{self.journals} is no folder; expected one of episode-*.mcap files")
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        require_folder(self.journals, "one of episode-*.mcap files")
         if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
             if not self.overwrite:
                 raise UsageError(f"{self.dataset} exists already; replace it by --overwrite=true")
             require_ours(self.dataset)
         if self.repo_id is not None:
             require_repo_id("--repo_id", self.repo_id)
+
+    def run(self) -> None:
+        """Build."""
         from manip_il.data.atomic import exclusive
         from manip_il.data.build import build
 

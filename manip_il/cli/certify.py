@@ -20,6 +20,7 @@ from manip_il.cli.groups import (
     option,
     save_options,
 )
+from manip_il.cli.paths import require_new, require_workers
 from manip_il.cli.policy_check import check_policy
 from manip_il.cli.progress import progress, say
 from manip_il.errors import FolderExistsError, UsageError
@@ -55,10 +56,18 @@ class CertifyOptions:
     output_dir: Path = field(default=Path("runs/certificate"), metadata={"help": "folder of certificate.json"})
     overwrite: bool = option(False, "replace a certificate that is there")
 
-    def run(self) -> None:
-        """Run the episodes, write `certificate.json`, print the tables."""
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
         if self.cases < 1:
             raise UsageError(f"--cases is {self.cases}; expected at least 1")
+        require_workers(self.workers)
+        if self.policy.path is not None:
+            find_policy(self.policy.path)
+        require_new(self.output_dir, overwrite=self.overwrite)
+        self.env.config(self.robot.type or DEFAULT_ROBOT, self.task.type or DEFAULT_TASK)
+
+    def run(self) -> None:
+        """Run the episodes, write `certificate.json`, print the tables."""
         env, policy = self._who()
         from manip_il.data.atomic import exclusive
         from manip_il.engine.engine import Engine

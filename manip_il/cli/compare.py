@@ -24,9 +24,10 @@ from manip_il.cli.groups import (
 )
 from manip_il.cli.measure import TEST_EPISODES, Trial, check_policies, measured, rule_json
 from manip_il.cli.options import options_of, to_plain
+from manip_il.cli.paths import require_output, require_workers
 from manip_il.cli.progress import say
-from manip_il.cli.sides import Side, Source, common_env, limit_of, matched, read_side
-from manip_il.cli.suites import SUITE_HELP
+from manip_il.cli.sides import Side, Source, common_env, limit_of, matched, read_side, require_side
+from manip_il.cli.suites import SUITE_HELP, require_suite
 from manip_il.errors import UsageError
 from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, Measured, require_same_episodes, write_json
 from manip_il.evaluation.results import EvalResult
@@ -76,13 +77,22 @@ class CompareOptions:
     resume: bool = option(False, "go on with a comparison that was stopped")
     overwrite: bool = option(False, "replace a comparison that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        Rule.parse(self.checkpoint, self.at)
+        if self.eval.n_episodes < 1:
+            raise UsageError(f"--eval.n_episodes is {self.eval.n_episodes}; expected at least 1")
+        for side in (self.left, self.right):
+            require_side(side)
+        if self.left.resolve() == self.right.resolve():
+            raise UsageError(f"{self.left} is compared with itself; give two different ones")
+        require_workers(self.workers)
+        require_suite(self.suite)
+        require_output(self.output_dir, "compare", resume=self.resume, overwrite=self.overwrite)
+
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         rule = Rule.parse(self.checkpoint, self.at)
-        if self.eval.n_episodes < 1:
-            raise UsageError(f"--eval.n_episodes is {self.eval.n_episodes}; expected at least 1")
-        if self.left.resolve() == self.right.resolve():
-            raise UsageError(f"{self.left} is compared with itself; give two different ones")
         left, right, lines = matched(read_side(self.left), read_side(self.right))
         warn([*lines, *_unfinished((*left.sources, *right.sources))])
         from manip_il.data.atomic import exclusive

@@ -23,6 +23,7 @@ from manip_il.cli.groups import (
     save_options,
 )
 from manip_il.cli.options import Open, to_plain
+from manip_il.cli.paths import require_output, require_workers
 from manip_il.cli.progress import say
 from manip_il.learn.fit_config import BATCH_SIZE, MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, FitConfig
 
@@ -104,6 +105,12 @@ class DaggerOptions:
     resume: bool = option(False, "go on with a run that was stopped")
     overwrite: bool = option(False, "replace a run that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        require_workers(self.workers)
+        require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
+        self._draft()
+
     def run(self) -> None:
         """Run, or go on with, all rounds."""
         config = self.config()
@@ -134,10 +141,18 @@ class DaggerOptions:
 
     def config(self) -> DaggerConfig:
         """What `run_dagger` takes. Raises `UsageError` for what does not go together."""
+        config = self._draft()
+        from manip_il.dagger.fitting import check_fit, check_labels
+
+        check_fit(config)
+        check_labels(config)
+        return config
+
+    def _draft(self) -> DaggerConfig:
+        """The same, before the policy's own configuration has been made, which takes seconds to import."""
         env = self.env.config(self.robot.type, self.task.type)
         cameras = self.image.config(self.cameras)
-        from manip_il.dagger.config import DaggerConfig
-        from manip_il.dagger.fitting import check_labels, check_sight
+        from manip_il.dagger.config import DaggerConfig, check_sight
         from manip_il.dagger.sampling import Sampling
 
         own = {one.name for one in fields(DaggerConfig)} - {"env", "fit", "sampling", "cameras"}
@@ -149,7 +164,6 @@ class DaggerOptions:
             **{name: getattr(self, name) for name in own},
         )
         check_sight(config)
-        check_labels(config)
         return config
 
     def _fit(self) -> FitConfig:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.groups import option
+from manip_il.cli.paths import hub_hint, require_folder
 from manip_il.cli.progress import progress, say
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,10 +33,12 @@ class DoctorOptions:
     dataset: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset", "positional": True})
     repair: bool = option(False, "put right what can be put right, and keep a copy")
 
+    def check(self) -> None:
+        """Refuse what is no folder."""
+        require_folder(self.dataset, f"the folder of a LeRobot dataset{hub_hint(self.dataset, 'datasets/')}")
+
     def run(self) -> None:
         """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
-        if not self.dataset.is_dir():
-            raise UsageError(f"{self.dataset} is no folder; expected the folder of a LeRobot dataset")
         from manip_il.data.doctor.examine import has_errors, verdict
         from manip_il.data.doctor.finding import NotWhole
         from manip_il.data.doctor.repair import repair

@@ -26,9 +26,10 @@ from manip_il.cli.groups import (
 )
 from manip_il.cli.kept_episodes import KeptEpisodes
 from manip_il.cli.options import to_plain
+from manip_il.cli.paths import require_output, require_workers
 from manip_il.cli.policy_check import check_policy, looks
 from manip_il.cli.progress import say
-from manip_il.cli.suites import SUITE_HELP, suite_conditions
+from manip_il.cli.suites import SUITE_HELP, require_suite, suite_conditions
 from manip_il.errors import FolderExistsError, ManipError, UsageError
 
 if TYPE_CHECKING:
@@ -85,6 +86,17 @@ class EvalOptions:
     output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
     resume: bool = option(False, "go on with an evaluation that was stopped, or with more episodes")
     overwrite: bool = option(False, "replace an evaluation that is there")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self._check()
+        self._seeds()
+        require_workers(self.workers)
+        if self.policy.path is not None:
+            find_policy(self.policy.path)
+        require_suite(self.suite)
+        require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
+        self._env(None)
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""

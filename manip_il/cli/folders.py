@@ -18,8 +18,18 @@ _MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
 
-    It is not created, as LeRobot's writers insist on doing so themselves. Raises `FolderExistsError` where it holds
-    something, and `UsageError` where `overwrite` would delete what this program did not make.
+    It is not created, as LeRobot's writers insist on doing so themselves. Raises what `check_output` raises.
+    """
+    check_output(folder, resume=resume, overwrite=overwrite)
+    if overwrite and folder.exists() and any(folder.iterdir()):
+        _delete(folder)
+
+
+def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
+    """Raise what would keep `prepare_output` from its work; nothing is changed.
+
+    `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
+    program did not make.
     """
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
@@ -34,7 +44,6 @@ def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not overwrite:
         raise FolderExistsError(folder)
     require_ours(folder)
-    _delete(folder)
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:

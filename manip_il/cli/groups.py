@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.folders import atomic_write
 from manip_il.cli.options import dump_yaml, from_yaml, options_of, to_plain
+from manip_il.cli.paths import hub_hint
 from manip_il.errors import MismatchError, UnknownName, UsageError
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
@@ -193,7 +194,9 @@ def find_policy(path: Path) -> Path:
     for place in WHERE_POLICIES_LIE:
         if (path / place / "config.json").is_file():
             return path / place
-    raise UsageError(f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one")
+    raise UsageError(
+        f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
+    )
 
 
 def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """`manip-il COMMAND --option=value ...`: finds the command, answers for help and for errors.
 
-Nothing heavy is imported before a command is known, so that help and a wrong word answer at once.
+Nothing heavy is imported before a command's options are sound, so that help and a mistake are answered at once:
+an options class may have `check`, which refuses what its paths and values alone show to be wrong, before `run`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import threading
 import traceback
 from collections.abc import Collection, Sequence
 from dataclasses import MISSING
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from manip_il import __version__
@@ -57,13 +59,14 @@ COMMANDS = {
     "quickstart": Command("manip_il.cli.quickstart:QuickstartOptions", "the whole story, small: watch it learn"),
 }
 
+_HELP_WORDS = ("--help", "-h", "help")
 _GLOBAL_HELP = """\
   --debug      show the traceback of an error
   --quiet      no progress on standard error"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command. Returns 0 done, 1 the work failed, 2 the words were off, 130 interrupted."""
+    """Run one command. Returns 0 done, 1 the work failed, 2 the command line was invalid, 130 interrupted."""
     words = list(sys.argv[1:] if argv is None else argv)
     debug, quiet = "--debug" in words, "--quiet" in words
     words = [word for word in words if word not in ("--debug", "--quiet")]
@@ -103,7 +106,9 @@ def load(name: str) -> type:
 
 
 def _dispatch(words: list[str]) -> None:
-    if not words or words[0] in ("--help", "-h", "help"):
+    if words and words[0] in _HELP_WORDS and (rest := [word for word in words if word not in _HELP_WORDS]):
+        words = [*rest, "--help"]
+    if not words or words[0] in _HELP_WORDS:
         print(_help())
     elif words[0] == "--version":
         print(f"{PROGRAM} {__version__}")
@@ -116,7 +121,9 @@ def _dispatch(words: list[str]) -> None:
         print(_command_help(name, load(name), words) if name in COMMANDS else _group_help(name))
     else:
         name, words = _split(words)
-        options = parse(load(name), words)
+        options = parse(load(name), words, command=name)
+        if hasattr(options, "check"):
+            options.check()
         from manip_il.sim.gl import choose_backend, require_known_backend
 
         require_known_backend()
@@ -161,10 +168,13 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
         return f"; kept: {error.kept}; go on with: {error.resume_command or resume_command(words)}"
     try:
-        can_resume = any(option.name == "resume" for option in options_of(load(_split(words)[0])))
+        name, words_of_it = _split(words)
+        options: Any = parse(load(name), words_of_it)
     except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
         return ""
-    return f"; what was finished is kept; go on with: {resume_command(words)}" if can_resume else ""
+    if not hasattr(options, "resume") or not getattr(options, "output_dir", Path()).exists():  # nothing to resume
+        return ""
+    return f"; what was finished is kept; go on with: {resume_command(words)}"
 
 
 def _complain(text: str) -> None:

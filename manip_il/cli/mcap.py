@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import option, save_options
+from manip_il.cli.paths import require_dataset, require_new
 from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
 
@@ -30,6 +31,13 @@ class McapExportOptions:
     out: Path = field(metadata={"help": "folder for the files", "positional": True})
     overwrite: bool = option(False, "replace an export that is there")
 
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        require_dataset(self.dataset)
+        if self.dataset.resolve().is_relative_to(self.out.resolve()):
+            raise UsageError(f"{self.out} holds the dataset itself; expected another folder for the files")
+        require_new(self.out, overwrite=self.overwrite)
+
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
         from manip_il.data.atomic import new_folder
@@ -37,8 +45,6 @@ class McapExportOptions:
         from manip_il.data.mcap_export import MAPPING, export_dataset, open_source
 
         source = open_source(self.dataset)
-        if self.dataset.resolve().is_relative_to(self.out.resolve()):
-            raise UsageError(f"{self.out} holds the dataset itself; expected another folder for the files")
         total = dataset_info(self.dataset).episodes
         prepare_output(self.out, resume=False, overwrite=self.overwrite)
         with new_folder(self.out) as folder, progress(total, "export") as bar:
@@ -64,6 +70,15 @@ class McapImportOptions:
     dataset: Path = field(metadata={"help": "folder for the dataset", "positional": True})
     mapping: Path = field(metadata={"help": "YAML: columns in terms of topics (see configs/mcap/panda.yaml)"})
 
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        if not self.source.exists():
+            raise UsageError(f"{self.source} does not exist; expected an MCAP file, or a folder of them")
+        if not self.mapping.is_file():
+            raise UsageError(f"{self.mapping} does not exist; expected a mapping file, such as configs/mcap/panda.yaml")
+        if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
+            raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
+
     def run(self) -> None:
         """Import every file; the dataset appears when it is whole."""
         from manip_il.data.mcap_import import list_files
@@ -71,8 +86,6 @@ class McapImportOptions:
 
         mapping = load_mapping(self.mapping)
         paths = list_files(self.source)
-        if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
-            raise UsageError(f"{self.dataset} exists already; choose another folder, or delete it first")
         counts: Counter[str] = Counter()
         used: Counter[str] = Counter()
         episodes = frames = 0

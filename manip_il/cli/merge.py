@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.cli.folders import prepare_output
 from manip_il.cli.groups import command_line, option, save_options, warn
 from manip_il.cli.options import to_plain
+from manip_il.cli.paths import require_eval, require_new
 from manip_il.cli.progress import say
 from manip_il.errors import FolderExistsError, UsageError
-
-if TYPE_CHECKING:
-    from manip_il.evaluation.results import EvalResult
 
 REPORT_FILE = "report.html"
 
@@ -30,6 +28,16 @@ class MergeOptions:
     output_dir: Path = field(default=Path("runs/merged"), metadata={"help": "folder of the merged eval.json"})
     overwrite: bool = option(False, "replace a merged evaluation that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        if len(self.files) < 2:
+            raise UsageError(f"{self.files[0]} alone; expected two or more evaluations to merge")
+        for path in self.files:
+            if self.files.count(path) > 1:
+                raise UsageError(f"{path} is given twice; expected every evaluation once")
+            require_eval(path)
+        require_new(self.output_dir, overwrite=self.overwrite)
+
     def run(self) -> None:
         """Read all, merge, write, print the table."""
         from manip_il.data.atomic import exclusive
@@ -41,13 +49,7 @@ class MergeOptions:
         from manip_il.evaluation.results import FILE_NAME, EvalResult
         from manip_il.evaluation.tables import print_table
 
-        if len(self.files) < 2:
-            raise UsageError(f"{self.files[0]} alone; expected two or more evaluations to merge")
-        parts: dict[str, EvalResult] = {}
-        for path in self.files:
-            if str(path) in parts:
-                raise UsageError(f"{path} is given twice; expected every evaluation once")
-            parts[str(path)] = EvalResult.read(path)
+        parts = {str(path): EvalResult.read(path) for path in self.files}
         merged = merge_results(parts)
         (first, one), *others = parts.items()
         for name, other in others:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from manip_il import __version__
+from manip_il.cli.mistakes import unexpected_word, unknown_option
 from manip_il.cli.values import choices, decode, expected
 from manip_il.errors import UsageError, nearest
 
@@ -77,10 +78,13 @@ def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     return found
 
 
-def parse[T](cls: type[T], words: Sequence[str]) -> T:
-    """Options from the command line; `UsageError` for an unknown name, a bad or a missing value."""
+def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
+    """Options from the command line; `UsageError` for an unknown name, a bad or a missing value.
+
+    command: whose options they are, for the message.
+    """
     known = {option.name: option for option in options_of(cls)}
-    from_words, config_paths = _read_words(words, known)
+    from_words, config_paths = _read_words(words, known, command)
     from_files: dict[str, _Given] = {}
     for path in config_paths:
         from_files |= _read_yaml(Path(path), cls, known)
@@ -128,7 +132,7 @@ def to_plain(value: Any) -> Any:
     return value
 
 
-def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict[str, _Given], list[str]]:
+def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str) -> tuple[dict[str, _Given], list[str]]:
     given: dict[str, _Given] = {}
     config_paths: list[str] = []
     places = [option for option in known.values() if option.positional]
@@ -137,7 +141,7 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
         word = rest.pop(0)
         if not word.startswith("--"):
             if not places:
-                raise UsageError(f"unexpected {word!r}; options are written --name=value{_did_you_mean(word, known)}")
+                raise unexpected_word(word, known, command)
             option = places[0] if typing.get_origin(places[0].type) is list else places.pop(0)
             _place(word, option, given)
             continue
@@ -150,7 +154,7 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option]) -> tuple[dict
             given[name] = _Given(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
             continue
         if name != CONFIG_PATH and (name not in known or known[name].positional or known[name].is_open):
-            raise _unknown("option", name, known, "--")
+            raise unknown_option("option", name, known, "--", command)
         if not equals:
             value = _next_value(name, known, rest)
         if name == CONFIG_PATH:
@@ -216,7 +220,7 @@ def _leaves(
         elif name in known or _open_group(name, known):
             yield name, value
         elif not any(option.startswith(f"{name}.") for option in known):
-            raise _unknown(f"key in {path}:", name, known)
+            raise unknown_option(f"key in {path}:", name, known, "", "")
         elif isinstance(value, dict):
             yield from _leaves(value, known, path, f"{name}.")
         elif value is not None:
@@ -266,28 +270,3 @@ def _default(field: dataclasses.Field[Any], base: Any) -> Any:
     if base is not None:
         return getattr(base, field.name)
     return field.default_factory() if field.default_factory is not MISSING else field.default
-
-
-def _unknown(kind: str, name: str, known: Mapping[str, Option], dashes: str = "") -> UsageError:
-    if name in known and known[name].is_open:
-        return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")
-    groups = {".".join(option.split(".")[:-1]) for option in known}
-    if name in groups:
-        inside = ", ".join(dashes + option for option in known if option.startswith(f"{name}."))
-        return UsageError(f"{dashes}{name} is a group of options; known: {inside}")
-    named = ", ".join(
-        dashes + option.name + (".NAME" if option.is_open else "")
-        for option in known.values()
-        if not (dashes and option.positional)
-    )
-    return UsageError(f"unknown {kind} {dashes + name!r}{_did_you_mean(name, known, dashes)}; known: {named}")
-
-
-def _did_you_mean(name: str, known: Mapping[str, Option], dashes: str = "--") -> str:
-    """The nearest option; `num_episodes` without its group finds `dataset.num_episodes`."""
-    names = [option.name for option in known.values() if not (dashes and option.positional)]
-    leaf = name.rpartition(".")[2].replace("-", "_")
-    same_leaf = [option for option in names if option.rpartition(".")[2] == leaf]
-    if len(same_leaf) == 1:
-        return f" (did you mean {dashes + same_leaf[0]!r}?)"
-    return nearest(dashes + name, [dashes + option for option in names])

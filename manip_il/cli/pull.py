@@ -31,14 +31,18 @@ class PullOptions:
     dry_run: bool = option(False, "only say what would be pulled")
     overwrite: bool = option(False, "replace a dataset or run that is there")
 
+    def check(self) -> None:
+        """Refuse an address that is none, and a folder that may not be replaced."""
+        self._url()
+        if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
+            require_ours(self.target)
+
     def run(self) -> None:
         """Fetch, verify, rename; say what is there now."""
         from manip_il.data.remote.pull import pull
         from manip_il.data.remote.url import open_remote
 
         url = self._url()
-        if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
-            require_ours(self.target)
         remote = open_remote(url)
         try:
             with going_on():

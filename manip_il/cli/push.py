@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.groups import option, warn
+from manip_il.cli.paths import require_folder
 from manip_il.cli.progress import bytes_text, say
 from manip_il.cli.transfer import going_on, moved
 
@@ -35,6 +36,13 @@ class PushOptions:
     dry_run: bool = option(False, "only say what would be uploaded and removed")
     journals: bool = option(False, "take the journals along, of which the dataset can be built again")
     private: bool = option(False, "make a repo that is not on the Hub yet a private one")
+
+    def check(self) -> None:
+        """Refuse an address that is none, and what is no folder."""
+        from manip_il.data.remote.url import RemoteUrl
+
+        RemoteUrl.parse(self.remote)
+        require_folder(self.source, "the folder of a dataset, a run or a policy")
 
     def run(self) -> None:
         """Examine, list, upload, switch over; say what was done."""

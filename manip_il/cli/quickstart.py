@@ -26,6 +26,7 @@ from manip_il.cli.groups import (
     warn,
 )
 from manip_il.cli.options import to_plain
+from manip_il.cli.paths import require_output
 from manip_il.cli.progress import say
 from manip_il.errors import UsageError
 
@@ -72,13 +73,18 @@ class QuickstartOptions:
     resume: bool = option(False, "go on with a run that was stopped")
     overwrite: bool = option(False, "replace a run that is there")
 
-    def run(self) -> None:
-        """Run what is not there yet, print the table, write the report."""
-        started = time.monotonic()
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
         for name in ("test_episodes", "disturbed_episodes"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
-        config = self._config()
+        require_output(self.output_dir, "quickstart", resume=self.resume, overwrite=self.overwrite)
+        replace(self._dagger(), output_dir=self.output_dir, resume=self.resume, overwrite=self.overwrite).check()
+
+    def run(self) -> None:
+        """Run what is not there yet, print the table, write the report."""
+        started = time.monotonic()
+        config = self._dagger().config()
         from manip_il.data.atomic import exclusive
 
         with exclusive(self.output_dir):
@@ -99,11 +105,12 @@ class QuickstartOptions:
             story.add_time("start", time.monotonic() - started)
             story.tell()
 
-    def _config(self) -> DaggerConfig:
+    def _dagger(self) -> DaggerOptions:
+        """Of the rounds."""
         shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "steps")
         shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
         same = {name: getattr(self, name) for name in shared}
-        return DaggerOptions(**same, policy=self.policy.settings()).config()
+        return DaggerOptions(**same, policy=self.policy.settings(), workers=self.workers)
 
 
 class _Story:

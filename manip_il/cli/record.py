@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.cli.folders import prepare_output
+from manip_il.cli.folders import check_output, prepare_output
 from manip_il.cli.groups import (
     ENGINE_HELP,
     WORKERS_HELP,
@@ -20,6 +20,7 @@ from manip_il.cli.groups import (
     save_options,
     warn,
 )
+from manip_il.cli.paths import require_output, require_workers
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, UsageError
 
@@ -71,9 +72,19 @@ class RecordOptions:
     resume: bool = option(False, "go on with a recording, also to more episodes")
     overwrite: bool = option(False, "replace a dataset that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self._check()
+        require_workers(self.workers)
+        root, journals = self._folders()
+        check_output(root, resume=self.resume, overwrite=self.overwrite)
+        if not (self.resume and root.is_dir() and any(root.iterdir())):
+            require_output(journals, "record", resume=self.resume, overwrite=self.overwrite)
+        self.env.config(self.robot.type, self.task.type)
+        self.image.config(self.cameras)
+
     def run(self) -> None:
         """Record; the dataset is written as the episodes come."""
-        self._check()
         env, cameras = self.env.config(self.robot.type, self.task.type), self.image.config(self.cameras)
         if cameras:
             from manip_il.data.lerobot_io import VideoConfig

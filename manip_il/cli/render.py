@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from manip_il.cli.folders import require_ours
 from manip_il.cli.groups import ImageGroup, LookGroup, option, warn
+from manip_il.cli.paths import require_dataset, require_workers
 from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
 
@@ -25,9 +26,15 @@ class RenderOptions:
     workers: int | None = option(None, "processes; by default one a core")
     overwrite: bool = option(False, "replace a dataset that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        require_workers(self.workers)
+        require_dataset(self.source)
+        self._check()
+        self.image.config(self.cameras, self.look.config())
+
     def run(self) -> None:
         """Render every episode; TARGET appears when all are there."""
-        self._check()
         cameras = self.image.config(self.cameras, self.look.config())
         if cameras is None:
             raise UsageError("--cameras names none; expected front, wrist or both")
@@ -54,8 +61,6 @@ class RenderOptions:
         say(f"dataset: {self.target}")
 
     def _check(self) -> None:
-        if self.workers is not None and self.workers < 1:
-            raise UsageError(f"--workers is {self.workers}; expected at least 1")
         source, target = self.source.resolve(), self.target.resolve()
         if source.is_relative_to(target) or target.is_relative_to(source):
             raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.folders import atomic_write
 from manip_il.cli.groups import find_policy, warn
+from manip_il.cli.paths import require_eval
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, MismatchError, UsageError
 
@@ -37,6 +38,12 @@ class ReplayOptions:
     episode: int = field(metadata={"help": "which of its episodes, the first one is 0"})
     video: Path | None = field(default=None, metadata={"help": "an MP4 to write"})
     policy: PlaceGroup = field(default_factory=PlaceGroup)
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        require_eval(self.file)
+        if self.policy.path is not None:
+            find_policy(self.policy.path)
 
     def run(self) -> None:
         """Run it, tell, film, compare."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from manip_il.cli.folders import read_jsonl
 from manip_il.cli.groups import CONFIG_FILE, DEFAULT_ROBOT, DEFAULT_TASK, EnvGroup, find_policy
 from manip_il.cli.options import from_yaml
+from manip_il.cli.paths import hub_hint
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import END, History, Round, Rule, budget, choose, history
@@ -62,10 +63,15 @@ class Side:
     several: bool = False
 
 
+def require_side(path: Path) -> None:
+    """Raise `UsageError` where nothing is at `path`."""
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; {EXPECTED}{hub_hint(path)}")
+
+
 def read_side(path: Path) -> Side:
     """What lies at `path`; `UsageError` in one line where it is nothing that can be compared."""
-    if not path.exists():
-        raise UsageError(f"{path} does not exist; {EXPECTED}")
+    require_side(path)
     seeds = seed_folders(path) if path.is_dir() else {}
     if not seeds:
         return Side(path, (_read_source(path),))

@@ -12,10 +12,12 @@ from manip_il.cli.folders import atomic_write, prepare_output
 from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, check_same_options, option, save_options
 from manip_il.cli.measure import Trial, check_policies, measured, rule_json
 from manip_il.cli.options import to_plain
+from manip_il.cli.paths import require_output, require_workers
 from manip_il.cli.progress import say
 from manip_il.cli.shared_start import share_start
 from manip_il.cli.sides import Source, limit_of, run_finished, run_history
 from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
+from manip_il.errors import UsageError
 from manip_il.evaluation.comparison import Arm, write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
 
@@ -42,6 +44,15 @@ class StudyOptions:
     output_dir: Path = field(default=Path("runs/study"), metadata={"help": "folder of the study"})
     resume: bool = option(False, "go on with a study that was stopped")
     overwrite: bool = option(False, "replace a study that is there")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        if not self.file.is_file():
+            raise UsageError(
+                f"{self.file} does not exist; expected the YAML of a study, such as configs/studies/*.yaml"
+            )
+        require_workers(self.workers)
+        require_output(self.output_dir, "study", resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""

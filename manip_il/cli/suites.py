@@ -39,12 +39,22 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
     return tuple(left)
 
 
+def require_suite(suite: str) -> None:
+    """Raise `UnknownName` for a suite that is not there, `UsageError` for a file that is not; none is read."""
+    if _is_file(suite):
+        if not Path(suite).is_file():
+            raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
+    elif suite not in (*SUITES, *CONDITIONS):
+        raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
+
+
+def _is_file(suite: str) -> bool:
+    return suite.endswith((".yaml", ".yml"))
+
+
 def _read(name: str) -> Condition:
-    if name in CONDITIONS:
-        return read_condition(_folder() / f"{name}.yaml")
-    if name.endswith((".yaml", ".yml")):
-        return read_condition(Path(name))
-    raise UnknownName("suite", name, [*SUITES, *CONDITIONS[1:]])
+    require_suite(name)
+    return read_condition(Path(name) if _is_file(name) else _folder() / f"{name}.yaml")
 
 
 def read_condition(path: Path) -> Condition:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import check_dataset, check_same_options, option, policy_help, save_options
+from manip_il.cli.groups import check_dataset, check_same_options, find_policy, option, policy_help, save_options
 from manip_il.cli.options import Open
+from manip_il.cli.paths import require_dataset, require_output
 from manip_il.cli.progress import progress, say, set_quiet
 from manip_il.learn.fit_config import MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, STEPS, FitConfig
 
@@ -68,6 +69,15 @@ class TrainOptions:
     resume: bool = option(False, "go on from the last checkpoint")
     overwrite: bool = option(False, "replace a run that is there")
 
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        self._fit_config()
+        require_dataset(self.dataset.root)
+        if "path" in self.policy:
+            find_policy(Path(str(self.policy["path"])).expanduser())
+        if _is_first_process():
+            require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
+
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
         from manip_il.data.atomic import exclusive
@@ -90,11 +100,15 @@ class TrainOptions:
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
 
     def _config(self) -> TrainConfig | PolicyFitConfig:
+        fit, seed = self._fit_config()
+        return fit.mlp(seed) if fit.is_mlp else fit.other(seed)
+
+    def _fit_config(self) -> tuple[FitConfig, int]:
+        """What is asked for, and the seed of weights and batches."""
         from manip_il.seeding import stream_base
 
         same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name != "eval_split"}
-        fit, seed = FitConfig(**same, eval_split=self.dataset.eval_split), stream_base("training", self.seed)
-        return fit.mlp(seed) if fit.is_mlp else fit.other(seed)
+        return FitConfig(**same, eval_split=self.dataset.eval_split), stream_base("training", self.seed)
 
     def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
         from manip_il.learn.train import TrainConfig

@@ -24,6 +24,8 @@ class BetaSchedule:
     def parse(cls, text: str) -> BetaSchedule:
         """Raises `UnknownName` for the kind, `UsageError` for a parameter out of range."""
         kind, _, parameter = text.partition(":")
+        if kind not in SCHEDULES and _is_number(text):
+            raise UsageError(f"beta is {text!r}; expected constant:{text}, linear:ROUNDS or exponential:B")
         if kind not in SCHEDULES:
             raise UnknownName("beta schedule", kind, SCHEDULES)
         try:
@@ -45,3 +47,11 @@ class BetaSchedule:
         if self.kind == "linear":
             return max(0.0, 1.0 - round_ / self.parameter)
         return self.parameter**round_
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -91,3 +91,16 @@ class DaggerConfig:
             raise UsageError(f"ensemble is {self.ensemble}, but nothing asks it; give ask=ensemble:BOUND too")
         if self.refit_steps is not None and self.refit == "scratch":
             raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
+
+
+def check_sight(config: DaggerConfig) -> None:
+    """Raise `UsageError` unless what the policy sees is recorded, and nothing is pictured for a blind one."""
+    sees = config.fit.sees
+    if sees and config.fit.is_mlp:
+        raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={config.fit.observation}; use cnn")
+    if sees and config.cameras is None:
+        raise UsageError("the policy looks at pictures, but none are made; give --cameras=front,wrist")
+    if config.cameras is not None and not sees:
+        raise UsageError("pictures are made, but the policy looks at none; leave out --cameras or --observation=images")
+    if sees and config.method == "dart":
+        raise UsageError("method 'dart' measures the learner's errors from numbers; it is not for a policy that sees")

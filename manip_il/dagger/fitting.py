@@ -128,19 +128,9 @@ def resolved_ask(config: DaggerConfig) -> Ask:
     return Ask("probability", 1 / branch_steps(config)) if config.label == "branch" else Ask()
 
 
-def check_sight(config: DaggerConfig) -> None:
-    """Raise `UsageError` unless what the policy sees is recorded, and nothing is pictured for a blind one."""
-    if config.fit.is_mlp:
-        config.fit.mlp(0)  # refuses what it does not know
-        sees = False
-    else:
-        sees = config.fit.other(0).observation != "state"
-    if sees and config.cameras is None:
-        raise UsageError("the policy looks at pictures, but none are made; give --cameras=front,wrist")
-    if config.cameras is not None and not sees:
-        raise UsageError("pictures are made, but the policy looks at none; leave out --cameras or --observation=images")
-    if sees and config.method == "dart":
-        raise UsageError("method 'dart' measures the learner's errors from numbers; it is not for a policy that sees")
+def check_fit(config: DaggerConfig) -> None:
+    """Raise `UsageError` unless the policy's own configuration takes what it is given."""
+    config.fit.mlp(0) if config.fit.is_mlp else config.fit.other(0)
 
 
 def check_labels(config: DaggerConfig) -> None:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from manip_il.checks import read_json
 from manip_il.errors import UsageError
+from manip_il.learn.policy_names import check_names
 
 if TYPE_CHECKING:  # torch and LeRobot take seconds to import
-    from pathlib import Path
-
     from manip_il.learn.policy_config import PolicyFitConfig
     from manip_il.learn.train import TrainConfig
 
 MLP = "mlp"  # the one policy with a loop of its own
 MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
 STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
+_AT_LEAST_1 = ("steps", "batch_size", "threads", "log_freq", "save_freq")
+_AT_LEAST_0 = ("num_workers", "image_cache_gb")
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,8 @@ class FitConfig:
 
     policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). optimizer, scheduler:
     in place of the policy's own. tensorboard, wandb: not for the mlp.
+
+    Raises `UsageError` for a number out of range, `UnknownName` for a policy or an option of it that is not there.
     """
 
     policy: Mapping[str, Any] = field(default_factory=dict[str, Any])
@@ -44,10 +50,30 @@ class FitConfig:
     tensorboard: bool = False
     wandb: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
+    def __post_init__(self) -> None:
+        for name, least in (*((name, 1) for name in _AT_LEAST_1), *((name, 0) for name in _AT_LEAST_0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise UsageError(f"{name} is {value}; expected at least {least}")
+        if not 0.0 <= self.eval_split < 1.0:
+            raise UsageError(f"dataset.eval_split is {self.eval_split}; expected at least 0 and less than 1")
+        if self.lr is not None and not 0.0 < self.lr < math.inf:
+            raise UsageError(f"lr is {self.lr}; expected more than 0")
+        check_names(self.policy, MLP)
+
     @property
     def is_mlp(self) -> bool:
         """Whether the policy is fitted by `manip_il.learn.train`."""
         return "path" not in self.policy and self.policy.get("type", MLP) == MLP
+
+    @property
+    def sees(self) -> bool:
+        """Whether the policy looks at pictures; `ManipError` where that is for the checkpoint in `path` to say."""
+        if self.is_mlp or self.observation is not None:
+            return self.observation not in (None, "state")
+        path = self.policy.get("path")
+        kind = read_json(Path(path) / "config.json", "a policy's").get("type") if path else self.policy["type"]
+        return kind == "cnn"
 
     @property
     def total_steps(self) -> int:

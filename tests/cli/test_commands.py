@@ -24,6 +24,7 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.sim.env import EnvConfig
 
 ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "datasets" / "sample"
 TINY_DAGGER = [
     "--demonstrations=3",
     "--rounds=1",
@@ -163,7 +164,7 @@ def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
         (["record", "--cameras=front", "--dataset.rgb_encoder.preset=99"], "preset"),
         (["record", "--workers=0"], "workers is 0"),
         (["record", "--engine=rai"], "did you mean 'ray'?"),
-        (["build", "nix", "dataset"], "nix is no folder"),
+        (["build", "nix", "dataset"], "nix does not exist"),
         (["build", "configs"], "DATASET is missing"),
         (["record", "--dataset.num_episodes=0"], "expected at least 1"),
         (["record", "--dataset.repo_id=name"], "expected USER/NAME"),
@@ -173,8 +174,8 @@ def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
         (["train", "--dataset.root=x", "--policy.lr=1"], "unknown option of --policy.type=mlp: 'lr'"),
         (["train", "--dataset.root=x", "--policy.type=act", "--observation=eyes"], "one of state, images, both"),
         (["train", "--dataset.root=x", "--policy=act"], "--policy.NAME=VALUE"),
-        (["train", "--dataset.root=x", "--wandb.projekt=a", "--policy.type=act"], "did you mean 'project'"),
-        (["train", "--dataset.root=x", "--policy.loss=mes"], "did you mean 'mse'?"),
+        (["train", f"--dataset.root={SAMPLE}", "--wandb.projekt=a", "--policy.type=act"], "did you mean 'project'"),
+        (["train", f"--dataset.root={SAMPLE}", "--policy.loss=mes"], "did you mean 'mse'?"),
         (["dagger", "--beta=lineal:5"], "did you mean 'linear'?"),
         (["dagger", "--rounds=-1"], "expected at least 0"),
         (["dagger", "--label=takover"], "did you mean 'takeover'?"),

@@ -5,22 +5,27 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from manip_il.cli.main import COMMANDS
+from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.options import options_of
 
-HEAVY = {"torch", "lerobot", "mujoco", "mink", "gymnasium", "scipy", "pyarrow", "av", "PIL", "mcap", "huggingface_hub"}
-RUN = f"""
+SLOW = ["torch", "lerobot"]  # seconds
+HEAVY = [*SLOW, "mujoco", "mink", "gymnasium", "scipy", "pyarrow", "av", "PIL", "mcap", "huggingface_hub"]
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "datasets" / "sample"
+RUN = """
 import io, json, sys
 from contextlib import redirect_stderr, redirect_stdout
 from manip_il.cli.main import main
-answers = []
-for words in json.loads(sys.stdin.read()):
+answers, (heavy, cases) = [], json.loads(sys.stdin.read())
+for words in cases:
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = main(words)
-    loaded = sorted({HEAVY} & set(sys.modules))
+    loaded = sorted(set(heavy) & set(sys.modules))
     answers.append([words, code, out.getvalue(), err.getvalue(), loaded])
     if loaded:
         break
@@ -28,12 +33,21 @@ print(json.dumps(answers))
 """
 
 
-def answers(cases: list[list[str]], cwd) -> list[tuple[list[str], int, str, str, list[str]]]:
+def answers(cases: list[list[str]], cwd: Path, heavy: list[str] = HEAVY) -> list[tuple[list[str], int, str, str, list]]:
     """What one process says to one command line after the other, up to the first that loads something heavy."""
-    done = subprocess.run(
-        [sys.executable, "-c", RUN], input=json.dumps(cases), capture_output=True, text=True, check=True, cwd=cwd
-    )
+    asked = json.dumps([heavy, cases])
+    done = subprocess.run([sys.executable, "-c", RUN], input=asked, capture_output=True, text=True, check=True, cwd=cwd)
     return json.loads(done.stdout)
+
+
+def mistakes(cases: dict[str, str], cwd: Path, heavy: list[str] = HEAVY) -> None:
+    """Every command line exits 2, says its words in one line, and loads nothing heavy."""
+    words = [line.replace("SAMPLE", str(SAMPLE)).split() for line in cases]
+    given = answers(words, cwd, heavy)
+    assert [(words, loaded) for words, _, _, _, loaded in given if loaded] == []
+    for (words, code, _, err, _), says in zip(given, cases.values(), strict=True):
+        assert (code, err.count("\n"), says in err) == (2, 1, True), (words, says, err)
+    assert list(cwd.iterdir()) == []
 
 
 def test_help_of_every_command_imports_nothing_heavy(tmp_path):
@@ -50,6 +64,77 @@ def test_a_mistyped_command_or_option_imports_nothing_heavy(tmp_path):
     assert [(words, loaded) for words, _, _, _, loaded in given if loaded] == []
     assert [code for _, code, *_ in given] == [2] * len(cases)
     assert all(err.count("\n") == 1 and err.startswith("manip-il: error: ") for _, _, _, err, _ in given)
+
+
+def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
+    no_dataset = "missing does not exist; expected the folder of a LeRobot dataset"
+    mistakes(
+        {
+            "train --dataset.root=missing": no_dataset,
+            f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: it has no meta/info.json",
+            f"train --dataset.root={SAMPLE.parent}": "it holds the datasets sample",
+            "train --dataset.root=lerobot/pusht": "manip-il pull hf://datasets/lerobot/pusht FOLDER",
+            "train --dataset.root=SAMPLE --policy.path=missing": "no policy in missing",
+            "eval --policy.path=missing": "no policy in missing",
+            "eval --policy.path=lerobot/act_aloha": "manip-il pull hf://lerobot/act_aloha FOLDER",
+            "eval --policy.type=expert --suite=missing.yaml": "--suite=missing.yaml: no such file",
+            "certify --policy.path=missing": "no policy in missing",
+            "replay missing --episode=1": "missing does not exist; expected an eval.json",
+            "merge a b": "a does not exist; expected an eval.json",
+            "compare a b": "a does not exist; expected an eval.json, a policy",
+            "study missing.yaml": "missing.yaml does not exist; expected the YAML of a study",
+            "render missing out": no_dataset,
+            "doctor missing": no_dataset,
+            "mcap export missing out": no_dataset,
+            "mcap import missing out --mapping=m.yaml": "missing does not exist; expected an MCAP file",
+            "build missing out": "missing does not exist; expected one of episode-*.mcap files",
+            "push missing hf://me/x": "missing does not exist; expected the folder of a dataset, a run or a policy",
+            "push SAMPLE me/x": "'me/x' is no URL",
+            "pull me/x out": "'me/x' is no URL",
+            "dagger --config_path=missing.yaml": "cannot read missing.yaml",
+        },
+        tmp_path,
+    )
+
+
+def test_resume_with_nothing_to_resume_is_refused_before_anything_heavy_is_imported(tmp_path):
+    nothing = "--resume=true: nothing to resume in new"
+    commands = ["train --dataset.root=SAMPLE", "dagger", "eval --policy.type=expert", f"compare {ROOT} {SAMPLE}"]
+    commands += [f"study {ROOT / 'pyproject.toml'}", "quickstart"]
+    cases = {f"{command} --resume=true --output_dir=new": nothing for command in commands}
+    mistakes(cases | {"record --resume=true --dataset.root=new": f"{nothing}.journals"}, tmp_path)
+    assert {name for name in COMMANDS if any(option.name == "resume" for option in options_of(load(name)))} == {
+        *(command.split()[0] for command in commands),
+        "record",
+    }
+
+
+def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
+    mistakes(
+        {
+            "train --dataset.root=SAMPLE --policy.type=atc": "unknown policy 'atc' (did you mean 'act'?)",
+            "train --dataset.root=SAMPLE --policy.widht=3": "(did you mean 'width'?)",
+            "train --dataset.root=SAMPLE --policy.type=act --policy.chunksize=3": "(did you mean 'chunk_size'?)",
+            "train --dataset.root=SAMPLE --steps=0": "steps is 0; expected at least 1",
+            "train --dataset.root=SAMPLE --lr=-1": "lr is -1.0; expected more than 0",
+            "train --dataset.root=SAMPLE --dataset.eval_split=1": "dataset.eval_split is 1.0; expected at least 0",
+            "train --dataset.root=SAMPLE --seed=5000": "seed is 5000",
+            "dagger --beta=0.5": "beta is '0.5'; expected constant:0.5, linear:ROUNDS or exponential:B",
+            "dagger --robot.type=ur5": "unknown robot 'ur5'; known: fetch, panda",
+            "dagger --rounds=-1": "rounds is -1",
+            "dagger --policy.type=cnn": "give --cameras=front,wrist",
+            "dagger --dataset.root=x": "unknown option '--dataset.root'; manip-il dagger --help lists all",
+            "eval --policy.type=expert --suite=hard": "unknown suite 'hard'",
+            "eval --policy.type=expert --workers=0": "--workers is 0",
+            "eval --policy.type=expert --task.type=push": "unknown task 'push'",
+            "eval runs/x": "did you mean --policy.path=runs/x?",
+            "record --cameras=top": "unknown camera 'top'; known: front, wrist",
+            "quickstart --rounds=-1": "rounds is -1",
+            "quickstart --policy.widht=3": "(did you mean '--policy.width'?)",
+        },
+        tmp_path,
+        SLOW,
+    )
 
 
 @pytest.mark.parametrize(

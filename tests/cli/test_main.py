@@ -101,8 +101,17 @@ def test_every_error_is_one_line_and_an_exit_code(words, code, line, capsys):
 def test_an_unknown_option_names_the_nearest(capsys):
     assert main(["fake", "--dataset.num_episode=1"]) == 2
     err = capsys.readouterr().err
-    assert "unknown option '--dataset.num_episode' (did you mean '--dataset.num_episodes'?); known: --act" in err
+    assert (
+        "unknown option '--dataset.num_episode' (did you mean '--dataset.num_episodes'?); manip-il fake --help" in err
+    )
+    assert "--act" not in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["help", "fake"], ["--help", "fake"], ["fake", "--help"], ["fake", "-h"]])
+def test_help_may_stand_before_the_command_or_behind_it(words, capsys):
+    assert main(words) == 0
+    assert "usage: manip-il fake" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("words", [["--debug", "fake", "--act=bug"], ["fake", "--act=bug", "--debug"]])

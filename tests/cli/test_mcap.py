@@ -98,9 +98,10 @@ def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path
     [
         (["expotr", "a", "b"], 2, "unknown command 'mcap expotr' (did you mean 'mcap export'?); known: mcap export, "),
         (["export"], 2, "DATASET is missing"),
-        (["export", "nothing", "b"], 1, "nothing is not a LeRobot dataset"),
+        (["export", "nothing", "b"], 2, "nothing does not exist; expected the folder of a LeRobot dataset"),
         (["import", "a", "b"], 2, "--mapping is missing"),
-        (["import", "a", "b", "--mapping=nothing.yaml"], 2, "cannot read nothing.yaml"),
+        (["import", "a", "b", "--mapping=nothing.yaml"], 2, "a does not exist; expected an MCAP file"),
+        (["import", ".", "b", "--mapping=nothing.yaml"], 2, "nothing.yaml does not exist; expected a mapping file"),
         (["import", "a", "b", "--maping=x"], 2, "(did you mean '--mapping'?)"),
     ],
 )

@@ -93,9 +93,9 @@ def test_words_change_what_they_name(words, change):
 @pytest.mark.parametrize(
     ("words", "parts"),
     [
-        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "--dataset.root"]),
+        (["--los=l1"], ["unknown option '--los'", "did you mean '--loss'", "manip-il COMMAND --help lists all"]),
         (["--num_epsiodes=1"], ["did you mean", "num_episodes"]),
-        (["--repo-id=x"], ["unknown option", "known: --dataset.repo_id"]),
+        (["--repo-id=x"], ["unknown option '--repo-id' (did you mean '--small.repo_id' or '--dataset.repo_id'?)"]),
         (["--dataset=x"], ["--dataset is a group", "--dataset.num_episodes"]),
         (["--lr=fast"], ["--lr", "expected a number", "'fast'"]),
         (["--lr=nan"], ["expected a number"]),
@@ -109,7 +109,10 @@ def test_words_change_what_they_name(words, change):
         (["--cameras=front,"], ["comma-separated list"]),
         (["--lr"], ["--lr has no value", "a number"]),
         (["--lr", "--resume"], ["--lr has no value"]),
-        (["lr=1"], ["unexpected 'lr=1'", "--name=value"]),
+        (["lr=1"], ["unexpected 'lr=1'", "two dashes: --lr=1"]),
+        (["-lr=1"], ["unexpected '-lr=1'", "two dashes: --lr=1"]),
+        (["c.yaml"], ["--config_path=c.yaml"]),
+        (["data/x"], ["did you mean --dataset.root=data/x?"]),
         (["--config_path=absent.yaml"], ["cannot read absent.yaml"]),
     ],
 )

@@ -87,7 +87,7 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(
     ("words", "code", "says"),
     [
         (["push", "RUN", "ftp://x/y"], 2, "unknown scheme 'ftp://' (did you mean 'sftp://'?)"),
-        (["push", "nowhere", "URL"], 2, "nowhere is no folder; expected the folder of a dataset or of a run"),
+        (["push", "nowhere", "URL"], 2, "nowhere does not exist; expected the folder of a dataset, a run or a policy"),
         (["push", ".", "URL"], 2, "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
         (
             ["push", "RUN", "hf://datasets/me/x"],

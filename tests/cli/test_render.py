@@ -72,7 +72,7 @@ def test_two_workers_write_the_bytes_of_one(demos):
         (["demos", "demos/meta", "--overwrite=true"], 2, "overlaps SOURCE demos"),
         (["demos", "full"], 2, "full exists already; replace it by --overwrite=true"),
         (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
-        (["nothing", "x"], 1, "nothing is not a LeRobot dataset"),
+        (["nothing", "x"], 2, "nothing does not exist; expected the folder of a LeRobot dataset"),
     ],
 )
 def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, capsys, words, code, message):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.fitting import branch_steps, check_labels, check_sight, plan_length, resolved_ask
+from manip_il.dagger.config import DaggerConfig, check_sight
+from manip_il.dagger.fitting import branch_steps, check_labels, plan_length, resolved_ask
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.look import CameraConfig
