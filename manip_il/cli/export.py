@@ -36,7 +36,7 @@ class ExportOptions:
         """Export, compare, write."""
         output = self._output()
         path = find_policy(self.policy)
-        self._check(path)
+        self._check(path, output)
         from manip_il.engine.describe import policy_sha256
         from manip_il.learn.export import export_onnx, export_torchscript
 
@@ -58,8 +58,10 @@ class ExportOptions:
             raise UsageError(f"{output} exists already; replace it by --overwrite=true, or choose another --output")
         return output
 
-    def _check(self, path: Path) -> None:
+    def _check(self, path: Path, output: Path) -> None:
         """Raise before anything heavy is imported where this policy cannot be exported, or not on this machine."""
+        if output.resolve().is_relative_to(path.resolve()):
+            raise UsageError(f"--output is {output}, inside the policy's own folder {path}; choose another place")
         from manip_il.learn.pretrained import read_config
 
         kind = read_config(path)["type"]

@@ -87,6 +87,14 @@ def test_a_folder_is_no_file(here, capsys):
     assert complaint(capsys) == "--output is run, a folder; expected a file such as run/policy.onnx"
 
 
+def test_the_policys_own_folder_stays_as_it_is(here, capsys):
+    policy = write_run(here / "run").relative_to(here)
+    assert main(["export", "run", f"--output={policy}/policy.pt", "--format=torchscript"]) == 2
+    expected = f"--output is {policy}/policy.pt, inside the policy's own folder {policy}; choose another place"
+    assert complaint(capsys) == expected
+    assert not (policy / "policy.pt").exists()
+
+
 def test_other_policies_are_refused_by_their_type(here, capsys):
     policy = write_run(here / "run", "act")
     assert main(["export", "run"]) == 1
