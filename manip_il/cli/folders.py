@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from manip_il.cli.options import CONFIG_HEADER
+from manip_il.data.atomic import write_file
+from manip_il.data.writing import writing
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
 _MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a folder
@@ -47,33 +49,27 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
-    """Write a whole file or nothing, through a temporary file beside it; creates the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write a whole file or nothing, and its folder where that is missing. Raises `WriteError` as `write_file` does."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, content.encode() if isinstance(content, str) else content)
 
 
 def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     """Add one line of JSON and flush it. A torn last line, left by a kill, is removed first.
 
-    Raises `NotFiniteError` where the record holds NaN or infinity, which JSON has not.
+    Raises `NotFiniteError` where the record holds NaN or infinity, which JSON has not, and `WriteError` where the disk
+    is full or read-only.
     """
     try:
         line = json.dumps(dict(record), allow_nan=False, default=_plain)
     except ValueError as error:
         raise NotFiniteError(f"{path}: a record that is not finite: {dict(record)}") from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _mend_tail(path)
-    with path.open("ab") as file:
-        file.write(line.encode() + b"\n")
-        file.flush()
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _mend_tail(path)
+        with path.open("ab") as file:
+            file.write(line.encode() + b"\n")
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:

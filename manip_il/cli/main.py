@@ -28,6 +28,7 @@ from manip_il.errors import ManipError, UnknownName, UsageError
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+LONGEST_LINE = 2_000  # of an error [characters]
 
 
 class Command(NamedTuple):
@@ -178,7 +179,13 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
 
 
 def _complain(text: str) -> None:
-    print(f"{PROGRAM}: {' '.join(_clean(text).split())}", file=sys.stderr, flush=True)
+    print(f"{PROGRAM}: {_one_line(text)}", file=sys.stderr, flush=True)
+
+
+def _one_line(text: str) -> str:
+    """Without its middle where it is too long to be read: what to do next stands at the end."""
+    line = " ".join(_clean(text).split())
+    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
 
 
 def _clean(text: str) -> str:

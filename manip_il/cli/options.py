@@ -181,12 +181,12 @@ def _open_group(name: str, known: Mapping[str, Option]) -> str:
 
 
 def _as_yaml(word: str, group: str) -> Any:
-    import yaml
+    from manip_il.data.yaml_file import parse_yaml
 
     try:
-        return yaml.safe_load(word)
-    except yaml.YAMLError as error:
-        raise UsageError(f"--{group}: {word!r} is not a YAML value: {' '.join(str(error).split())}") from error
+        return parse_yaml(word)
+    except ValueError as error:
+        raise UsageError(f"--{group}: {word!r} is not a YAML value: {error}") from error
 
 
 def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:

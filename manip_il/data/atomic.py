@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
+from manip_il.data.writing import writing
 from manip_il.errors import FolderBusyError, FolderExistsError
 
 PARTIAL = ".partial"  # suffix of what is not finished
@@ -23,21 +24,23 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
 
     An exception removes the sibling; what a killed writer left of one is removed by the next writer.
     Raises `FolderExistsError` where `root` holds something, before and after; with `replace` that stays until the
-    new folder is whole, and is removed then.
+    new folder is whole, and is removed then. Raises `WriteError` where the disk is full or read-only.
     """
     root = root.absolute()
     if not (replace and root.is_dir()):
         _refuse_full(root)
-    root.parent.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(root)
-    partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
+    with writing(root):
+        root.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(root)
+        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
     lock = os.open(partial, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):  # a network file system may know no locks; then leftovers stay
             fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel lets go when the writer dies: so leftovers are known
         partial.chmod(0o777 & ~umask())
-        yield partial
-        _sync_tree(partial)
+        with writing(root):
+            yield partial
+            _sync_tree(partial)
         if replace and root.exists():
             _exchange(partial, root)
             shutil.rmtree(partial, ignore_errors=True)
@@ -61,18 +64,21 @@ def exclusive(folder: Path) -> Generator[None]:
     """
     folder = folder.absolute()
     path = folder.with_name(f".{folder.name}.lock")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle = _lock(folder, path)
     except OSError as error:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
-            raise
+            with writing(path):
+                raise
         with _holding_itself(folder):
             yield
         return
     try:
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+        with writing(path):
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
         path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
@@ -112,7 +118,15 @@ def _lock(folder: Path, path: Path) -> int:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that `path` holds all of it or what it held before."""
+    """Write `data` to `path` so that `path` holds all of it or what it held before.
+
+    Raises `WriteError` where the disk is full or read-only.
+    """
+    with writing(path):
+        _write_file(path, data)
+
+
+def _write_file(path: Path, data: bytes) -> None:
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
     partial = Path(name)
     try:

@@ -8,9 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
-import yaml
-
 from manip_il.data.remote.errors import redact
+from manip_il.data.yaml_file import parse_yaml
 
 MADE_BY = "| made by | manip_il"
 LICENSE = "apache-2.0"
@@ -59,8 +58,8 @@ def command(config: Path) -> str | None:
     if word is None:
         return None
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError:
+        tree = parse_yaml(text)
+    except ValueError:
         return None
     words = [f"--{name}={value}" for name, value in _leaves(tree) if _is_shown(name, value)]
     return redact(f"manip-il {word} \\\n  " + " \\\n  ".join(words))

@@ -25,6 +25,7 @@ from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
 from manip_il.data.video import CameraFiles, CameraThreads, Clip, VideoConfig
+from manip_il.data.writing import writing
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -255,7 +256,8 @@ class DatasetWriter:
 @contextlib.contextmanager
 def _explained(root: Path) -> Generator[None]:
     try:
-        yield
+        with writing(root):
+            yield
     except OSError as error:
         raise ManipError(f"cannot write {root}: {error.strerror or error}") from error
 

@@ -14,13 +14,15 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il.data.atomic import umask
 from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.writing import writing
 from manip_il.errors import ManipError, MismatchError
 
 # LeRobot is imported where something is written: its import takes seconds, which a worker that
@@ -134,17 +136,13 @@ def save_checkpoint(
     from lerobot.optim.optimizers import save_optimizer_state
 
     checkpoints = Path(output_dir) / "checkpoints"
-    checkpoints.mkdir(parents=True, exist_ok=True)
     final = checkpoints / f"{step:06d}"
-    temporary = checkpoints / f".{final.name}.tmp"
-    for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
-        shutil.rmtree(stale, ignore_errors=True)
-    _write_pretrained(temporary / PRETRAINED_MODEL, policy, meta)
-    state = temporary / TRAINING_STATE
-    state.mkdir()
-    save_optimizer_state(optimizer, state)
-    write_json(state / STEP_FILE, {"step": step, **resume_key})
-    publish(temporary, final)
+    with unpublished(final) as temporary:
+        _write_pretrained(temporary / PRETRAINED_MODEL, policy, meta)
+        state = temporary / TRAINING_STATE
+        state.mkdir()
+        save_optimizer_state(optimizer, state)
+        write_json(state / STEP_FILE, {"step": step, **resume_key})
     for other in checkpoints.iterdir():
         if not other.is_symlink() and other.name != final.name:
             shutil.rmtree(other, ignore_errors=True)
@@ -193,6 +191,26 @@ def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMe
     for processor in make_pre_post_processors(policy.config):
         processor.save_pretrained(folder)
     write_json(folder / META_FILE, asdict(meta))
+
+
+@contextmanager
+def unpublished(final: Path) -> Generator[Path]:
+    """Give an empty folder to write a checkpoint into; on leaving, it gets its name and is `last`.
+
+    An exception removes it. Raises `WriteError` where the disk is full or read-only.
+    """
+    temporary = final.parent / f".{final.name}.tmp"
+    try:
+        with writing(final):
+            final.parent.mkdir(parents=True, exist_ok=True)
+            for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
+                shutil.rmtree(stale, ignore_errors=True)
+            temporary.mkdir()
+            yield temporary
+            publish(temporary, final)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
 
 
 def publish(temporary: Path, final: Path) -> None:

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -26,8 +25,8 @@ from manip_il.learn.checkpoint import (
     STEP_FILE,
     TRAINING_STATE,
     CheckpointMeta,
-    publish,
     read_step,
+    unpublished,
     write_json,
 )
 
@@ -57,15 +56,11 @@ def save_lerobot_checkpoint(
     `pretrained_model`.
     """
     final = get_step_checkpoint_dir(output_dir, progress.steps, progress.step)
-    temporary = final.parent / f".{final.name}.tmp"
-    temporary.parent.mkdir(parents=True, exist_ok=True)
-    for stale in (temporary, final):  # of a run that was killed before it could switch `last` over
-        shutil.rmtree(stale, ignore_errors=True)
     policy, before, after = parts
     optimizer, scheduler = state
-    save_checkpoint(temporary, progress.step, pipeline, policy, optimizer, scheduler, before, after)
-    write_json(temporary / PRETRAINED_MODEL / META_FILE, asdict(meta))
-    key = {"data": progress.data, "options": progress.options, "batch_size": pipeline.batch_size}
-    write_json(temporary / TRAINING_STATE / STEP_FILE, read_step(temporary) | key)
-    yield temporary / PRETRAINED_MODEL
-    publish(temporary, final)
+    with unpublished(final) as temporary:
+        save_checkpoint(temporary, progress.step, pipeline, policy, optimizer, scheduler, before, after)
+        write_json(temporary / PRETRAINED_MODEL / META_FILE, asdict(meta))
+        key = {"data": progress.data, "options": progress.options, "batch_size": pipeline.batch_size}
+        write_json(temporary / TRAINING_STATE / STEP_FILE, read_step(temporary) | key)
+        yield temporary / PRETRAINED_MODEL

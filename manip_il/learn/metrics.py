@@ -10,6 +10,8 @@ from typing import Any
 
 from lerobot.configs.train import TrainPipelineConfig
 
+from manip_il.data.atomic import write_file
+from manip_il.data.writing import writing
 from manip_il.errors import UsageError
 
 METRICS_FILE = "metrics.jsonl"
@@ -26,14 +28,13 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
             with_step = _step_of(line)
             if with_step is not None and with_step <= step:
                 kept.append(line + "\n")
-    with path.open("w") as file:
-        file.writelines(kept)
+    write_file(path, "".join(kept).encode())
 
-        def write(record: Record) -> None:
-            file.write(json.dumps(dict(record)) + "\n")
-            file.flush()
+    def write(record: Record) -> None:
+        with writing(path), path.open("ab") as file:
+            file.write((json.dumps(dict(record)) + "\n").encode())
 
-        yield write
+    yield write
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, rea
 from manip_il.cli.groups import CONFIG_FILE, check_same_options
 from manip_il.cli.options import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
+from manip_il.data.writing import WriteError
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
 
@@ -125,7 +126,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(WriteError, match=f"cannot write {path}: No space"):
         atomic_write(path, "new")
     assert path.read_bytes() == b"old"
     assert list(path.parent.iterdir()) == [path]

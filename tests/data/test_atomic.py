@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.data.atomic import exclusive, new_folder, write_file
+from manip_il.data.writing import WriteError
 from manip_il.errors import FolderBusyError, FolderExistsError
 
 
@@ -73,7 +74,7 @@ def test_a_file_holds_what_it_held_where_writing_fails(tmp_path, monkeypatch):
     path = tmp_path / "file"
     write_file(path, b"old")
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(WriteError, match=f"cannot write {path}: No space left"):
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert [one.name for one in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,62 @@
+"""YAML that somebody made to do harm, or just wrong: refused in one short line, at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from manip_il.data.yaml_file import DEEPEST, LARGEST, parse_yaml, read_yaml
+from manip_il.errors import UsageError
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        BOMB,
+        "&a [*a]",
+        "[" * 100_000,
+        "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1),
+        "a: !!python/object/apply:os.getcwd []",
+        "2001-99-99",
+        "!!timestamp x",
+        "!!int ''",
+        "9" * 5_000,
+        "a: [",
+        "\0",
+    ],
+)
+def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(UsageError, match="is not YAML") as error:
+        read_yaml(path, "a YAML file of options")
+    assert len(str(error.value)) < len(str(path)) + 400
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text("a: 1\n" * LARGEST)
+    with pytest.raises(UsageError, match=f"has more than {LARGEST} bytes"):
+        read_yaml(path, "a YAML file of options")
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_bytes(b"a: \xff")
+    with pytest.raises(UsageError, match="is not YAML"):
+        read_yaml(path, "a YAML file of options")
+
+
+def test_plain_yaml_is_read() -> None:
+    assert parse_yaml("a: [1, 2.5, yes, null, '*b']\nb: {c: d & e}") == {
+        "a": [1, 2.5, True, None, "*b"],
+        "b": {"c": "d & e"},
+    }
+    deep = "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
+    assert isinstance(parse_yaml(deep), list)

@@ -1,0 +1,91 @@
+"""A disk that fills up under a command: one line that names the path; with more room the command goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+
+from ..cli.made_runs import make_eval
+from .full_disk import small_disk
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+REACH = ("--robot.type=fetch", "--task.type=reach", "--workers=1")
+
+TRAIN = ("train", f"--dataset.root={SAMPLE}", "--steps=4", "--save_freq=2", "--policy.width=64")
+DAGGER = (
+    *("dagger", *REACH, "--rounds=1", "--demonstrations=2", "--episodes_per_round=2", "--validation_episodes=1"),
+    *("--steps=4", "--policy.width=64"),
+)
+EVAL = ("eval", "--policy.type=expert", *REACH, "--eval.n_episodes=6", "--eval.films=0")
+
+
+def error_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
+    """The error of a command that fails; there is one line of it."""
+    capsys.readouterr()
+    assert main([*words, "--quiet"]) == 1
+    printed = capsys.readouterr().err
+    assert "Traceback" not in printed
+    (line,) = [line for line in printed.splitlines() if line.startswith("manip-il: error:")]
+    return line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "size", "place"),
+    [
+        pytest.param(TRAIN, 60_000, "out/checkpoints/", id="train"),
+        pytest.param(DAGGER, 20_000, "out/round_000/journals/", id="dagger journals"),
+        pytest.param(DAGGER, 130_000, "out/round_000/", id="dagger"),
+        pytest.param(EVAL, 12_288, "out/", id="eval"),
+    ],
+)
+def test_what_was_finished_is_kept_and_the_command_goes_on(words, size, place, tmp_path, capsys):
+    with small_disk(tmp_path / "disk", size) as disk:
+        out = disk.folder / "out"
+        line = error_of((*words, f"--output_dir={out}"), capsys)
+        assert f"cannot write {disk.folder}/{place}" in line
+        assert ("No space left on device" if disk.is_real else "File too large") in line
+        assert "kept: " in line
+        assert "--resume=true" in line
+        assert not list(disk.folder.rglob("*.partial")) + list(disk.folder.rglob("*.tmp"))
+        disk.grow()
+        assert main([*words, f"--output_dir={out}", "--resume=true", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("words", [("merge", "left", "right"), ("compare", "left", "same")])
+def test_evaluations_are_merged_and_compared_anew(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for folder, seed in (("left", 4_000_000), ("right", 4_001_000), ("same", 4_000_000)):
+        make_eval(Path(folder, "eval.json"), [True, False], seed)
+        text = Path(folder, "eval.json").read_text()
+        Path(folder, "eval.json").write_text(text.replace(f'"policy": "{folder}"', '"policy": "expert"'))
+    with small_disk(tmp_path / "disk", 8_192) as disk:
+        out = disk.folder / "out"
+        line = error_of((*words, f"--output_dir={out}"), capsys)
+        assert f"cannot write {out}/" in line
+        disk.grow()
+        assert main([*words, f"--output_dir={out}", "--overwrite=true", "--quiet"]) == 0
+
+
+def test_an_export_leaves_nothing_behind(tmp_path, capsys):
+    with small_disk(tmp_path / "disk", 8_192) as disk:
+        out = disk.folder / "out"
+        line = error_of(("mcap", "export", str(SAMPLE), str(out)), capsys)
+        assert f"cannot write {out}: " in line
+        assert list(disk.folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [("merge", "left", "right"), ("mcap", "export", str(SAMPLE))])
+def test_a_path_through_a_file_is_named(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    make_eval(Path("left/eval.json"), [True])
+    make_eval(Path("right/eval.json"), [True], 4_001_000)
+    for path in Path().glob("*/eval.json"):
+        path.write_text(path.read_text().replace(f'"policy": "{path.parent}"', '"policy": "expert"'))
+    Path("file").write_text("")
+    out = ("file/out",) if words[0] == "mcap" else ("--output_dir=file/out",)
+    assert "file" in error_of((*words, *out), capsys)
+    assert Path("file").read_text() == ""
