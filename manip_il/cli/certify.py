@@ -44,7 +44,7 @@ class VisitorGroup:
 class CertifyOptions:
     """Measure how the expert goes on from perturbed states and after wrong actions; writes certificate.json."""
 
-    example: ClassVar[str] = "manip-il certify --robot.type=fetch --policy.path=runs/dagger --output_dir=runs/fetch"
+    example: ClassVar[str] = "manip-il certify --policy.path=runs/dagger --output_dir=runs/certificate"
     robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
     task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
     policy: VisitorGroup = field(default_factory=VisitorGroup)

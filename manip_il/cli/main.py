@@ -201,7 +201,7 @@ def _help() -> str:
         "Robot-arm imitation learning without a human at the controls.\n\n"
         f"commands:\n{_commands(COMMANDS)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
-        f"example: {PROGRAM} quickstart"
+        f"example: {PROGRAM} quickstart --output_dir=runs/quickstart"
     )
 
 

@@ -36,7 +36,7 @@ class StudyOptions:
     target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and report.html the answer.
     """
 
-    example: ClassVar[str] = "manip-il study configs/studies/labels.yaml --output_dir=runs/labels"
+    example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
     file: Path = field(metadata={"help": "YAML of the study", "positional": True})
     training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)

@@ -1,0 +1,155 @@
+"""What README and docs mention is there: options, commands, files, headings, messages."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+import typing
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.options import options_of
+
+from .pages import PAGES, ROOT
+
+_OPTION = re.compile(r"(?<![\w-])--([a-zA-Z][\w.-]*)")
+_ALWAYS = {"help", "debug", "quiet", "version", "config_path"}
+_OTHERS = {  # of other programs, by their own manuals
+    "docker": {
+        "build-arg", "cap-drop", "cpus", "format", "gpus", "memory", "network", "read-only", "rm", "security-opt",
+        "tmpfs", "user",
+    },
+    "accelerate": {"multi_gpu", "num_processes"},
+    "lerobot-dataset-viz": {"episode-index", "output-dir", "repo-id", "root", "save"},
+}  # fmt: skip
+_LINK = re.compile(r"\]\(([^)\s]+)\)")
+_VALUE = "\0"  # in an f-string
+_INLINE_COMMAND = re.compile(r"`manip-il ([a-z]+(?: [a-z]+)?)")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_option_is_one_of_a_command(page: str):
+    known = _ALWAYS | _our_options() | _lerobots_options() | set().union(*_OTHERS.values(), _of_benchmarks())
+    text = (ROOT / page).read_text(encoding="utf-8")
+    unknown = {name.rstrip(".-") for name in _OPTION.findall(text)} - known
+    assert [name for name in unknown if not _is_open(name)] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_is_one_that_there_is(page: str):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    unknown = [words for words in _INLINE_COMMAND.findall(text) if not {words, words.split()[0]} & set(COMMANDS)]
+    assert unknown == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_and_heading_of_the_repository(page: str):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for link in _LINK.findall(text):
+        if link.startswith("https://"):
+            continue
+        name, _, heading = link.partition("#")
+        target = (ROOT / page).parent / name if name else ROOT / page
+        assert target.exists(), f"{page}: {link}"
+        assert not heading or heading in _headings(target), f"{page}: {link}"
+
+
+def test_every_page_of_the_docs_is_on_the_map():
+    on_the_map = {link.partition("#")[0] for link in _LINK.findall((ROOT / "docs/README.md").read_text("utf-8"))}
+    assert {path.name for path in ROOT.glob("docs/*.md")} - {"README.md"} <= on_the_map
+
+
+@pytest.mark.parametrize("page", ["docs/docker.md", "docs/sharing.md"])
+def test_every_message_in_a_table_of_remedies_is_one_that_the_program_has(page: str):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    table = text.partition("| message | remedy |\n|---|---|\n")[2].partition("\n\n")[0]
+    quoted = [text for row in table.splitlines() for text in re.findall(r"`([^`]+)`", row.split(" | ")[0])]
+    assert len(quoted) >= 5
+    for text in set(quoted) - {"unhealthy"}:  # which Docker says
+        assert any(_says(message, text.split()) for message in _messages()), text
+
+
+@cache
+def _our_options() -> set[str]:
+    return {option.name for name in COMMANDS for option in options_of(load(name))}
+
+
+def _is_open(name: str) -> bool:
+    """Whether it is an option of a policy, an optimiser and so on, which other programs name; checked where we can."""
+    group, _, inner = name.partition(".")
+    if group == "policy":
+        return inner in _policies_options()
+    return group in ("optimizer", "scheduler", "wandb") and bool(inner)
+
+
+@cache
+def _policies_options() -> set[str]:
+    from manip_il.learn.choices import policy_class, policy_types
+
+    return {field.name for kind in policy_types() for field in dataclasses.fields(policy_class(kind))} | {
+        "type", "path", "discover_packages_path",
+    }  # fmt: skip
+
+
+@cache
+def _lerobots_options() -> set[str]:
+    """Of lerobot-train, lerobot-eval and lerobot-edit-dataset."""
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.scripts import lerobot_edit_dataset
+
+    from manip_il.lerobot_plugin import ManipILEnv
+
+    found = _leaves(TrainPipelineConfig) | _leaves(EvalPipelineConfig) | _leaves(lerobot_edit_dataset.EditDatasetConfig)
+    found |= {f"env.{field.name}" for field in dataclasses.fields(ManipILEnv)} | {"env.type", "operation.type"}
+    kinds = [kind for kind in vars(lerobot_edit_dataset).values() if isinstance(kind, type)]
+    edits = [kind for kind in kinds if dataclasses.is_dataclass(kind) and kind.__name__.endswith("Config")]
+    found |= {f"operation.{field.name}" for kind in edits for field in dataclasses.fields(kind)}
+    return found | {"env.discover_packages_path"}
+
+
+def _leaves(kind: type, prefix: str = "") -> set[str]:
+    found: set[str] = set()
+    hints = typing.get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        choices = [one for one in (hints[field.name], *typing.get_args(hints[field.name])) if isinstance(one, type)]
+        nested = [one for one in choices if dataclasses.is_dataclass(one)]
+        found.add(prefix + field.name)
+        for one in nested:
+            found |= _leaves(one, f"{prefix}{field.name}.")
+    return found
+
+
+def _of_benchmarks() -> set[str]:
+    texts = [path.read_text(encoding="utf-8") for path in ROOT.glob("benchmarks/*.py")]
+    return {name for text in texts for name in re.findall(r'add_argument\(\s*"--([\w-]+)"', text)}
+
+
+def _says(message: str, words: list[str]) -> bool:
+    """Whether a message may hold these words in a row, of which at most half are values."""
+    said = re.search(r"\s+".join(rf"(?:{re.escape(word)}|{_VALUE}\S*)" for word in words), message)
+    return said is not None and 2 * said[0].count(_VALUE) <= len(words)
+
+
+def _headings(page: Path) -> set[str]:
+    """As GitHub names them in addresses."""
+    lines = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
+@cache
+def _messages() -> list[str]:
+    """Every text in the program's code, with a mark for each value in it."""
+    found: list[str] = []
+    for path in ROOT.glob("manip_il/**/*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts = (str(part.value) if isinstance(part, ast.Constant) else _VALUE for part in node.values)
+                found.append("".join(parts))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return found
