@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from manip_il import __version__
+from manip_il.checks import shorten
 from manip_il.cli.mistakes import unexpected_word, unknown_option
 from manip_il.cli.values import choices, decode, expected
 from manip_il.errors import UsageError, nearest
@@ -186,7 +187,7 @@ def _as_yaml(word: str, group: str) -> Any:
     try:
         return parse_yaml(word)
     except ValueError as error:
-        raise UsageError(f"--{group}: {word!r} is not a YAML value: {error}") from error
+        raise UsageError(f"--{group}: {shorten(word)} is not a YAML value: {error}") from error
 
 
 def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
@@ -215,7 +216,7 @@ def _leaves(
         name = f"{prefix}{key}"
         if name in known and known[name].is_open:
             if not isinstance(value, dict | None):
-                raise UsageError(f"{path}: {name}: expected a mapping of options, got {value!r}")
+                raise UsageError(f"{path}: {name}: expected a mapping of options, got {shorten(value)}")
             yield from ((f"{name}.{inner}", one) for inner, one in (value or {}).items())
         elif name in known or _open_group(name, known):
             yield name, value
@@ -224,7 +225,7 @@ def _leaves(
         elif isinstance(value, dict):
             yield from _leaves(value, known, path, f"{name}.")
         elif value is not None:
-            raise UsageError(f"{path}: {name}: expected a mapping of options, got {value!r}")
+            raise UsageError(f"{path}: {name}: expected a mapping of options, got {shorten(value)}")
 
 
 def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
@@ -258,7 +259,8 @@ def _decode_given(field_type: Any, given: _Given) -> Any:
     except (ValueError, OverflowError):
         hint = nearest(given.value, choices(field_type)) if isinstance(given.value, str) else ""
         quotes = "; YAML needs quotes around text like this" if field_type is str and not given.is_word else ""
-        raise UsageError(f"{given.where}: expected {expected(field_type)}, got {given.value!r}{hint}{quotes}") from None
+        text = f"{given.where}: expected {expected(field_type)}, got {shorten(given.value)}{hint}{quotes}"
+        raise UsageError(text) from None
 
 
 def _fields(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Any]]:

@@ -190,7 +190,7 @@ def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after
 
 def test_a_file_that_is_not_there_is_one_line(tmp_path, capsys):
     assert main(["study", str(tmp_path / "y.yaml")]) == 2
-    assert "cannot read" in error(capsys)
+    assert "y.yaml does not exist; expected the YAML of a study" in error(capsys)
 
 
 def test_the_baseline_is_the_first_arm_unless_named(here):
