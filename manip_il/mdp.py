@@ -17,6 +17,7 @@ from manip_il.errors import ManipError, NotFiniteError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
 
 
 class Actor(IntEnum):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from manip_il import checks
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
 from manip_il.cli.groups import (
     ENGINE_HELP,
@@ -195,7 +196,7 @@ def run_rounds(config: DaggerConfig, folder: Path, engine: Engine, stages: Stage
 
 def _add_metrics(path: Path, result: RoundResult) -> None:
     """Add the round's line, unless an earlier run has: what it took then is what is true."""
-    if all(record["round"] != result.round for record in read_jsonl(path)):
+    if all(record.get("round") != result.round for record in read_jsonl(path)):
         append_jsonl(path, result.to_json())
 
 
@@ -249,5 +250,9 @@ def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
 
 def round_timings(folder: Path) -> dict[str, float]:
     """What each round's stages took [s], as the run that made them measured it."""
-    records = read_jsonl(folder / METRICS_FILE)
-    return {f"round {r['round']}, {stage}": seconds for r in records for stage, seconds in r["seconds"].items()}
+    path = folder / METRICS_FILE
+    return {
+        f"round {record.get('round')}, {stage}": checks.number(f"{path}: {stage}", seconds, 0)
+        for record in read_jsonl(path)
+        for stage, seconds in checks.mapping(f"{path}: seconds", record.get("seconds")).items()
+    }

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from manip_il import checks
 from manip_il.cli.options import CONFIG_HEADER
 from manip_il.data.atomic import write_file
 from manip_il.data.writing import writing
@@ -153,10 +154,9 @@ def _read_at(file: Any, position: int) -> bytes:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
-        record = json.loads(line)
-    except ValueError:
+        return checks.mapping("a record", checks.parse_json("a record", line))
+    except ManipError:
         return None
-    return record if isinstance(record, dict) else None
 
 
 def _require_record(path: Path, number: int, line: bytes) -> dict[str, Any]:

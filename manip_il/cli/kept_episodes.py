@@ -53,9 +53,10 @@ class KeptEpisodes:
         for line in read_jsonl(self.path)[1:]:
             try:
                 result = EpisodeResult.from_json(line)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, ManipError) as error:
+                why = f"{error} is missing" if isinstance(error, KeyError) else error
                 raise ManipError(
-                    f"{self.path}: a line that is no episode ({error}); --overwrite=true starts anew"
+                    f"{self.path}: a line that is no episode ({why}); start again with --overwrite=true"
                 ) from error
             if result.seed in seeds:
                 found[result.seed] = result

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from manip_il import checks
 from manip_il.cli.dagger import FREE, REPORT_FILE, DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.folders import atomic_write, prepare_output
 from manip_il.cli.groups import (
@@ -120,7 +121,7 @@ class _Story:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
         self.folder = options.output_dir
         path = self.folder / TIMINGS_FILE
-        self.timings: dict[str, float] = json.loads(path.read_text()) if path.is_file() else {}
+        self.timings = _read_timings(path) if path.is_file() else {}
 
     def tell(self) -> None:
         """Every chapter, then table and report."""
@@ -242,6 +243,12 @@ class _Story:
         say(f"took {format_seconds(sum(self.timings.values()))} in all")
         say(f"report: {self.folder / REPORT_FILE}")
         say(f"next: manip-il eval --policy.path={dagger.policy} --eval.films=3 --output_dir={self.folder}_eval")
+
+
+def _read_timings(path: Path) -> dict[str, float]:
+    """Chapter -> what it took [s]."""
+    timings = checks.read_json(path, f"the {TIMINGS_FILE} of a quickstart")
+    return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
 
 
 def _verdict(rows: Sequence[PolicyRow]) -> str:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from manip_il import checks
 from manip_il.data.atomic import write_file
-from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.statistics import CONFIDENCE, PairedComparison, Proportion, compare_paired
+from manip_il.mdp import LONGEST_EPISODE
 from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 FILE_NAME = "eval.json"
 _HZ, _STEPS = 20, 5  # of files that do not say them
+_MOST_CONDITIONS = 100  # of a suite
 WILSON = "Wilson's score interval"
 ANYTIME = "confidence sequence: holds whenever one stops"
 
@@ -52,16 +55,24 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """The inverse of `to_json`; `KeyError`, `TypeError` or `ValueError` where a value is amiss."""
+        """The inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
+        data = checks.mapping("an episode", data)
         known = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")
+        detail = {key: value for key, value in data.items() if key not in known}
+        if detail.get("steps_to_success") is not None:
+            checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
+        if "condition" in detail:
+            checks.text("condition", detail["condition"], checks.LONGEST_NAME)
+        if "drawn" in detail:
+            checks.mapping("drawn", detail["drawn"])
         return cls(
-            seed=_whole(data["seed"]),
-            success=_truth(data["success"]),
-            success_at_end=_truth(data.get("success_at_end", data["success"])),
-            steps=_whole(data["steps"]),
-            ret=float(data["return"]),
-            phase_at_end=str(data.get("phase_at_end", "")),
-            detail={key: value for key, value in data.items() if key not in known},
+            seed=checks.whole("seed", data["seed"], 0, checks.LARGEST_SEED),
+            success=checks.truth("success", data["success"]),
+            success_at_end=checks.truth("success_at_end", data.get("success_at_end", data["success"])),
+            steps=checks.whole("steps", data["steps"], 0, LONGEST_EPISODE),
+            ret=checks.number("return", data["return"]),
+            phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
+            detail=detail,
         )
 
 
@@ -118,16 +129,19 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """The inverse of `to_json`."""
-        named = [dict(one) for one in data.get("conditions", [NOMINAL.to_json()])]
+        """The inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
+        data = checks.mapping("settings", data)
+        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), _MOST_CONDITIONS)
+        named = [checks.mapping("a condition", one) for one in given]
+        ranges = [{key: value for key, value in one.items() if key != "name"} for one in named]
         return cls(
-            horizon=_whole(data["horizon"]),
-            tolerance=float(data["tolerance"]),
-            control_hz=_whole(data.get("control_hz", _HZ)),
-            success_steps=_whole(data.get("success_steps", _STEPS)),
-            suite=str(data.get("suite", NOMINAL.name)),
-            conditions=tuple(Condition.from_mapping(str(one.pop("name")), one) for one in named),
-            hold=None if data.get("hold") is None else _whole(data["hold"]),
+            horizon=checks.whole("horizon", data["horizon"], 1, LONGEST_EPISODE),
+            tolerance=checks.number("tolerance", data["tolerance"], 0, 1),
+            control_hz=checks.whole("control_hz", data.get("control_hz", _HZ), 1, 1_000),
+            success_steps=checks.whole("success_steps", data.get("success_steps", _STEPS), 1, LONGEST_EPISODE),
+            suite=checks.text("suite", data.get("suite", NOMINAL.name)),
+            conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
+            hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
         )
 
 
@@ -224,15 +238,15 @@ class EvalResult:
         """The inverse of `to_json`: rates and interval are worked out anew from the episodes."""
         width = data.get("until_width")
         return cls(
-            policy=str(data["policy"]),
-            robot=str(data["robot"]),
-            task=str(data["task"]),
-            fingerprint=dict(data["fingerprint"]),
-            episodes=tuple(EpisodeResult.from_json(episode) for episode in data["episodes"]),
+            policy=checks.text("policy", data["policy"]),
+            robot=checks.name("robot", data["robot"]),
+            task=checks.name("task", data["task"]),
+            fingerprint=checks.mapping("fingerprint", data["fingerprint"]),
+            episodes=tuple(EpisodeResult.from_json(one) for one in checks.array("episodes", data["episodes"])),
             settings=EvalSettings.from_json(data["settings"]),
-            confidence=float(data.get("confidence", CONFIDENCE)),
-            policy_sha256=str(data.get("policy_sha256", "")),
-            until_width=None if width is None else float(width),
+            confidence=checks.number("confidence", data.get("confidence", CONFIDENCE), 0.5, 0.9999),
+            policy_sha256=checks.text("policy_sha256", data.get("policy_sha256", "")),
+            until_width=None if width is None else checks.number("until_width", width, 0, 1),
         )
 
     def write(self, path: Path) -> None:
@@ -248,16 +262,19 @@ class EvalResult:
         `path` may be the folder that holds `eval.json`.
         """
         path = path / FILE_NAME if path.is_dir() else path
-        data = _read_object(path)
+        data = checks.read_json(path, f"an {FILE_NAME} of manip-il eval")
         try:
             result = cls.from_json(data)
         except KeyError as error:
             raise ManipError(f"{path}: key {error} is missing; expected an {FILE_NAME}") from error
-        except (TypeError, ValueError, AttributeError, UsageError) as error:
+        except MismatchError:
+            raise
+        except ManipError as error:
             raise ManipError(f"{path}: not an {FILE_NAME}: {error}") from error
         stated = data.get("n_episodes", len(result.episodes))
         if stated != len(result.episodes):
-            raise MismatchError(f"{path}: number of episodes", "n_episodes", stated, "episodes", len(result.episodes))
+            said = checks.shorten(stated)
+            raise MismatchError(f"{path}: number of episodes", "n_episodes", said, "episodes", len(result.episodes))
         return result
 
 
@@ -277,29 +294,3 @@ def compare_results(left: EvalResult, right: EvalResult, names: tuple[str, str] 
     if not shared:
         raise ManipError(f"{names[0]} and {names[1]} share no seed; evaluate both with the same --seed=")
     return compare_paired([ours[seed] for seed in shared], [theirs[seed] for seed in shared], names, left.confidence)
-
-
-def _read_object(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise ManipError(f"{path} does not exist; `manip-il eval` writes it") from error
-    except OSError as error:
-        raise ManipError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # broken JSON or broken UTF-8
-        raise ManipError(f"{path} is not whole JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise ManipError(f"{path} holds a {type(data).__name__}; expected the object of an {FILE_NAME}")
-    return data
-
-
-def _whole(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{value!r} is not a whole number")
-    return value
-
-
-def _truth(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise TypeError(f"{value!r} is neither true nor false")
-    return value

@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.evaluation.report_data import COSTS, Cost, CurvePoint, format_amount
 from manip_il.evaluation.statistics import Proportion
 
 END = "end"
+_MOST = 10**12  # labels, episodes: beyond it a number is a slip
 
 
 @dataclass(frozen=True)
@@ -62,28 +64,37 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
         raise ManipError(f"{name} has no finished round yet; go on with it by manip-il dagger --resume=true")
     rounds: list[Round] = []
     seconds = validating = 0.0
-    for number, record in enumerate(sorted(records, key=lambda one: one.get("round", -1))):
+    for number, record in enumerate(sorted(records, key=_number)):
+        if _number(record) != number:
+            raise ManipError(f"{name}: metrics.jsonl has no round {number}; expected one line a round")
         try:
-            if record["round"] != number:
-                raise ManipError(f"{name}: metrics.jsonl has no round {number}; expected one line a round")
-            times = record["seconds"]
-            seconds += float(times["collect"]) + float(times["fit"])
-            validating += float(times["validate"])
-            count = int(record["validation_episodes"])
+            times = checks.mapping("seconds", record["seconds"])
+            seconds += sum(checks.number(part, times[part], 0) for part in ("collect", "fit"))
+            validating += checks.number("validate", times["validate"], 0)
+            count = checks.whole("validation_episodes", record["validation_episodes"], 1, _MOST)
+            success = checks.number("validation_success", record["validation_success"], 0, 1)
             rounds.append(
                 Round(
                     round=number,
-                    labels=int(record["labels"]),
-                    queries=int(record.get("queries", record["labels"])),
-                    episodes=int(record["episodes"]),
+                    labels=checks.whole("labels", record["labels"], 0, _MOST),
+                    queries=checks.whole("queries", record.get("queries", record["labels"]), 0, _MOST),
+                    episodes=checks.whole("episodes", record["episodes"], 0, _MOST),
                     seconds=seconds,
                     validating=validating,
-                    validation=Proportion(round(float(record["validation_success"]) * count), count),
+                    validation=Proportion(round(success * count), count),
                 )
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ManipError(f"{name}: metrics.jsonl is not of manip-il dagger ({error!r}, round {number})") from error
+        except KeyError as error:
+            raise ManipError(f"{name}: metrics.jsonl is not of manip-il dagger (no {error}, round {number})") from error
+        except ManipError as error:
+            raise ManipError(f"{name}: metrics.jsonl is not of manip-il dagger (round {number}: {error})") from error
     return tuple(rounds)
+
+
+def _number(record: Mapping[str, Any]) -> int:
+    """Of the round that a line is about; -1 where it says none."""
+    number = record.get("round")
+    return number if isinstance(number, int) else -1
 
 
 def curve_points(rounds: History) -> tuple[CurvePoint, ...]:

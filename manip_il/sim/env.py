@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
-from manip_il.mdp import Observation, State
+from manip_il.mdp import LONGEST_EPISODE, Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.look import PLAIN, CameraConfig, Look
 from manip_il.sim.observe import environment_state, environment_state_names
@@ -38,6 +38,8 @@ class EnvConfig:
             raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
         if not 0 < self.tolerance < 1:
             raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
+        if self.horizon > LONGEST_EPISODE:
+            raise UsageError(f"horizon is {self.horizon}; expected at most {LONGEST_EPISODE} control steps")
         if self.success_steps < 1 or self.horizon < self.success_steps:
             raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
 

@@ -160,7 +160,7 @@ def sides(here: Path, policy: Path) -> None:
     [
         (["nowhere", "run"], 2, "nowhere does not exist; expected an eval.json, a policy, a run"),
         (["empty", "run"], 2, "empty holds nothing to compare"),
-        (["broken.json", "two"], 1, "broken.json is not whole JSON"),
+        (["broken.json", "two"], 1, "broken.json is not valid JSON"),
         (["run", "run"], 2, "compared with itself"),
         (["run"], 2, "RIGHT is missing"),
         (["fresh", "run"], 1, "fresh has no finished round yet"),

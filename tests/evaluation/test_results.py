@@ -101,9 +101,9 @@ def test_steps_to_success_counts_the_episodes_that_succeeded():
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        ("", "not whole JSON"),
-        ('{"success_rate": 0.5, "epis', "not whole JSON"),
-        ("[]", "holds a list"),
+        ("", "not valid JSON"),
+        ('{"success_rate": 0.5, "epis', "not valid JSON"),
+        ("[]", "expected an object"),
         ("{}", "is missing"),
     ],
 )
