@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-fast lint format docker docker-test bench lock clean
+.PHONY: help setup demo test test-fast fuzz lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
@@ -40,6 +40,10 @@ test: setup  ## every test
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow and not gl"
+
+FUZZ ?= 20000
+fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --inputs=$(FUZZ)
 
 lint: setup  ## style, types and who may import whom
 	$(BIN)/ruff check

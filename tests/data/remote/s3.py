@@ -44,6 +44,9 @@ def variables(endpoint: str) -> dict[str, str]:
     }
 
 
+Change = Callable[[int, dict[str, str], bytes], tuple[int, dict[str, str], bytes]]
+
+
 @dataclass
 class Fault:
     """What happens to requests that match, so many times.
@@ -73,6 +76,7 @@ class Proxy:
     requests: list[tuple[str, str, int]] = field(default_factory=list)
     url: str = ""
     before: Callable[[str, str], None] = lambda method, path: None
+    change: Change = lambda status, headers, data: (status, headers, data)  # what goes out in place of an answer
 
     def fault(self, method: str, path: str) -> Fault | None:
         return next((fault for fault in self.faults if fault.fits(method, path)), None)
@@ -126,8 +130,9 @@ def running_proxy(endpoint: str) -> Iterator[Proxy]:
                 data = answer.read()
             finally:
                 connection.close()
-            self.send_response(answer.status)
-            for name, value in answer.getheaders():
+            status, headers, data = proxy.change(answer.status, dict(answer.getheaders()), data)
+            self.send_response(status)
+            for name, value in headers.items():
                 if name.lower() not in _HOP:
                     self.send_header(name, value)
             length = answer.getheader("Content-Length") if self.command == "HEAD" else str(len(data))

@@ -1,0 +1,8 @@
+"""Every kind of input that is fuzzed."""
+
+from __future__ import annotations
+
+from . import datasets, files, policies, remotes
+from .target import Target
+
+TARGETS: tuple[Target, ...] = (*datasets.TARGETS, *policies.TARGETS, *files.TARGETS, *remotes.TARGETS)
