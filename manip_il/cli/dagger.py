@@ -226,10 +226,7 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
     return Report(
         title=f"{kind} on {config.env.robot} {config.env.task}",
-        verdict=(
-            f"{names[best.round]} is the best of {len(results)}: "
-            f"{best.validation.success} success on {best.validation.success.n:,} validation episodes."
-        ),
+        verdict=best_verdict(names, results),
         command=command_line("dagger", options),
         rows=tuple(rows),
         facts=tuple(facts),
@@ -237,6 +234,28 @@ def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundRes
         config=to_plain(options),
         fingerprint=best.validation.fingerprint,
         timings=round_timings(options.output_dir),
+    )
+
+
+def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
+    """Which round was taken, with its validation success, and whether it is shown to be better than round 0.
+
+    Where round 0 is the best itself, the last round takes its place. names: of the rounds.
+    """
+    from manip_il.dagger.loop import best_round
+    from manip_il.evaluation.results import compare_results
+
+    best = best_round(list(results))
+    found = f"{best.validation.success} success on {best.validation.success.n:,} validation episodes"
+    other = results[0] if best.round else results[-1]
+    if other is best:
+        return f"{names[best.round]}: {found}."
+    comparison = compare_results(other.validation, best.validation)
+    if comparison.significant and comparison.difference > 0:
+        return f"{names[best.round]} is the best of {len(results)}: {found}."
+    return (
+        f"{names[best.round]} is taken of {len(results)}, with {found}; "
+        f"no difference from {names[other.round]} is shown."
     )
 
 

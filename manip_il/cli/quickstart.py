@@ -195,6 +195,7 @@ class _Story:
     ) -> Report:
         from manip_il.cli.story import compare
         from manip_il.evaluation.report_data import CurvePoint, PolicyRow, Report
+        from manip_il.evaluation.results import compare_results
 
         _, cloned, more, dagger = contestants
         nominal, disturbed = measured["nominal"], measured["disturbed"]
@@ -204,7 +205,7 @@ class _Story:
         points = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
         return Report(
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
-            verdict=_verdict(rows),
+            verdict=told_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
             command=command_line("quickstart", self.options),
             rows=tuple(rows),
             facts=(
@@ -251,7 +252,8 @@ def _read_timings(path: Path) -> dict[str, float]:
     return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
 
 
-def _verdict(rows: Sequence[PolicyRow]) -> str:
+def told_verdict(rows: Sequence[PolicyRow], shown: bool) -> str:
+    """The first sentence of the report. shown: whether DAgger and cloning with as many labels are shown to differ."""
     from manip_il.evaluation.report_data import format_percent
 
     _, cloned, more, dagger = rows
@@ -259,4 +261,5 @@ def _verdict(rows: Sequence[PolicyRow]) -> str:
         f"DAgger solves {format_percent(dagger.success.rate)} of {dagger.success.n:,} unseen starts, "
         f"cloning {format_percent(more.success.rate)} with as many labels "
         f"and {format_percent(cloned.success.rate)} with the first demonstrations alone."
+        + ("" if shown else " So few starts show no difference between DAgger and cloning with as many labels.")
     )

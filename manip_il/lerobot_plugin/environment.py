@@ -16,6 +16,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from manip_il.child_processes import bound_to_this_process
+from manip_il.data.lerobot_log import shorten_ffmpeg_warning
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName
 from manip_il.learn.observation import OBSERVATIONS
@@ -151,3 +152,4 @@ def make_env(env_id: str, kwargs: dict[str, Any], *, film: bool) -> gymnasium.En
 
 
 register_envs()
+shorten_ffmpeg_warning()
