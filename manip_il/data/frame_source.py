@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.doctor.info import Feature, Info, read_info
-from manip_il.data.doctor.shards import UNREADABLE, find_shards, floats, integers
+from manip_il.data.doctor.shards import UNREADABLE, Shard, find_shards, floats, integers
 from manip_il.data.picture import open_picture
 from manip_il.data.video_read import VideoReader
 from manip_il.errors import ManipError, MismatchError, UnknownName
@@ -169,7 +169,7 @@ def _episodes(root: Path, info: Info, key: str) -> list[VideoPart]:
     """Every episode's frames, in order of the dataset."""
     names = [*_PLACES, *(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))]
     parts: list[VideoPart] = []
-    for shard in find_shards(root, layout.EPISODES_FILES):
+    for shard in _whole_shards(root, layout.EPISODES_FILES):
         try:
             for table in shard.tables(names):
                 length, row, chunk, file = (integers(table, name) for name in names[:4])
@@ -182,9 +182,16 @@ def _episodes(root: Path, info: Info, key: str) -> list[VideoPart]:
     return sorted((part for part in parts if part.count), key=lambda part: part.row)
 
 
+def _whole_shards(root: Path, pattern: str) -> Iterator[Shard]:
+    for shard in find_shards(root, pattern):
+        if shard.problem:
+            raise ManipError(f"cannot read {shard.path}: it {shard.problem}; {_SEE_DOCTOR}")
+        yield shard
+
+
 def _row_groups(root: Path, info: Info) -> Iterator[ParquetPart]:
     rows: list[NDArray[np.int64]] = []
-    for shard in find_shards(root, layout.DATA_FILES):
+    for shard in _whole_shards(root, layout.DATA_FILES):
         try:
             rows += [integers(table, layout.INDEX) for table in shard.tables([layout.INDEX])]
             groups = pq.read_metadata(shard.path).num_row_groups

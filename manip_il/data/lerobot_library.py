@@ -18,6 +18,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
 
 from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
+from manip_il.data.lerobot_read import check_dataset
 from manip_il.errors import ManipError, MismatchError
 
 Frame = dict[str, Any]  # column -> array of the feature's dtype and shape, or text; and `task`
@@ -66,6 +67,8 @@ def _save(dataset: LeRobotDataset) -> None:
 
 def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
     """LeRobot's own joining of datasets into `root`, which must not exist; every video stays a file of its own."""
+    for source in roots:
+        check_dataset(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
     with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
         aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
@@ -107,6 +110,7 @@ def _nature(meta: LeRobotDatasetMetadata) -> tuple[list[str], int, list[str]]:
 def _metadata(root: Path) -> Metadata:
     if not (root / INFO).is_file():  # LeRobot would ask the Hub for it
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {INFO}")
+    check_dataset(root)
     meta = Metadata(f"local/{root.name}", root=root)
     if meta.stats is None:
         raise ManipError(f"{root} has no statistics (meta/stats.json); `manip-il doctor` tells what is left")
@@ -128,6 +132,7 @@ def lerobot_windows(
     for pattern in (INFO, TASKS, EPISODES_FILES):  # what LeRobot would ask the Hub for
         if not any(root.glob(pattern)):
             raise ManipError(f"{root} is not a whole LeRobot dataset: no file matches {pattern}")
+    check_dataset(root)
     return _LocalDataset(
         repo_id,
         root=root,

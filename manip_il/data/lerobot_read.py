@@ -19,6 +19,7 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.doctor.info import LARGEST_META, info_problems
+from manip_il.data.parquet_limits import check_parquet
 from manip_il.data.video_read import DatasetPictures
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
@@ -58,6 +59,7 @@ def read_table(
         if name not in table_features:
             raise UnknownName(f"column in {root}", name, table_features)
     wanted = names if episodes is None else list(dict.fromkeys([*names, layout.EPISODE_INDEX]))
+    _check_files(root, _data_files(root), wanted)
     table = pa.concat_tables(_read_file(path, wanted) for path in _data_files(root))
     _check_rows(root, len(table))
     if episodes is not None:
@@ -195,9 +197,29 @@ def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:
         raise ManipError(f"{root / layout.OURS}: {error}") from error
 
 
+def check_dataset(root: Path) -> None:
+    """Raise `ManipError` where another program must not be let read a dataset: for what its description or files say.
+
+    Paths and names that lead out of its folder, and parquet files that unpack to more than real ones do.
+    """
+    _read_info(root)
+    for pattern in (layout.TASKS, layout.EPISODES_FILES, layout.DATA_FILES):
+        _check_files(root, sorted(root.glob(pattern)), None)
+
+
+def _check_files(root: Path, paths: list[Path], columns: list[str] | None) -> None:
+    try:
+        check_parquet(paths, columns)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        where = paths[0] if len(paths) == 1 else f"{root}/{paths[0].relative_to(root).parts[0]}"
+        raise ManipError(f"cannot read {where}: {error}; `manip-il doctor` tells what is left") from error
+
+
 def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
     names = [f"videos/{key}/{name}" for key in keys for name in layout.VIDEO_COLUMNS]
-    tables = [_read_file(path, ["length", *names]) for path in sorted(root.glob(layout.EPISODES_FILES))]
+    paths = sorted(root.glob(layout.EPISODES_FILES))
+    _check_files(root, paths, ["length", *names])
+    tables = [_read_file(path, ["length", *names]) for path in paths]
     if not tables:
         raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
     return DatasetPictures(root, int(_read_info(root)["fps"]), pa.concat_tables(tables).to_pydict())
@@ -265,9 +287,10 @@ def _data_files(root: Path) -> list[Path]:
 
 def _read_file(path: Path, columns: list[str]) -> pa.Table:
     try:
+        check_parquet([path], columns)
         # one thread: handing out pieces of one episode costs more than reading them
         table = pq.ParquetFile(path).read(columns, use_threads=False)
-    except (OSError, pa.ArrowException) as error:
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise ManipError(f"cannot read {path}: {error}; `manip-il doctor` tells what is left") from error
     for name in columns:
         if name not in table.column_names:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from manip_il.data import schema as s
 from manip_il.data.lerobot_read import dataset_info, read_table
 from manip_il.data.mcap_mapping import INDEX_COLUMNS, NUMBERS, TEXT, Camera, Mapping, Values
 from manip_il.data.mcap_path import parse_path
+from manip_il.data.parquet_limits import check_parquet
 from manip_il.errors import ManipError
 from manip_il.mdp import require_finite
 
@@ -80,7 +82,7 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
     for start, stop in itertools.pairwise([*starts, len(index)]):
         episode = int(index[start])
         rows = {key: values[start:stop] for key, values in table.items()}
-        lines = [tasks[int(task)] for task in task_index[start:stop]]
+        lines = [_task(source.root, tasks, int(task)) for task in task_index[start:stop]]
         frames = {key: pictures.read(key, episode, stop - start) for key in source.cameras}
         path = folder / f"episode_{episode:06d}.mcap"
         _write(path, source, episode, lines, rows, frames)
@@ -179,5 +181,15 @@ def _topic(key: str) -> str:
 
 
 def _tasks(root: Path) -> dict[int, str]:
-    table = pq.read_table(root / layout.TASKS, columns=["task_index", "task"]).to_pydict()
-    return dict(zip(table["task_index"], table["task"], strict=True))
+    try:
+        check_parquet([root / layout.TASKS])
+        table = pq.read_table(root / layout.TASKS, columns=[layout.TASK_INDEX, "task"]).to_pydict()
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise ManipError(f"cannot read {root / layout.TASKS}: {error}; `manip-il doctor` tells what is left") from error
+    return dict(zip(table[layout.TASK_INDEX], table["task"], strict=True))
+
+
+def _task(root: Path, tasks: dict[int, str], number: int) -> str:
+    if not isinstance(task := tasks.get(number), str):
+        raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
+    return task

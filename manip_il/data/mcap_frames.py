@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_read import read_frames
+from manip_il.data.parquet_limits import check_parquet
 from manip_il.data.picture import open_picture
 from manip_il.errors import ManipError
 
@@ -83,8 +84,9 @@ def _stored(root: Path, key: str) -> Iterator[U8]:
     """Every picture of an `image` column, in stored order."""
     for path in sorted(root.glob(layout.DATA_FILES)):
         try:
+            check_parquet([path], [key])
             for batch in pq.ParquetFile(path).iter_batches(_ROWS, columns=[key]):
                 for cell in batch.column(0).to_pylist():
                     yield decode_bytes(cell["bytes"] or b"")
-        except (OSError, pa.ArrowException, ManipError) as error:
+        except (OSError, ValueError, pa.ArrowException, ManipError) as error:
             raise ManipError(f"cannot read the pictures {key!r} in {path}: {error}") from error

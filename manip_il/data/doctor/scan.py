@@ -16,6 +16,7 @@ from manip_il.data.doctor.finding import Finding, error, plural, some
 from manip_il.data.doctor.info import INDEX_FEATURES, NUMBERS, Info
 from manip_il.data.doctor.moments import Moments
 from manip_il.data.doctor.shards import UNREADABLE, BadColumn, Shard, to_array
+from manip_il.data.parquet_limits import check_parquet
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
@@ -52,6 +53,11 @@ def scan(shards: Sequence[Shard], info: Info, quantiles: Mapping[str, F64], on_f
     numbers = info.of_dtype(*NUMBERS)
     result = Scan(moments={feature.key: Moments(feature.size, quantiles.get(feature.key)) for feature in numbers})
     runs: list[Runs] = []
+    try:
+        check_parquet((shard.path for shard in shards if not shard.problem), list(result.moments))
+    except UNREADABLE as problem:
+        result.findings.append(error("data", f"cannot be read: {problem}"))
+        return Scan(findings=result.findings)
     for shard in shards:
         if not shard.problem:
             runs += _scan_shard(shard, info, result)

@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il.data.parquet_limits import check_parquet
+
 MAGIC = b"PAR1"
 NO_FOOTER = "has no footer: its writer died before it closed the file, or the file was cut"
 _ROWS = 16_384  # held at once
@@ -77,6 +79,7 @@ def open_shard(name: str, path: Path) -> Shard:
             return Shard(name, path, "is no parquet file")
         if last != MAGIC or size < 12:
             return Shard(name, path, NO_FOOTER)
+        check_parquet([path])
         metadata = pq.read_metadata(path)
         return Shard(name, path, rows=metadata.num_rows, schema=metadata.schema.to_arrow_schema())
     except UNREADABLE as problem:

@@ -1,0 +1,237 @@
+"""What a parquet file may unpack to, found by its page headers before anything of it is decoded.
+
+A footer's sizes and counts are only claims, and a run of a billion equal numbers takes eight bytes. The pages' own
+headers are what pyarrow allocates and decodes by; they are read first (parquet-format, `PageHeader` in compact Thrift).
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from manip_il.data.thrift import LIST, STRUCT, Thrift
+
+MIB = 1024 * 1024
+LARGEST_FOOTER = 32 * MIB  # [bytes]; 10,000 row groups of 20 columns take about 30
+LARGEST_PAGE = 64 * MIB  # unpacked [bytes]; writers close a page at one, or behind a batch of long values
+_PAGE_RATIO = 4  # or so many times its packed size, where that is more: pictures, packed already
+LARGEST_FILE = 128 * MIB  # the values of the columns that are read [bytes]
+_FILE_RATIO = 100  # or so many times the files' size, where that is more: real ones reach about 20
+MOST_GROUPS = 100_000  # row groups of a file
+MOST_COLUMNS = 10_000  # of plain values
+
+_MAGIC = b"PAR1"
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}  # of a value [bytes]
+_OVERHEAD = 4  # of a value: its levels [bytes]
+_TEXT_OVERHEAD = 50  # of a text, as Python has it [bytes]
+_CODECS = {1: "snappy", 2: "gzip", 4: "brotli", 6: "zstd", 7: "lz4_raw"}
+_ROW_GROUPS, _COLUMNS, _META_DATA = 4, 1, 3  # fields of the footer, a row group, a column
+_CHUNK_FIELDS = (4, 5, 7, 9, 11)  # of its meta data: codec, values, packed size, first page of data, of a dictionary
+_DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3  # types of pages; 1 is an index
+_OWN_HEADER = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}  # the field of a page's header that says the rest
+_BY_DICTIONARY = (2, 8)  # encodings
+_DELTA_BYTES = 7  # each text repeats so much of the one before: no size of a page says how long they are
+_ENCODINGS = (0, *_BY_DICTIONARY, 3, 4, 5, 6, 9)
+_HEADS = (256, 16_384, MIB)  # bytes that a page header is looked for in: with long statistics it is long
+
+
+@dataclass(frozen=True)
+class _Page:
+    kind: int
+    start: int  # of its data in the file
+    packed: int  # [bytes]
+    unpacked: int  # [bytes]
+    values: int
+    encoding: int
+
+
+def check_parquet(paths: Iterable[Path], columns: Sequence[str] | None = None, least: int = LARGEST_FILE) -> None:
+    """Raise `ValueError` where columns (all by default) unpack to more than `least` and 100 times the files' size.
+
+    Also for a page that does, and for what is no parquet file; `OSError` and pyarrow's errors for an unreadable one.
+    """
+    size = taken = 0
+    names = None if columns is None else tuple(columns)
+    for path in paths:
+        there = path.stat()
+        size += there.st_size
+        taken += _unpacked_size(path, names, (there.st_ino, there.st_size, there.st_mtime_ns))
+        if taken > max(least, _FILE_RATIO * size):
+            raise ValueError(f"its columns unpack to {taken:,} bytes or more from {size:,}; no dataset's do")
+
+
+@lru_cache(1_000)
+def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[int, ...]) -> int:
+    """The most that the columns' values take, unpacked [bytes]. version: of the file, so that it is read once."""
+    with path.open("rb") as stream:
+        if stream.seek(0, 2) < 12:
+            raise ValueError("it is no parquet file")
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            footer = _footer(data)
+            schema = pq.read_metadata(stream).schema  # which looks at no column's place or size
+            leaves = [_Leaf.of(schema.column(i)) for i in range(len(schema.names))]
+            if len(leaves) > MOST_COLUMNS:
+                raise ValueError(f"it has {len(leaves):,} columns; expected at most {MOST_COLUMNS:,}")
+            try:
+                return sum(
+                    _column_size(data, chunk, leaves[number])
+                    for number, chunk in _chunks(footer, len(leaves))
+                    if _is_in(leaves[number].path, columns)
+                )
+            except IndexError as error:
+                raise ValueError("its footer is damaged") from error
+
+
+@dataclass(frozen=True)
+class _Leaf:
+    """A column of plain values. width: of a value [bytes]; None for texts."""
+
+    path: str
+    width: int | None
+
+    @classmethod
+    def of(cls, column: Any) -> _Leaf:
+        kind = column.physical_type
+        return cls(column.path, column.length if kind == "FIXED_LEN_BYTE_ARRAY" else _WIDTHS.get(kind))
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """One column of a row group, as the footer has it."""
+
+    codec: int
+    values: int
+    start: int
+    size: int  # packed [bytes]
+
+
+def _footer(data: mmap.mmap) -> bytes:
+    size = int.from_bytes(data[-8:-4], "little")
+    if data[-4:] != _MAGIC or size > len(data) - 12:
+        raise ValueError("it is no parquet file")
+    if size > LARGEST_FOOTER:
+        raise ValueError(f"its footer has {size:,} bytes; expected at most {LARGEST_FOOTER:,}")
+    return data[len(data) - 8 - size : len(data) - 8]
+
+
+def _chunks(footer: bytes, columns: int) -> Iterator[tuple[int, _Chunk]]:
+    """The columns of all row groups, each with its number in the schema."""
+    groups, reader = 0, Thrift(footer)
+    for number, kind in reader.fields():
+        if (number, kind) != (_ROW_GROUPS, LIST):
+            reader.skip(kind)
+            continue
+        for _ in reader.elements():
+            groups += 1
+            if groups > MOST_GROUPS:
+                raise ValueError(f"it has more than {MOST_GROUPS:,} row groups")
+            yield from _group_chunks(reader, columns)
+
+
+def _group_chunks(reader: Thrift, columns: int) -> Iterator[tuple[int, _Chunk]]:
+    for number, kind in reader.fields():
+        if (number, kind) != (_COLUMNS, LIST):
+            reader.skip(kind)
+            continue
+        for column, _ in enumerate(reader.elements()):
+            if column >= columns:
+                raise ValueError("a row group has more columns than the schema")
+            yield column, _chunk(reader)
+
+
+def _chunk(reader: Thrift) -> _Chunk:
+    said: dict[int, int] = {}
+    for number, kind in reader.fields():
+        if (number, kind) == (_META_DATA, STRUCT):
+            said = reader.integers(*_CHUNK_FIELDS)
+        else:
+            reader.skip(kind)
+    codec, values, size, start, dictionary = (said.get(field, 0) for field in _CHUNK_FIELDS)
+    return _Chunk(codec, values, dictionary if 0 < dictionary < start else start, size)
+
+
+def _is_in(leaf: str, columns: Sequence[str] | None) -> bool:
+    return columns is None or any(leaf == column or leaf.startswith(f"{column}.") for column in columns)
+
+
+def _column_size(data: mmap.mmap, chunk: _Chunk, leaf: _Leaf) -> int:
+    """The most that one column of a row group takes [bytes]."""
+    size = longest = 0
+    for page in _pages(data, chunk):
+        size += page.values * (_OVERHEAD if leaf.width is not None else _TEXT_OVERHEAD)
+        if page.kind == _DICTIONARY:
+            size += page.unpacked
+            longest = page.unpacked if leaf.width is not None else _longest(data, page, chunk.codec)
+        elif leaf.width is not None:
+            size += page.values * leaf.width
+        else:
+            size += page.values * longest if page.encoding in _BY_DICTIONARY else page.unpacked
+    return size
+
+
+def _pages(data: mmap.mmap, chunk: _Chunk) -> Iterator[_Page]:
+    """The pages that pyarrow would read. Raises `ValueError` for one that is not what it may be."""
+    at, stop, seen = chunk.start, chunk.start + chunk.size, 0
+    if not 0 < at <= stop <= len(data):
+        raise ValueError("a column lies outside the file")
+    while seen < chunk.values and at < stop:
+        page = _page(data, at, stop)
+        _check_page(page, stop)
+        seen += page.values if page.kind != _DICTIONARY else 0
+        at = page.start + page.packed
+        yield page
+
+
+def _check_page(page: _Page, stop: int) -> None:
+    if min(page.packed, page.unpacked, page.values) < 0 or page.start + page.packed > stop:
+        raise ValueError("a page's header is damaged")
+    most = max(LARGEST_PAGE, _PAGE_RATIO * page.packed)
+    if page.unpacked > most:
+        raise ValueError(f"a page of {page.packed:,} bytes unpacks to {page.unpacked:,}; expected at most {most:,}")
+    if page.encoding not in _ENCODINGS and page.kind in (_DATA, _DATA_V2):
+        name = "DELTA_BYTE_ARRAY" if page.encoding == _DELTA_BYTES else f"number {page.encoding}"
+        raise ValueError(f"a page has the encoding {name}, by which its size cannot be told; write it with another")
+
+
+def _page(data: mmap.mmap, at: int, stop: int) -> _Page:
+    for window in _HEADS:
+        reader = Thrift(data[at : min(at + window, stop)])
+        sizes, said = [-1, -1, -1], dict[int, int]()  # sizes: its type, unpacked and packed
+        try:
+            for number, kind in reader.fields():
+                if 1 <= number <= len(sizes):
+                    sizes[number - 1] = reader.integer(kind)
+                elif number == _OWN_HEADER.get(sizes[0]) and kind == STRUCT:
+                    said = reader.integers(1, 2, 4)
+                else:
+                    reader.skip(kind)
+        except IndexError:
+            continue
+        kind, unpacked, packed = sizes
+        encoding = said.get(4 if kind == _DATA_V2 else 2, 0)
+        values = said.get(1, -1) if kind in _OWN_HEADER else 0
+        return _Page(kind, at + reader.at, packed, unpacked, values, encoding)
+    raise ValueError("a page's header is damaged")
+
+
+def _longest(data: mmap.mmap, page: _Page, codec: int) -> int:
+    """The longest text in a dictionary [bytes]: what every value may be."""
+    packed = data[page.start : page.start + page.packed]
+    if codec:
+        if codec not in _CODECS:
+            return page.unpacked
+        packed = pa.Codec(_CODECS[codec]).decompress(packed, page.unpacked, asbytes=True)
+    at = longest = 0
+    for _ in range(page.values):
+        if at + 4 > len(packed):
+            break  # pyarrow refuses it
+        length = int.from_bytes(packed[at : at + 4], "little")
+        longest, at = max(longest, length), at + 4 + length
+    return min(longest, page.unpacked)
