@@ -19,6 +19,7 @@ from manip_il.cli.groups import (
     find_policy,
     option,
     save_options,
+    trust_option,
 )
 from manip_il.cli.paths import require_new, require_workers
 from manip_il.cli.policy_check import check_policy
@@ -53,6 +54,7 @@ class CertifyOptions:
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
+    trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/certificate"), metadata={"help": "folder of certificate.json"})
     overwrite: bool = option(False, "replace a certificate that is there")
 
@@ -99,7 +101,7 @@ class CertifyOptions:
         robot = self.robot.type or (meta.robot if meta else DEFAULT_ROBOT)
         task = self.task.type or (meta.task if meta else DEFAULT_TASK)
         env = self.env.config(robot, task, meta.fps if meta else DEFAULT_HZ)
-        check_policy(path, meta, env, draw=self.engine == "local")
+        check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
         return env, path
 
     def _certify(self, engine: Engine, env: EnvConfig, policy: Path | None) -> Certificate:
@@ -107,4 +109,5 @@ class CertifyOptions:
 
         count = count_episodes(env, self.cases, policy)
         with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
-            return certify(engine, env, self.cases, self.seed, policy, lambda _: bar.advance())
+            advance = bar.advance
+            return certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)

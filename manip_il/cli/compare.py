@@ -20,6 +20,7 @@ from manip_il.cli.groups import (
     command_line,
     option,
     save_options,
+    trust_option,
     warn,
 )
 from manip_il.cli.measure import TEST_EPISODES, Trial, check_policies, measured, rule_json
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
 
 REPORT_FILE = "report.html"
-FREE = ("workers", "engine", "output_dir")
+FREE = ("workers", "engine", "output_dir", "trust")
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes or seconds (up to what every run reached; seconds of "
     "collecting and fitting), or an amount, as in labels:5000"
@@ -73,6 +74,7 @@ class CompareOptions:
     seed: int = option(0, "shifts the stream of test seeds, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
+    trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/compare"), metadata={"help": "folder of compare.json"})
     resume: bool = option(False, "go on with a comparison that was stopped")
     overwrite: bool = option(False, "replace a comparison that is there")
@@ -126,7 +128,7 @@ class CompareOptions:
         env = common_env(sources, self.env, self.robot.type, self.task.type)
         policies = {source.name: source.chosen(rule, limit)[0] for source in sources if source.result is None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
-        trial = Trial.of(env, seeds, self.suite, policies.values())
+        trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
         for source in results:
             trial.check_result(source.name, _result(source))
         check_policies(trial, policies, self.output_dir, self.engine)
@@ -196,7 +198,7 @@ class CompareOptions:
         for known in options_of(type(self)):
             value = functools.reduce(getattr, known.name.split("."), self)
             if known.name not in places and value != known.default:
-                words.append(f"--{known.name}={value}")
+                words.append(f"--{known.name}={str(value).lower() if isinstance(value, bool) else value}")
         return shlex.join(words)
 
 

@@ -22,6 +22,8 @@ from manip_il.cli.groups import (
     option,
     policy_help,
     save_options,
+    start_policy,
+    trust_option,
 )
 from manip_il.cli.options import Open, to_plain
 from manip_il.cli.paths import require_output, require_workers
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
 METHOD_NAMES = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}
-FREE = ("workers", "engine", "output_dir")
+FREE = ("workers", "engine", "output_dir", "trust")
 
 
 @dataclass
@@ -102,6 +104,7 @@ class DaggerOptions:
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
+    trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/dagger"), metadata={"help": "folder of the run"})
     resume: bool = option(False, "go on with a run that was stopped")
     overwrite: bool = option(False, "replace a run that is there")
@@ -168,8 +171,8 @@ class DaggerOptions:
         return config
 
     def _fit(self) -> FitConfig:
-        own = ("policy", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler")
-        return FitConfig(**{name: getattr(self, name) for name in own})
+        own = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        return FitConfig(policy=start_policy(self.policy), **{name: getattr(self, name) for name in own})
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:

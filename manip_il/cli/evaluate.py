@@ -23,6 +23,7 @@ from manip_il.cli.groups import (
     find_policy,
     option,
     save_options,
+    trust_option,
 )
 from manip_il.cli.kept_episodes import KeptEpisodes
 from manip_il.cli.options import to_plain
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 REPORT_FILE = "report.html"
 EPISODES, MOST_EPISODES = 100, 10_000
-FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size")
+FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust")
 
 
 @dataclass
@@ -83,6 +84,7 @@ class EvalOptions:
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
+    trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
     resume: bool = option(False, "go on with an evaluation that was stopped, or with more episodes")
     overwrite: bool = option(False, "replace an evaluation that is there")
@@ -157,12 +159,12 @@ class EvalOptions:
             driver = "policy"
             meta = read_meta(path)
             env = self._env(meta)
-            cameras = check_policy(path, meta, env, draw=self.engine == "local")
+            cameras = check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:
                 say(looks(cameras, path))
         conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
         job = RolloutJob(env, driver or "random", policy=path, labels="last", conditions=conditions)
-        return replace(job, hold=self.eval.hold, batch=self.eval.batch_size)
+        return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
         """Before anything large is loaded; on a cluster memory is its own affair."""

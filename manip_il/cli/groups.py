@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.folders import atomic_write
-from manip_il.cli.options import dump_yaml, from_yaml, options_of, to_plain
+from manip_il.cli.options import Open, dump_yaml, from_yaml, options_of, to_plain
 from manip_il.cli.paths import hub_hint
 from manip_il.errors import MismatchError, UnknownName, UsageError
 
@@ -26,12 +26,22 @@ POLICY_TYPES = ("mlp",)
 DEFAULT_ROBOT, DEFAULT_TASK, DEFAULT_HZ = "panda", "pick_place", 20
 ENGINE_HELP = "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one of its own here)"
 WORKERS_HELP = "processes, or tasks at once on Ray; by default one a core"
-WHERE_POLICIES_LIE = (".", "pretrained_model", "checkpoints/last/pretrained_model", "best/pretrained_model")
+WHERE_POLICIES_LIE = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
+NEWEST_LIES = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
+TRUST_HELP = (
+    "load models, and run code, that a checkpoint names (smolvla, pi0, groot, ...): only for sources that you trust; "
+    "no file may set it"
+)
 
 
 def option(default: Any, text: str) -> Any:
     """A field with one line of help."""
     return field(default=default, metadata={"help": text})
+
+
+def trust_option() -> Any:
+    """`--trust`: a field that only the command line may set."""
+    return field(default=False, metadata={"help": TRUST_HELP, "command_line_only": True})
 
 
 @dataclass
@@ -190,13 +200,29 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
 
 
 def find_policy(path: Path) -> Path:
-    """The `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run."""
+    """The `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run.
+
+    Of a run it is the best policy, else the newest checkpoint.
+    """
     for place in WHERE_POLICIES_LIE:
         if (path / place / "config.json").is_file():
             return path / place
+    for place in NEWEST_LIES:
+        if found := sorted(path.glob(f"{place}/config.json")):
+            return found[-1].parent
     raise UsageError(
         f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
     )
+
+
+def start_policy(settings: Open) -> Open:
+    """`--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means (`find_policy`)."""
+    if "path" not in settings:
+        return settings
+    path = settings["path"]
+    if not isinstance(path, str) or not path:
+        raise UsageError(f"--policy.path is {path!r}; expected a checkpoint or a run")
+    return {**settings, "path": str(find_policy(Path(path).expanduser()))}
 
 
 def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:

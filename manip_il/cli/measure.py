@@ -29,27 +29,32 @@ TEST_EPISODES = 500
 
 @dataclass(frozen=True)
 class Trial:
-    """In which environment, on which seeds and under which conditions policies are measured."""
+    """In which environment, on which seeds and under which conditions policies are measured.
+
+    trust: whether models that their checkpoints name may be loaded.
+    """
 
     env: EnvConfig
     seeds: range
     suite: str = "nominal"
     conditions: tuple[Condition, ...] = ()
+    trust: bool = False
 
     @classmethod
-    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path]) -> Trial:
+    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path], trust: bool = False) -> Trial:
         """Under a suite's conditions: those of cameras are left out where none of the policies looks at one."""
         from manip_il.engine.sight import policy_cameras
 
         sees = any(policy_cameras(policy) is not None for policy in policies)
-        return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees))
+        return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees), trust)
 
     def job(self, policy: Path) -> RolloutJob:
         """The rollouts of one policy."""
         from manip_il.engine.jobs import RolloutJob
         from manip_il.evaluation.runner import HOLD
 
-        return RolloutJob(self.env, "policy", policy=policy, hold=HOLD, labels="last", conditions=self.conditions)
+        job = RolloutJob(self.env, "policy", policy=policy, hold=HOLD, labels="last", conditions=self.conditions)
+        return replace(job, trust=self.trust)
 
     def file(self, folder: Path, policy: Path) -> Path:
         """Where the evaluation of `policy` lies: named after its files, the environment and the episodes.
@@ -87,7 +92,7 @@ def check_policies(trial: Trial, policies: dict[str, Path], folder: Path, engine
             meta = read_meta(policy)
             if meta is not None and meta.task != trial.env.task:
                 raise MismatchError("task", name, meta.task, "the comparison", trial.env.task)
-            check_policy(policy, meta, trial.env, draw=engine == "local")
+            check_policy(policy, meta, trial.env, draw=engine == "local", trust=trial.trust)
 
 
 def measure(

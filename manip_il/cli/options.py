@@ -66,7 +66,8 @@ class _Given:
 def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     """Every option of a dataclass, depth first, in the order of definition.
 
-    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il doctor DATASET`).
+    field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il doctor DATASET`);
+    `command_line_only=True` for what no file may say, and none that is written does.
     """
     found: list[Option] = []
     for field, field_type in _fields(cls):
@@ -121,7 +122,8 @@ def dump_yaml(options: Any) -> str:
 def to_plain(value: Any) -> Any:
     """Options as dicts, lists, text, numbers, booleans and None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value) if f.init}
+        fields = [f for f in dataclasses.fields(value) if f.init and not f.metadata.get("command_line_only")]
+        return {f.name: to_plain(getattr(value, f.name)) for f in fields}
     if isinstance(value, dict):
         return {key: to_plain(item) for key, item in value.items()}
     if isinstance(value, Enum):
@@ -240,6 +242,8 @@ def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefi
             before = {} if default is MISSING else default
             arguments[field.name] = before | _inside(name, given)
         elif name in given:
+            if field.metadata.get("command_line_only") and not given[name].is_word:
+                raise UsageError(f"{given[name].where}: only the command line may say this; give --{name}=...")
             arguments[field.name] = _decode_given(field_type, given[name])
         elif default is MISSING:
             label = name.upper() if field.metadata.get("positional") else f"--{name}"

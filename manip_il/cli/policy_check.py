@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from manip_il.sim.look import CameraConfig
 
 
-def check_policy(path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True) -> CameraConfig | None:
+def check_policy(
+    path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
+) -> CameraConfig | None:
     """The cameras that the policy looks at, None for none; warns where it was trained on something else than `env`.
 
-    draw: make its first pictures here, to see that they can be made. Raises `MismatchError` unless the policy can drive
-    `env`, `RenderError` where there is no OpenGL for its pictures, and what `LearnedPolicy.load` raises.
+    draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
+    `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
+    `LearnedPolicy.load` raises.
     """
     from manip_il.engine.describe import env_spec
     from manip_il.engine.sight import policy_cameras
@@ -33,7 +36,7 @@ def check_policy(path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, dra
         check_fits(meta, spec)
     check_interface(read_interface(path), spec)
     warn(_differences(path, meta, env, cameras))
-    policy = LearnedPolicy.load(path, task=spec.instruction)
+    policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
     # One action now says what else would not fit before a worker does.
     seen = _first_sight(env, cameras, draw)
     images = {camera: picture[None] for camera, picture in seen.images.items()}
@@ -48,11 +51,12 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
         return [*lines, f"nor in what light its pictures were made: {cameras.look} is assumed"] if cameras else lines
-    lines = [f"task differs: {path} has {meta.task}, the environment has {env.task}"] if meta.task != env.task else []
+    if meta.task != env.task:  # and with it the model and all that is hashed of it
+        return [f"task differs: {path} has {meta.task}, the environment has {env.task}"]
     theirs = dict(meta.fingerprint)
     if cameras is None:
         theirs.pop("cameras_sha256", None)  # it sees none
-    return lines + compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
+    return compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
 
 
 def _first_sight(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:

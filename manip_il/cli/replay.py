@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.folders import atomic_write
-from manip_il.cli.groups import find_policy, warn
+from manip_il.cli.groups import find_policy, trust_option, warn
 from manip_il.cli.paths import require_eval
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, MismatchError, UsageError
@@ -38,6 +38,7 @@ class ReplayOptions:
     episode: int = field(metadata={"help": "which of its episodes, the first one is 0"})
     video: Path | None = field(default=None, metadata={"help": "an MP4 to write"})
     policy: PlaceGroup = field(default_factory=PlaceGroup)
+    trust: bool = trust_option()
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
@@ -89,10 +90,11 @@ class ReplayOptions:
             job = RolloutJob(env, result.policy, hold=hold, labels="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
         else:
             path = self._find(result)
-            cameras = check_policy(path, read_meta(path), env)
+            cameras = check_policy(path, read_meta(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn([f"{path} is not the policy of {self.file}: its files differ"])
             job = RolloutJob(env, "policy", policy=path, hold=hold, labels="last", conditions=conditions)
+            job = replace(job, trust=self.trust)
         here = env_fingerprint(env, cameras)
         warn(compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
         return job

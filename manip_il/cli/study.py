@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli.dagger import REPORT_FILE
 from manip_il.cli.folders import atomic_write, prepare_output
-from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, check_same_options, option, save_options
+from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, check_same_options, option, save_options, trust_option
 from manip_il.cli.measure import Trial, check_policies, measured, rule_json
 from manip_il.cli.options import to_plain
 from manip_il.cli.paths import require_output, require_workers
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from manip_il.cli.dagger import DaggerOptions
     from manip_il.evaluation.study_report import StudyReport
 
-FREE = ("workers", "engine", "output_dir", "file", "training_seeds")  # what the file says is compared by itself
+# What the file says is compared by itself.
+FREE = ("workers", "engine", "output_dir", "file", "training_seeds", "trust")
 
 
 @dataclass
@@ -41,6 +42,7 @@ class StudyOptions:
     training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
+    trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/study"), metadata={"help": "folder of the study"})
     resume: bool = option(False, "go on with a study that was stopped")
     overwrite: bool = option(False, "replace a study that is there")
@@ -56,7 +58,7 @@ class StudyOptions:
 
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""
-        plan = read_plan(self.file, self.training_seeds)
+        plan = read_plan(self.file, self.training_seeds, self.trust)
         from manip_il.data.atomic import exclusive
 
         with exclusive(self.output_dir):
@@ -105,7 +107,7 @@ class StudyOptions:
         limit = limit_of(plan.rule, everything)
         policies = {source.name: source.chosen(plan.rule, limit)[0] for source in everything}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values())
+        trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values(), self.trust)
         check_policies(trial, policies, self.output_dir, self.engine)
         kept = f"every finished run and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
@@ -129,6 +131,8 @@ class StudyOptions:
         words = ["manip-il", "study", str(self.file), f"--output_dir={self.output_dir}"]
         if self.training_seeds is not None:
             words.append(f"--training_seeds={self.training_seeds}")
+        if self.trust:
+            words.append("--trust=true")
         return StudyReport(
             title=f"Study: {result.robot} {result.task}, {self.file.stem}",
             command=shlex.join(words),

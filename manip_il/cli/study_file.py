@@ -59,13 +59,16 @@ class Plan:
     env: EnvConfig
 
 
-def read_plan(path: Path, training_seeds: int | None) -> Plan:
-    """The study in `path`; training_seeds: in place of the file's. `UsageError` in one line for what is not sound."""
+def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
+    """The study in `path`; training_seeds: in place of the file's; trust: what the file may not say of its runs.
+
+    Raises `UsageError` in one line for what is not sound.
+    """
     file = from_yaml(path, StudyFile)
     if training_seeds is not None:
         file = replace(file, training_seeds=training_seeds)
     _check_numbers(path, file)
-    arms = {name: _arm(path, file, name) for name in file.arms}
+    arms = {name: replace(_arm(path, file, name), trust=trust) for name in file.arms}
     envs = {name: _checked(path, name, options) for name, options in arms.items()}
     first = next(iter(envs))
     for name, env in envs.items():

@@ -10,7 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import check_dataset, check_same_options, find_policy, option, policy_help, save_options
+from manip_il.cli.groups import (
+    check_dataset,
+    check_same_options,
+    option,
+    policy_help,
+    save_options,
+    start_policy,
+    trust_option,
+)
 from manip_il.cli.options import Open
 from manip_il.cli.paths import require_dataset, require_output
 from manip_il.cli.progress import progress, say, set_quiet
@@ -23,7 +31,10 @@ if TYPE_CHECKING:
     from manip_il.learn.train import TrainConfig
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
-_FREE = ("threads", "log_freq", "save_freq", "dataset.root", "output_dir", "num_workers", "tensorboard", "wandb")
+_FREE = (
+    *("threads", "log_freq", "save_freq", "num_workers"),
+    *("dataset.root", "output_dir", "tensorboard", "wandb", "trust"),
+)
 
 
 @dataclass
@@ -66,6 +77,7 @@ class TrainOptions:
     log_freq: int = option(200, "steps between metrics")
     tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
     wandb: Open = field(default_factory=dict, metadata={"help": "Weights & Biases: enable, project, mode, ..."})
+    trust: bool = trust_option()
     resume: bool = option(False, "go on from the last checkpoint")
     overwrite: bool = option(False, "replace a run that is there")
 
@@ -73,8 +85,6 @@ class TrainOptions:
         """Refuse what paths and values show to be wrong."""
         self._fit_config()
         require_dataset(self.dataset.root)
-        if "path" in self.policy:
-            find_policy(Path(str(self.policy["path"])).expanduser())
         if _is_first_process():
             require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
 
@@ -108,6 +118,7 @@ class TrainOptions:
         from manip_il.seeding import stream_base
 
         same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name != "eval_split"}
+        same["policy"] = start_policy(self.policy)
         return FitConfig(**same, eval_split=self.dataset.eval_split), stream_base("training", self.seed)
 
     def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
@@ -143,6 +154,7 @@ class TrainOptions:
             fingerprint=fingerprint,
             on_log=stages.log,
             resume=self.resume,
+            repo_id=f"local/{self.dataset.root.name}",
         )
 
     def _fit_policy(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:

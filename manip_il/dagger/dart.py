@@ -15,16 +15,17 @@ F64 = NDArray[np.float64]
 EPISODE = "episode_index"
 
 
-def fitted_noise(policy: Path, root: Path) -> tuple[tuple[float, ...], ...]:
+def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tuple[float, ...], ...]:
     """The covariance (n, n) of learner minus expert over a dataset of the expert's, for the next round's noise.
 
     Maximum likelihood for a Gaussian with mean zero, as the paper fits it. Best on data that the policy has not
-    learnt from, or its errors are taken for smaller than they are. Raises `ManipError` without a sound label.
+    learnt from, or its errors are taken for smaller than they are. trust: see `LearnedPolicy.load`. Raises `ManipError`
+    without a sound label.
     """
     from manip_il.learn.policy import LearnedPolicy
 
     table = read_table(root, (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE))
-    learner = LearnedPolicy.load(policy)
+    learner = LearnedPolicy.load(policy, trust=trust)
     errors: list[F64] = []
     for rows in _side_by_side(table[EPISODE].reshape(-1)):  # a policy with a memory is asked in the order of time
         actions = learner.act(table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, table[EPISODE][rows].tolist())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +161,7 @@ def _validate(config: DaggerConfig, here: Path, engine: Engine, watch: Watch, po
     if path.is_file():
         return EvalResult.read(path)
     job = RolloutJob(config.env, "policy", policy=policy, labels="last", hold=config.hold)  # solved is solved
+    job = replace(job, trust=config.fit.trust)
     seeds = stream_seeds("validation", config.validation_episodes, config.seed)
     result = evaluate(engine, job, seeds, f"DAgger round {round_}", watch.on_episode)
     result.write(path)

@@ -106,7 +106,7 @@ def _round_job(config: DaggerConfig, folder: Path, engine: Engine, round_: int, 
     common = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
     if config.method == "dart":
         held_out = _held_out(config, folder, engine)
-        return replace(common, driver="noisy_expert", noise=fitted_noise(policy, held_out))
+        return replace(common, driver="noisy_expert", noise=fitted_noise(policy, held_out, trust=config.fit.trust))
     beta = BetaSchedule.parse(config.beta).at(round_)
     return replace(
         common,
@@ -117,6 +117,7 @@ def _round_job(config: DaggerConfig, folder: Path, engine: Engine, round_: int, 
         labels=config.label,
         ask=resolved_ask(config),
         branch_steps=branch_steps(config),
+        trust=config.fit.trust,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any
 
 from huggingface_hub import EvalResult, ModelCardData
 
+from manip_il import checks
 from manip_il.data.card_text import LICENSE, REPOSITORY, command, fingerprint_rows, repository, table
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_read import dataset_info
@@ -54,8 +54,19 @@ class Policy:
 
 
 def policy_card(root: Path, url: str) -> str:
-    """`README.md`. Raises `ManipError` for a folder without a policy."""
-    policy, place = read_policy(root), repository(url)
+    """`README.md`. Raises `ManipError` for a folder without a policy, or whose files say what no policy's do."""
+    policy = read_policy(root)
+    try:
+        return _card(root, policy, url)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ManipError(
+            f"{root}: its card cannot be written, as a JSON file beside the policy holds odd values "
+            f"({type(error).__name__}: {checks.shorten(str(error))}); restore the file"
+        ) from error
+
+
+def _card(root: Path, policy: Policy, url: str) -> str:
+    place = repository(url)
     robot, task = policy.robot_task
     title = f"{policy.type} for {robot} {task}" if robot else policy.type
     made = command(root / "config.yaml")
@@ -219,7 +230,6 @@ def _is_evaluation(one: Mapping[str, Any]) -> bool:
 def _read(path: Path) -> dict[str, Any]:
     """The object in a JSON file; empty where there is none."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return checks.read_json(path, "a JSON file beside a policy")
+    except ManipError:
         return {}
-    return data if isinstance(data, dict) else {}

@@ -73,6 +73,6 @@ def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> Gate:
 def _load(job: RolloutJob, path: Path, env: ManipEnv) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
-    policy = LearnedPolicy.load(path, task=env.task_description)
+    policy = LearnedPolicy.load(path, task=env.task_description, trust=job.trust)
     check_interface(policy.interface, env_spec(job.env, drawn_cameras(job)))
     return policy

@@ -46,7 +46,8 @@ class RolloutJob:
     perturbation: what happens once, in place of a disturbance. conditions: what an evaluation's episodes meet, in turn
     by their seeds, in place of both.
 
-    batch: episodes that share one call of the policy, at most; it changes no outcome.
+    batch: episodes that share one call of the policy, at most; it changes no outcome. trust: whether models that the
+    policies' checkpoints name may be loaded.
 
     cameras: what is pictured in every step and kept; None for nothing. A policy that looks at cameras is shown them
     all the same.
@@ -68,6 +69,7 @@ class RolloutJob:
     batch: int = LOCKSTEP
     round: int = 0
     cameras: CameraConfig | None = None
+    trust: bool = False
 
     def __post_init__(self) -> None:
         if self.driver in ("policy", "mixture") and self.policy is None:

@@ -49,12 +49,14 @@ def certify(
     seed: int = 0,
     policy: Path | None = None,
     on_episode: Progress | None = None,
+    *,
+    trust: bool = False,
 ) -> Certificate:
     """Certify the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
     A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
-    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too. on_episode:
-    sees every episode as it ends.
+    the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too; trust: see
+    `LearnedPolicy.load`. on_episode: sees every episode as it ends.
     """
     if cases < 1:
         raise UsageError(f"cases is {cases}; expected at least 1")
@@ -63,7 +65,7 @@ def certify(
     rows += [run.perturbed(kind) for kind in kinds_for(get_task(env.task))]
     rows.append(run.noisy())
     if policy is not None:
-        rows.append(run.taken_over(policy))
+        rows.append(run.taken_over(policy, trust))
     if engine.given_up:
         _LOG.warning("left out, as each killed its worker again and again: seeds %s", engine.given_up)
     settings = Settings(cases, seed, env.horizon, env.control_hz, env.tolerance, env.success_steps)
@@ -118,9 +120,10 @@ class _Run:
         known = kinds_for(get_task(self._env.task))[kind]
         return self._row("action" if known.wrong else "state", kind, known.words, cases)
 
-    def taken_over(self, policy: Path) -> Row:
+    def taken_over(self, policy: Path, trust: bool) -> Row:
         """From states that a learner visits: at a drawn step of a horizon the expert takes over."""
-        job = RolloutJob(self._env, "policy", policy=policy, hold=0, labels="takeover", ask=Ask("one"))
+        ask = Ask("one")
+        job = RolloutJob(self._env, "policy", policy=policy, hold=0, labels="takeover", ask=ask, trust=trust)
         cases: list[Case] = []
         for episode in self._episodes(job, self._seeds):
             taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)

@@ -14,12 +14,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from manip_il import checks
 from manip_il.data.atomic import umask
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.data.writing import writing
@@ -35,6 +36,9 @@ META_FILE = "manip_il.json"
 PRETRAINED_MODEL = "pretrained_model"
 TRAINING_STATE = "training_state"
 _LAST = "last"
+_LARGEST_META = 1024 * 1024  # [bytes]
+_LARGEST_STEP = 10**12
+_FASTEST, _MOST_NAMES, _LONGEST_WORDS, _LONGEST_SIDE = 10_000, 1_000, 1_000, 100_000
 STEP_FILE = "training_step.json"
 _MUST_AGREE = {
     "robot": "robot",
@@ -65,6 +69,24 @@ class CheckpointMeta:
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels]
     look: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("robot", "task"):
+            checks.name(name, getattr(self, name))
+        checks.whole("fps", self.fps, 1, _FASTEST)
+        checks.text("action_meaning", self.action_meaning, _LONGEST_WORDS)
+        checks.text("observation", self.observation, checks.LONGEST_NAME)
+        for name in ("joint_names", "environment_state_names", "cameras"):
+            for word in checks.array(name, getattr(self, name), _MOST_NAMES):
+                checks.text(f"one of {name}", word, _LONGEST_WORDS)
+        size = checks.array("image_size", self.image_size, 2)
+        if len(size) != 2:
+            raise ManipError(f"image_size is {size}; expected height and width")
+        for side in size:
+            checks.whole("a side of image_size", side, 0, _LONGEST_SIDE)
+        for name in ("fingerprint", "options") if self.look is None else ("fingerprint", "options", "look"):
+            if len(checks.mapping(name, getattr(self, name))) > _MOST_NAMES:
+                raise ManipError(f"{name} has {len(getattr(self, name))} entries; expected at most {_MOST_NAMES}")
 
     @classmethod
     def of(
@@ -102,12 +124,19 @@ def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
     if not path.is_file():
         return None
     try:
-        values = json.loads(path.read_text())
+        values = checks.read_json(path, "what a policy was trained for", _LARGEST_META)
         for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
             if name in values:  # a checkpoint from before there were pictures has no cameras
-                values[name] = tuple(values[name])
+                values[name] = tuple(checks.array(name, values[name], _MOST_NAMES))
+        known = [one.name for one in fields(CheckpointMeta)]
+        for name in values:
+            if name not in known:
+                raise ManipError(f"unexpected {checks.shorten(name)}")
+        for one in fields(CheckpointMeta):
+            if one.name not in values and one.default is MISSING and one.default_factory is MISSING:
+                raise ManipError(f"no {one.name}")
         return CheckpointMeta(**values)
-    except (ValueError, KeyError, TypeError) as error:
+    except ManipError as error:
         raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
 
 
@@ -117,6 +146,8 @@ def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
         if name == "environment_state_names" and meta.observation == "images":
             continue  # it does not look at it
         ours, theirs = getattr(meta, name), getattr(spec, name)
+        if name == "environment_state_names" and ours != theirs and meta.task != spec.task:
+            raise MismatchError("task", "the policy", meta.task, "the environment", spec.task)
         if ours != theirs:
             raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
 
@@ -160,7 +191,9 @@ def read_step(checkpoint: Path) -> dict[str, Any]:
     path = checkpoint / TRAINING_STATE / STEP_FILE
     if not path.is_file():
         raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")
-    return json.loads(path.read_text())
+    values = checks.read_json(path, "the step of a run", _LARGEST_META)
+    checks.whole(f"{path}: step", values.get("step"), 0, _LARGEST_STEP)
+    return values
 
 
 def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) -> None:
@@ -168,7 +201,7 @@ def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) ->
     saved = read_step(checkpoint)
     if saved.get("data") != digest:
         raise MismatchError("training data", f"checkpoint {checkpoint}", saved.get("data"), "this run", digest)
-    before = saved.get("options", {})
+    before = checks.mapping(f"{checkpoint}: options", saved.get("options", {}))
     for name, ours in options.items():
         if before.get(name) != ours:
             raise MismatchError(
@@ -180,7 +213,22 @@ def load_optimizer(checkpoint: Path, optimizer: torch.optim.Optimizer) -> None:
     """Put the optimiser in the checkpoint's state."""
     from lerobot.optim.optimizers import load_optimizer_state
 
-    load_optimizer_state(optimizer, checkpoint / TRAINING_STATE)
+    with readable_state(checkpoint):
+        load_optimizer_state(optimizer, checkpoint / TRAINING_STATE)
+
+
+@contextmanager
+def readable_state(checkpoint: Path) -> Iterator[None]:
+    """Turn what LeRobot, torch and safetensors raise for files that are not whole into `ManipError`."""
+    try:
+        yield
+    except ManipError:
+        raise
+    except Exception as error:  # of every kind: files of tensors and JSON, read by others' code
+        line = checks.shorten(" ".join(str(error).split()))
+        raise ManipError(
+            f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start anew with --overwrite=true"
+        ) from error
 
 
 def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMeta) -> None:

@@ -18,7 +18,10 @@ import torch
 from draccus.utils import DecodingError, ParsingError
 from lerobot.configs import PreTrainedConfig
 
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import UnknownName, UsageError
+from manip_il.learn.limits import check_numbers
+from manip_il.learn.pretrained import CONFIG, read_config
+from manip_il.learn.trust import PLAIN, require_trust
 
 # Where a policy's configuration is kept with what was meant for one machine or one command.
 _NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
@@ -40,35 +43,56 @@ def policy_class(kind: str) -> type[PreTrainedConfig]:
     return PreTrainedConfig.get_choice_class(kind)
 
 
-def policy_config(settings: Mapping[str, Any], default_type: str = "mlp") -> PreTrainedConfig:
+def policy_config(settings: Mapping[str, Any], default_type: str = "mlp", *, trust: bool = False) -> PreTrainedConfig:
     """The configuration that `--policy.*` asks for: of `type`, or of the checkpoint in `path`, with the rest changed.
 
-    The device is the graphics card where there is one. Raises `UnknownName` for a type or an option that is not
-    there, `UsageError` for a value that LeRobot refuses, `ManipError` for a `path` without a policy.
+    The device is the graphics card where there is one. As many actions are taken of a plan as it has, where LeRobot's
+    default is more. trust: whether models that the configuration names may be loaded. Raises `UnknownName` for a type
+    or an option that is not there, `UsageError` for a value that LeRobot refuses, `ManipError` for a `path` without a
+    policy and where trust is needed.
     """
     settings = dict(settings)
     if str(settings.get("device")).startswith("cuda") and not torch.cuda.is_available():  # LeRobot takes another
         raise UsageError(f"--policy.device={settings['device']}, but torch sees no graphics card here; expected cpu")
     settings.setdefault("device", "cuda" if torch.cuda.is_available() else "cpu")
     if "path" in settings:
-        return _from_checkpoint(Path(settings.pop("path")), settings)
+        return _from_checkpoint(Path(settings.pop("path")), settings, trust)
     kind = settings.pop("type", default_type)
-    return _checked(typing.cast(PreTrainedConfig, _decode(policy_class(kind), settings, f"--policy.type={kind}")))
+    cls, where = policy_class(kind), f"--policy.type={kind}"
+    require_trust({**settings, "type": kind}, where, trust)
+    return _checked(typing.cast(PreTrainedConfig, _decode(cls, _fitting(cls, settings, settings), where)))
 
 
-def _from_checkpoint(path: Path, settings: dict[str, Any]) -> PreTrainedConfig:
+def _from_checkpoint(path: Path, settings: dict[str, Any], trust: bool) -> PreTrainedConfig:
     if "type" in settings:
         raise UsageError("give one of --policy.path=DIR and --policy.type=...: a checkpoint knows its type")
-    policy_types()
-    if not (path / "config.json").is_file():
-        raise ManipError(f"no config.json in {path}; --policy.path wants LeRobot's pretrained_model folder")
-    with _quiet():
-        config = PreTrainedConfig.from_pretrained(path, local_files_only=True)
-    encoded = typing.cast(dict[str, Any], draccus.encode(config))
-    kept = {key: value for key, value in encoded.items() if key not in ("type", *_NOT_OURS)}
-    config = _checked(typing.cast(PreTrainedConfig, _decode(type(config), kept | settings, f"--policy.path={path}")))
+    saved = read_config(path)
+    cls, where = policy_class(saved["type"]), f"--policy.path={path}"
+    require_trust(saved | settings, where, trust)
+    if saved["type"] in PLAIN:
+        check_numbers(saved, str(path / CONFIG))
+    # The weights are in the checkpoint; torchvision would download its own first.
+    unused = ("type", "pretrained_backbone_weights", *_NOT_OURS)
+    kept = {key: value for key, value in saved.items() if key not in unused}
+    if "pretrained_backbone_weights" in saved:
+        kept["pretrained_backbone_weights"] = None
+    options = _fitting(cls, kept | settings, settings)
+    config = _checked(typing.cast(PreTrainedConfig, _decode(cls, options, where)))
     config.pretrained_path = path
     return config
+
+
+def _fitting(cls: type[Any], options: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options with no more `n_action_steps` than a plan has, unless the user gave that number."""
+    defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+    values = defaults | dict(options)
+    wanted = values.get("n_action_steps")
+    plan = next((values[name] for name in ("chunk_size", "action_horizon", "horizon") if name in defaults), None)
+    if "n_action_steps" in given or not isinstance(wanted, int) or not isinstance(plan, int):
+        return dict(options)
+    if "horizon" in defaults:  # a plan that begins with the first observation
+        plan -= max(0, values["n_obs_steps"] - 1) if isinstance(values["n_obs_steps"], int) else 0
+    return {**options, "n_action_steps": plan} if 1 <= plan < wanted else dict(options)
 
 
 def _checked(config: PreTrainedConfig) -> PreTrainedConfig:
@@ -122,7 +146,7 @@ def _decode(cls: type[Any], settings: Mapping[str, Any], where: str) -> Any:
     try:
         with _quiet():
             return draccus.decode(cls, settings)
-    except (DecodingError, ParsingError, ValueError, TypeError, NotImplementedError) as error:
+    except (DecodingError, ParsingError, ValueError, TypeError, NotImplementedError, ImportError) as error:
         reason = error if isinstance(error, DecodingError) else error.__cause__ or error
         raise UsageError(f"{where}: {' '.join(str(reason).split())}") from error
 

@@ -28,7 +28,7 @@ class FitConfig:
     """Options by LeRobot's names; None is the default of the policy's kind.
 
     policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). optimizer, scheduler:
-    in place of the policy's own. tensorboard, wandb: not for the mlp.
+    in place of the policy's own. trust: whether models that the policy or its checkpoint names may be loaded.
 
     Raises `UsageError` for a number out of range, `UnknownName` for a policy or an option of it that is not there.
     """
@@ -49,6 +49,7 @@ class FitConfig:
     log_freq: int = 200
     tensorboard: bool = False
     wandb: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    trust: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (*((name, 1) for name in _AT_LEAST_1), *((name, 0) for name in _AT_LEAST_0)):
@@ -84,10 +85,12 @@ class FitConfig:
         """For `manip_il.learn.train.fit`. Raises `UsageError` for what the mlp does not know."""
         if self.observation not in (None, "state"):
             raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={self.observation}; use cnn")
-        for name in ("optimizer", "scheduler", "wandb", "tensorboard"):
+        for name in ("optimizer", "scheduler"):
             if getattr(self, name):
-                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop of its own (metrics.jsonl)")
-        from manip_il.learn.choices import policy_config
+                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop and a schedule of its own")
+        from lerobot.configs.default import WandBConfig
+
+        from manip_il.learn.choices import plain, policy_config
         from manip_il.learn.mlp.configuration_mlp import MLPConfig
         from manip_il.learn.train import TrainConfig
 
@@ -103,6 +106,8 @@ class FitConfig:
             save_freq=MLP_SAVE_FREQ if self.save_freq is None else self.save_freq,
             log_freq=self.log_freq,
             init_from=init_from,
+            tensorboard=self.tensorboard,
+            wandb=plain(WandBConfig, self.wandb, "wandb"),
             policy=policy,
         )
 
@@ -115,7 +120,7 @@ class FitConfig:
         from manip_il.learn.choices import choice, plain, policy_config
         from manip_il.learn.policy_config import PolicyFitConfig
 
-        policy = policy_config(self.policy)
+        policy = policy_config(self.policy, trust=self.trust)
         if init_from is not None:
             policy.pretrained_path = init_from
         return PolicyFitConfig(
@@ -136,4 +141,5 @@ class FitConfig:
             save_freq=SAVE_FREQ if self.save_freq is None else self.save_freq,
             tensorboard=self.tensorboard,
             wandb=plain(WandBConfig, self.wandb, "wandb"),
+            trust=self.trust,
         )

@@ -22,9 +22,16 @@ from numpy.typing import NDArray
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
 from manip_il.learn.card import write_card
-from manip_il.learn.checkpoint import PRETRAINED_MODEL, CheckpointMeta, check_same_run, last_checkpoint
+from manip_il.learn.checkpoint import (
+    PRETRAINED_MODEL,
+    CheckpointMeta,
+    check_same_run,
+    last_checkpoint,
+    read_step,
+    readable_state,
+)
 from manip_il.learn.lerobot_checkpoint import Progress, save_lerobot_checkpoint
-from manip_il.learn.metrics import METRICS_FILE, Writer, json_lines, tensorboard, weights_and_biases
+from manip_il.learn.metrics import Writer, metric_writers
 from manip_il.learn.order import batches_of, order_of
 from manip_il.learn.policy_config import PolicyFitConfig
 from manip_il.learn.prefetch import prefetched
@@ -33,7 +40,6 @@ from manip_il.learn.sources import Batch, pictures_to_float
 from manip_il.learn.threads import threads
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
-TENSORBOARD_FOLDER = "tensorboard"
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
@@ -108,21 +114,24 @@ class PolicyTrainer:
             config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL
         policy = build_policy(config.policy, self.dataset)
         before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
-        self.preprocessor, self.postprocessor = build_processors(config.policy, self.dataset, before)
+        self.preprocessor, self.postprocessor = build_processors(
+            config.policy, self.dataset, before, trust=config.trust
+        )
         optimizer = config.resolved_optimizer().build(policy.get_optim_params())
         if not isinstance(optimizer, torch.optim.Optimizer):
             raise UsageError(f"--policy.type={config.policy.type} wants several optimisers; lerobot-train fits it")
         schedule = config.resolved_scheduler()
         scheduler = schedule.build(optimizer, config.steps) if schedule is not None else None
         if checkpoint is not None:
-            self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
+            read_step(checkpoint)
+            with readable_state(checkpoint):
+                self.step, optimizer, scheduler = load_training_state(checkpoint, optimizer, scheduler)
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
         """Take the steps that are left, with metrics and checkpoints; see `fit_policy`."""
         config = self.config
-        with contextlib.ExitStack() as stack:
-            writers = self._open_metrics(stack)
+        with self._open_metrics() as writers:
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
@@ -183,18 +192,11 @@ class PolicyTrainer:
                 write_card(folder, self.pipeline, self.meta, self.dataset, record)
         self.accelerator.wait_for_everyone()
 
-    def _open_metrics(self, stack: contextlib.ExitStack) -> list[Writer]:
+    def _open_metrics(self) -> contextlib.AbstractContextManager[list[Writer]]:
         """Where metrics go, in the main process."""
         if not self.accelerator.is_main_process:
-            return []
-        self.output_dir.mkdir(parents=True, exist_ok=True)
-        writers = [stack.enter_context(json_lines(self.output_dir / METRICS_FILE, self.step))]
-        if self.config.tensorboard:
-            writers.append(stack.enter_context(tensorboard(self.output_dir / TENSORBOARD_FOLDER, self.step)))
-        if self.config.wandb.enable:
-            self.pipeline.resume = self.step > 0
-            writers.append(stack.enter_context(weights_and_biases(self.pipeline)))
-        return writers
+            return contextlib.nullcontext([])
+        return metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
 
     def _update(self, batch: Batch) -> dict[str, float]:
         batch = self.preprocessor(self._augmented(batch))

@@ -24,7 +24,9 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.errors import ManipError, UnknownName
 from manip_il.learn.choices import policy_class, policy_types
-from manip_il.learn.pretrained import CONFIG, PROCESSORS, check_processors, processor_steps
+from manip_il.learn.limits import Budget, check_numbers
+from manip_il.learn.pretrained import CONFIG, PROCESSORS, WEIGHTS, check_processors, processor_steps
+from manip_il.learn.trust import PLAIN, require_trust
 
 Batch = dict[str, Any]
 _DEVICE_STEP = "device_processor"
@@ -65,7 +67,12 @@ class EpisodePolicy:
         """One action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget(self._memories.keys() - set(episodes))
         rows = ({key: values[i : i + 1] for key, values in batch.items()} for i in range(len(episodes)))
-        actions = [self._one(row, episode) for row, episode in zip(rows, episodes, strict=True)]
+        try:
+            actions = [self._one(row, episode) for row, episode in zip(rows, episodes, strict=True)]
+        except ManipError:
+            raise
+        except Exception as error:  # the code of any policy, with options and statistics from anywhere
+            raise ManipError(f"the policy cannot act: {type(error).__name__}: {_line(error)}") from error
         return torch.cat([action.to("cpu", torch.float32) for action in actions])
 
     def forget(self, episodes: Iterable[int]) -> None:
@@ -89,21 +96,27 @@ class EpisodePolicy:
         return torch.autocast(self._device.type) if self._fresh.config.use_amp else contextlib.nullcontext()
 
 
-def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str) -> EpisodePolicy:
+def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
     """The policy in a `pretrained_model` folder, without a network where LeRobot needs none.
 
     settings: its `config.json`. Raises `UnknownName` for a type that is not known, `ManipError` where packages are
-    missing, where processors name code to import, or where LeRobot cannot load the folder.
+    missing, where what it names would have to be trusted and is not (`require_trust`), or where LeRobot cannot load
+    the folder.
     """
     kind = settings["type"]
     if kind not in policy_types():
         raise UnknownName(f"policy type in {path / CONFIG}:", kind, policy_types())
     check_processors(path)
+    require_trust(settings, str(path), trust, path)
+    if kind in PLAIN:
+        check_numbers(settings, str(path / CONFIG))
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
             return EpisodePolicy(*_load(path, settings, device), task)
     except ImportError as error:
         raise ManipError(f"{path} is a policy of type {kind!r}, which needs more packages: {_line(error)}") from error
+    except ManipError as error:
+        raise ManipError(f"{path}: {error}") from error
     except Exception as error:  # a folder from anywhere, read by the code of any policy: errors of every kind
         if "state_dict" in str(error):
             raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {_line(error)}") from error
@@ -117,7 +130,9 @@ def _load(path: Path, settings: Mapping[str, Any], device: str) -> tuple[PreTrai
     # Weights come from the checkpoint; torchvision would download its own first.
     if hasattr(config, "pretrained_backbone_weights"):
         config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
-    policy = get_policy_class(kind).from_pretrained(path, config=config, strict=True)
+    # Frozen parts of others are fetched and no part of the weights
+    with Budget(path / WEIGHTS) if kind in PLAIN else contextlib.nullcontext():
+        policy = get_policy_class(kind).from_pretrained(path, config=config, strict=True)
     placed = any(step["registry_name"] == _DEVICE_STEP for step in processor_steps(path / PROCESSORS[0]))
     overrides = {_DEVICE_STEP: {"device": device}} if placed else {}
     before, after = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)

@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from lerobot.configs.train import TrainPipelineConfig
 
+from manip_il import checks
 from manip_il.data.atomic import write_file
 from manip_il.data.writing import writing
-from manip_il.errors import UsageError
+from manip_il.errors import ManipError, UsageError
 
-METRICS_FILE = "metrics.jsonl"
+METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
+_LARGEST_STEP = 10**12
 Record = Mapping[str, Any]  # `step` and numbers
 Writer = Callable[[Record], None]
+
+
+@contextmanager
+def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
+    """What a fit calls with each record: the file of lines, and what else the user asked for.
+
+    step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
+    `UsageError` where one of them is not installed.
+    """
+    with writing(output_dir):
+        output_dir.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        writers = [stack.enter_context(json_lines(output_dir / METRICS_FILE, step))]
+        if curves:
+            writers.append(stack.enter_context(tensorboard(output_dir / TENSORBOARD_FOLDER, step)))
+        if pipeline.wandb.enable:
+            pipeline.resume = step > 0
+            writers.append(stack.enter_context(weights_and_biases(pipeline)))
+        yield writers
 
 
 @contextmanager
@@ -24,7 +46,7 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
     """A function that adds a line; lines after `step`, of a run that was killed, go first."""
     kept = []
     if path.is_file() and step > 0:
-        for line in path.read_text().splitlines():
+        for line in path.read_text(errors="replace").splitlines():
             with_step = _step_of(line)
             if with_step is not None and with_step <= step:
                 kept.append(line + "\n")
@@ -57,15 +79,19 @@ def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 @contextmanager
 def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
-    """A function that adds a point, through LeRobot's own logger."""
-    from lerobot.common.wandb_utils import WandBLogger
-
+    """A function that adds a point, through LeRobot's own logger. Raises `UsageError` where wandb is not installed."""
+    try:
+        importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
+        from lerobot.common.wandb_utils import WandBLogger
+    except ImportError as error:
+        raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
     logger = WandBLogger(config)
     yield lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])
 
 
 def _step_of(line: str) -> int | None:
+    """The step of a line; None for one that was cut short by a kill, or holds none."""
     try:
-        return int(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
-        return None  # cut short by a kill
+        return checks.whole("step", json.loads(line)["step"], 0, _LARGEST_STEP)
+    except (ManipError, ValueError, KeyError, TypeError, RecursionError):
+        return None

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from manip_il.learn.losses import make_head
+from manip_il import checks
+from manip_il.errors import ManipError, UnknownName
+from manip_il.learn.losses import LOSSES, make_head
 from manip_il.learn.normalise import Statistics, identity_statistics, scale_targets
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
@@ -19,11 +21,16 @@ from manip_il.learn.normalise import Statistics, identity_statistics, scale_targ
 ROWS = 64
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "silu": nn.SiLU}
 ACTIVATIONS = tuple(_ACTIVATIONS)
+BOUNDS = {"width": (1, 16_384), "depth": (1, 100), "components": (1, 1_000), "bins": (2, 10_000)}
+LARGEST_CLAMP = 1e6  # [standard deviations]
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a network is built from; the names are those of `MLPConfig`, which says what they mean."""
+    """What a network is built from; the names are those of `MLPConfig`, which says what they mean.
+
+    Raises `ManipError` for a value out of bounds or of another type, `UnknownName` for a loss or activation.
+    """
 
     width: int
     depth: int
@@ -32,6 +39,16 @@ class Shape:
     components: int
     bins: int
     clamp: float
+
+    def __post_init__(self) -> None:
+        for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS)):
+            value = checks.text(name, getattr(self, name), checks.LONGEST_NAME)
+            if value not in known:
+                raise UnknownName(name, value, known)
+        for name, (least, most) in BOUNDS.items():
+            checks.whole(name, getattr(self, name), least, most)
+        if not checks.number("clamp", self.clamp, 0.0, LARGEST_CLAMP) > 0:
+            raise ManipError(f"clamp is {self.clamp}; expected more than 0")
 
 
 class MLPNetwork(nn.Module):

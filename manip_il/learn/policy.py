@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, read_meta
+from manip_il.learn.limits import Budget
 from manip_il.learn.network import MLPNetwork, Shape
 from manip_il.learn.observation import observation_of
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
@@ -53,13 +54,13 @@ class LearnedPolicy:
         self._chooser = chooser
 
     @classmethod
-    def load(cls, path: Path, device: str = "cpu", task: str = "") -> LearnedPolicy:
-        """Any LeRobot `pretrained_model` folder. Reads JSON and safetensors alone.
+    def load(cls, path: Path, device: str = "cpu", task: str = "", *, trust: bool = False) -> LearnedPolicy:
+        """Any LeRobot `pretrained_model` folder. Reads JSON and safetensors alone, unless `trust`.
 
         The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task: what
-        a policy that reads language is told to do. Raises `ManipError` for a folder that is not whole, that holds a
-        pickle, whose files do not belong together, or whose processors name code to import; `UnknownName` for a type
-        of policy that is not known.
+        a policy that reads language is told to do. trust: load models and code that the checkpoint names, too. Raises
+        `ManipError` for a folder that is not whole, that holds a pickle, whose files do not belong together, or that
+        names code to import or, without `trust`, models to load; `UnknownName` for a type of policy that is not known.
         """
         path = Path(path)
         if device.startswith("cuda") and not torch.cuda.is_available():
@@ -70,7 +71,7 @@ class LearnedPolicy:
             return cls(_Perceptron(path, config, interface, device), interface, meta)
         from manip_il.learn.lerobot_policy import load_policy
 
-        return cls(load_policy(path, config, device, task), interface, meta)
+        return cls(load_policy(path, config, device, task, trust), interface, meta)
 
     @property
     def widths(self) -> dict[str, int]:
@@ -190,16 +191,20 @@ class _Perceptron:
     """The mlp: no memory, and one call for all rows, which do not feel each other."""
 
     def __init__(self, path: Path, config: dict[str, Any], interface: Interface, device: str):
-        self._device, self.loss = device, config.get("loss", "")
+        self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in interface.numbers]
+        shape = _shape(config, path / CONFIG)
+        self.loss = shape.loss
         try:
-            shape = Shape(**{field.name: config[field.name] for field in fields(Shape)})
-            self._network = MLPNetwork(sum(interface.numbers.values()), interface.action, shape)
-            weights = load_file(path / WEIGHTS)
+            with Budget(path / WEIGHTS):
+                self._network = MLPNetwork(sum(interface.numbers[key] for key in self._keys), interface.action, shape)
+                weights = load_file(path / WEIGHTS)
             self._network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
-        except (RuntimeError, KeyError, SafetensorError) as error:
+        except (RuntimeError, SafetensorError) as error:
             line = " ".join(str(error).split())
             raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {line}") from error
+        except ManipError as error:
+            raise ManipError(f"{path}: {error}") from error
         self._network.to(device).eval()
 
     @property
@@ -221,6 +226,17 @@ class _Perceptron:
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Do nothing: there is nothing to forget."""
+
+
+def _shape(config: Mapping[str, Any], path: Path) -> Shape:
+    """What an mlp's `config.json` asks for."""
+    for field in fields(Shape):
+        if field.name not in config:
+            raise ManipError(f"{path} says no {field.name}; it is not of an mlp")
+    try:
+        return Shape(**{field.name: config[field.name] for field in fields(Shape)})
+    except ManipError as error:
+        raise ManipError(f"{path}: {error}") from error
 
 
 def _require_finite_rows(what: str, values: NDArray[Any]) -> None:

@@ -42,6 +42,7 @@ class PolicyFitConfig:
     save_freq: int = 20_000
     tensorboard: bool = False
     wandb: WandBConfig = field(default_factory=WandBConfig)
+    trust: bool = False
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "threads", "log_freq", "save_freq"):

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
+_LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
+_MOST_FEATURES, _MOST_STEPS, _LONGEST_SIDE = 100, 100, 100_000
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
 
 
@@ -53,11 +56,13 @@ def read_config(path: Path) -> dict[str, Any]:
     for name in (CONFIG, WEIGHTS):
         if not os.access(path / name, os.R_OK):
             raise ManipError(f"{path / name} may not be read by this user (uid {os.getuid()}); run as its owner")
+    config = checks.read_json(path / CONFIG, "a LeRobot policy's config.json", _LARGEST_JSON)
     try:
-        config = json.loads((path / CONFIG).read_text())
-        _ = config["type"], config["input_features"].items(), config["output_features"].items()
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: {type(error).__name__}: {error}") from error
+        checks.text("type", config.get("type"), checks.LONGEST_NAME)
+        for features in ("input_features", "output_features"):
+            checks.mapping(features, config.get(features))
+    except ManipError as error:
+        raise ManipError(f"{path / CONFIG} is not a LeRobot policy's: {error}") from error
     return config
 
 
@@ -69,18 +74,34 @@ def read_interface(path: Path) -> Interface:
 def interface_of(config: dict[str, Any], path: Path) -> Interface:
     """The same from `config.json`; path: for the message."""
     try:
-        inputs = {key: (ft["type"], tuple(ft["shape"])) for key, ft in config["input_features"].items()}
+        inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
+        if ACTION not in outputs:
+            raise ManipError(f"no {ACTION} among the outputs ({', '.join(outputs)})")
         pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
+        if any(len(shape) != 3 for shape in pictures.values()):
+            raise ManipError(f"pictures of shapes {checks.shorten(list(pictures.values()))}; expected (3, H, W)")
         return Interface(
             type=config["type"],
             numbers={key: math.prod(shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
-            pictures={name: (h, w) for name, (_, h, w) in pictures.items() if not name.startswith(_PLACEHOLDER)},
-            action=math.prod(config["output_features"][ACTION]["shape"]),
+            pictures={name: shape[1:] for name, shape in pictures.items() if not name.startswith(_PLACEHOLDER)},  # pyright: ignore[reportArgumentType]
+            action=math.prod(outputs[ACTION][1]),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise ManipError(
-            f"{path / CONFIG} has features that cannot be read: {type(error).__name__}: {error}"
-        ) from error
+    except ManipError as error:
+        raise ManipError(f"{path / CONFIG} has features that cannot be read: {error}") from error
+
+
+def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Name -> kind and shape of a policy's inputs or outputs."""
+    if len(features) > _MOST_FEATURES:
+        raise ManipError(f"{len(features)} features; expected at most {_MOST_FEATURES}")
+    found: dict[str, tuple[str, tuple[int, ...]]] = {}
+    for key, value in features.items():
+        checks.text("name of a feature", key, checks.LONGEST_NAME)
+        feature = checks.mapping(key, value)
+        shape = checks.array(f"shape of {key}", feature.get("shape"), 4)
+        sides = tuple(checks.whole(f"a side of {key}", side, 1, _LONGEST_SIDE) for side in shape)
+        found[key] = checks.text(f"type of {key}", feature.get("type"), checks.LONGEST_NAME), sides
+    return found
 
 
 def check_interface(interface: Interface, spec: RobotTaskSpec) -> None:
@@ -101,18 +122,36 @@ def check_interface(interface: Interface, spec: RobotTaskSpec) -> None:
 
 
 def check_processors(path: Path) -> None:
-    """Refuse a step by import path: LeRobot would import and call whatever a downloaded file names."""
+    """Raise `ManipError` unless both processors' files can be read; see `processor_steps`."""
     for name in PROCESSORS:
         if not (path / name).is_file():
             raise ManipError(f"no {path / name}; LeRobot's migrate_policy_normalization adds it to an old checkpoint")
-        for step in processor_steps(path / name):
-            if "registry_name" not in step:
-                raise ManipError(f"{path / name} wants to run {step.get('class')!r}; only registered steps are loaded")
+        processor_steps(path / name)
 
 
 def processor_steps(path: Path) -> list[dict[str, Any]]:
-    """The steps that a processor's file names."""
+    """Return the steps that a processor's file names: each `registry_name`, `config` and perhaps `state_file`.
+
+    Refuses a step by import path, as LeRobot would import and call whatever a downloaded file names, and a state
+    outside of the folder.
+    """
+    values = checks.read_json(path, "a processor of LeRobot's", _LARGEST_JSON)
     try:
-        return [dict(step) for step in json.loads(path.read_text()).get("steps", [])]
-    except (ValueError, TypeError, AttributeError) as error:
+        steps = [checks.mapping("a step", step) for step in checks.array("steps", values.get("steps"), _MOST_STEPS)]
+        return [_step(path, step) for step in steps]
+    except ManipError as error:
         raise ManipError(f"{path} cannot be read: {error}") from error
+
+
+def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
+    if "registry_name" not in step:
+        raise ManipError(f"it wants to run {checks.shorten(step.get('class'))}; only registered steps are loaded")
+    known = {
+        "registry_name": checks.text("registry_name", step["registry_name"], checks.LONGEST_NAME),
+        "config": checks.mapping("config", step.get("config", {})),
+    }
+    if "state_file" in step:
+        known["state_file"] = checks.name("state_file", step["state_file"])
+        if not (path.parent / known["state_file"]).is_file():
+            raise ManipError(f"no {known['state_file']} beside it")
+    return known

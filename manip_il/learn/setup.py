@@ -19,15 +19,20 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data.image_cache import open_frame_cache
 from manip_il.data.lerobot_io import read_tables
 from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.schema import ACTION, IMAGES, LABEL_VALID
 from manip_il.errors import ManipError, NotFiniteError
+from manip_il.learn.checkpoint import readable_state
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, split_by_episode
+from manip_il.learn.limits import Budget
 from manip_il.learn.observation import policy_features
 from manip_il.learn.policy_config import PolicyFitConfig
+from manip_il.learn.pretrained import WEIGHTS, check_processors, read_config
 from manip_il.learn.sources import TASK_INDEX, JoinedFrames, LibrarySource, MemorySource, Source
+from manip_il.learn.trust import PLAIN, require_trust
 from manip_il.learn.windows import Windows, windows_of
 
 _LOG = logging.getLogger(__name__)
@@ -68,12 +73,13 @@ def set_features(config: PreTrainedConfig, meta: Any, observation: str) -> None:
 def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
     """LeRobot's policy, its weights new or from `config.pretrained_path`.
 
-    Raises `ManipError` with the two ways out where a backbone's weights would have to be downloaded and cannot be.
+    Raises `ManipError` for a checkpoint that cannot be loaded, and with the two ways out where a backbone's weights
+    would have to be downloaded and cannot be.
     """
     weights = getattr(config, "pretrained_backbone_weights", None)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
-            policy = make_policy(config, ds_meta=meta)
+            policy = make_policy(config, ds_meta=meta) if config.pretrained_path is None else _loaded(config, meta)
     except (URLError, OSError) as error:
         if not weights or isinstance(error, FileNotFoundError):
             raise
@@ -89,12 +95,33 @@ def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
     return policy
 
 
-def build_processors(config: PreTrainedConfig, meta: Any, checkpoint: Path | None) -> tuple[Any, Any]:
-    """LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's."""
+def _loaded(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
+    """LeRobot's policy with a checkpoint's weights."""
+    path = Path(str(config.pretrained_path))
+    try:
+        with Budget(path / WEIGHTS) if config.type in PLAIN else contextlib.nullcontext():
+            return make_policy(config, ds_meta=meta)
+    except ImportError:
+        raise
+    except Exception as error:  # weights from anywhere, read by the code of any policy: errors of every kind
+        line = checks.shorten(" ".join(str(error).split()))
+        raise ManipError(f"{path} does not fit this policy: {type(error).__name__}: {line}") from error
+
+
+def build_processors(
+    config: PreTrainedConfig, meta: Any, checkpoint: Path | None, *, trust: bool = False
+) -> tuple[Any, Any]:
+    """LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
+
+    Raises what `require_trust` raises for the checkpoint's, and `ManipError` where they cannot be read.
+    """
     if checkpoint is None:
         return make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+    check_processors(checkpoint)
+    require_trust(read_config(checkpoint), str(checkpoint), trust, checkpoint)
     device = {"device_processor": {"device": config.device}}
-    return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
+    with readable_state(checkpoint):
+        return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -16,6 +16,9 @@ import draccus
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs.default import DatasetConfig, WandBConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.optim import AdamWConfig
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 
@@ -28,10 +31,11 @@ from manip_il.learn.checkpoint import (
     last_checkpoint,
     load_optimizer,
     read_step,
+    readable_state,
     save_checkpoint,
 )
 from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
-from manip_il.learn.metrics import METRICS_FILE, json_lines
+from manip_il.learn.metrics import metric_writers
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.normalise import fit_statistics
@@ -41,6 +45,7 @@ from manip_il.learn.warm_start import warm_start
 
 # Do not change the weights that come out at the end (threads: only in the last bits).
 _FREE_ON_RESUME = ("threads", "log_freq", "save_freq", "init_from")
+_TOLD_ELSEWHERE = ("tensorboard", "wandb")  # options of nobody but this run's user
 
 
 @dataclass
@@ -65,6 +70,8 @@ class TrainConfig:
     log_freq: int = 200
     save_freq: int = 1_000
     init_from: Path | None = None
+    tensorboard: bool = False
+    wandb: WandBConfig = field(default_factory=WandBConfig)
     policy: MLPConfig = field(default_factory=MLPConfig)
 
     def __post_init__(self) -> None:
@@ -75,6 +82,24 @@ class TrainConfig:
             raise UsageError(f"val_fraction is {self.val_fraction}; expected 0 <= val_fraction < 1")
         if not self.lr > 0.0:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
+
+    def lerobot(self, repo_id: str, output_dir: Path) -> TrainPipelineConfig:
+        """The same in LeRobot's words, for its logger."""
+        optimizer = AdamWConfig(lr=self.lr, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm)
+        return TrainPipelineConfig(
+            dataset=DatasetConfig(repo_id),
+            policy=self.policy,
+            output_dir=output_dir,
+            job_name="manip_il_mlp",
+            seed=self.seed,
+            batch_size=self.batch_size,
+            steps=self.steps,
+            env_eval_freq=0,
+            log_freq=self.log_freq,
+            save_freq=self.save_freq,
+            optimizer=optimizer,
+            wandb=self.wandb,
+        )
 
     def lr_at(self, step: int) -> float:
         """Learning rate of the update with number `step`, from 0."""
@@ -94,13 +119,15 @@ def fit(
     on_log: Callable[[dict[str, Any]], None] | None = None,
     resume: bool = False,
     weights: NDArray[np.float64] | None = None,
+    repo_id: str = "local/table",
 ) -> Path:
     """Clone the labels of `table` and return `output_dir/checkpoints/last/pretrained_model`.
 
     table: the schema's `observation.state`, `observation.environment_state`, `action` and, where
     there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
-    to the others, (N,); by default each once an epoch. The same table, config and number of
-    threads give the same bits, resumed or not. Metrics go to `on_log` and `metrics.jsonl`.
+    to the others, (N,); by default each once an epoch. repo_id: what Weights & Biases calls the data. The
+    same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
+    `metrics.jsonl`, and where the config says.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for
     data or a loss that is not finite, `MismatchError` for a table that does not fit `spec` or a
@@ -113,7 +140,7 @@ def fit(
     check_table(table, spec)
     rows = learning_rows(table)
     drawn = weights[valid_frames(table)] if weights is not None else None
-    options = draccus.encode(config)
+    options = {name: value for name, value in draccus.encode(config).items() if name not in _TOLD_ELSEWHERE}
     meta = CheckpointMeta.of(spec, fingerprint, options)
     digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
@@ -121,13 +148,13 @@ def fit(
         if checkpoint is not None:
             check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
         trainer = Trainer(rows, config, spec, checkpoint, drawn)
-        output_dir.mkdir(parents=True, exist_ok=True)
-        with json_lines(output_dir / METRICS_FILE, trainer.step) as write:
+        pipeline = config.lerobot(repo_id, output_dir)
+        with metric_writers(output_dir, trainer.step, config.tensorboard, pipeline) as writers:
             for record in trainer.run():
-                if record:
+                for write in writers if record else []:
                     write(record)
-                    if on_log is not None:
-                        on_log(record)
+                if record and on_log is not None:
+                    on_log(record)
                 if trainer.step % config.save_freq == 0 or trainer.step == config.steps:
                     save_checkpoint(output_dir, trainer.step, trainer.policy, meta, trainer.optimizer, key)
     return output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
@@ -162,9 +189,10 @@ class Trainer:
         self.order = order_of(len(train), drawn, config.batch_size, config.seed)
 
     def _restore(self, checkpoint: Path) -> None:
-        self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
+        with readable_state(checkpoint):
+            self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
         load_optimizer(checkpoint, self.optimizer)
-        self.step = int(read_step(checkpoint)["step"])
+        self.step = read_step(checkpoint)["step"]
 
     def _encode(self, rows: Rows, train: NDArray[np.int64], held_out: NDArray[np.int64]) -> None:
         device = self.policy.config.device

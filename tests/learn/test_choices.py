@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
@@ -63,6 +65,7 @@ def test_optimisers_and_schedules_by_their_type() -> None:
 
 def test_a_checkpoint_gives_its_options_and_they_can_be_changed(tmp_path) -> None:
     policy_config({"type": "act", "chunk_size": 7, "n_action_steps": 5, "device": "cpu"})._save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").touch()
     config = policy_config({"path": str(tmp_path), "n_action_steps": 2})
     assert isinstance(config, ACTConfig)
     assert (config.chunk_size, config.n_action_steps) == (7, 2)
@@ -73,3 +76,53 @@ def test_the_help_lists_a_policys_options() -> None:
     rows = dict(option_lines(policy_class("act"), "policy"))
     assert rows["--policy.chunk_size"] == "100"
     assert "--policy.push_to_hub" not in rows
+
+
+def actions(config: Any) -> int:
+    """Of a plan, before the next one is made."""
+    return config.n_action_steps
+
+
+PLANS = {
+    "act": ("chunk_size", 10, 10),
+    "diffusion": ("horizon", 16, 15),  # its plan begins with the first of two observations
+    "evo1": ("chunk_size", 10, 10),
+    "fastwam": ("action_horizon", 8, 8),
+    "groot": ("chunk_size", 10, 10),
+    "molmoact2": ("chunk_size", 10, 10),
+    "multi_task_dit": ("horizon", 16, 15),
+    "pi0": ("chunk_size", 10, 10),
+    "pi05": ("chunk_size", 10, 10),
+    "pi0_fast": ("chunk_size", 10, 10),
+    "smolvla": ("chunk_size", 10, 10),
+    "tdmpc": ("horizon", 16, 1),
+    "vla_jepa": ("chunk_size", 5, 5),
+    "wall_x": ("chunk_size", 10, 10),
+    "xvla": ("chunk_size", 10, 10),
+}
+
+
+@pytest.mark.parametrize("kind", PLANS)
+def test_no_more_actions_are_taken_of_a_plan_than_it_has(kind) -> None:
+    option, plan, taken = PLANS[kind]
+    config = policy_config({"type": kind, option: plan, "device": "cpu"}, trust=True)
+    assert (getattr(config, option), actions(config)) == (plan, taken)
+
+
+def test_a_policy_that_plans_and_is_not_above_is_new_in_lerobot() -> None:
+    plan = {kind for kind in policy_types() if "n_action_steps" in vars(policy_class(kind)).get("__annotations__", {})}
+    assert plan == {*PLANS, "eo1"}  # eo1 cannot be made without transformers
+
+
+def test_what_the_user_gives_stays_as_it_is(tmp_path) -> None:
+    config = policy_config({"type": "act", "chunk_size": 10, "n_action_steps": 3, "device": "cpu"})
+    assert actions(config) == 3
+    assert actions(policy_config({"type": "act", "chunk_size": 200, "device": "cpu"})) == 100
+    config._save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").touch()
+    assert actions(policy_config({"path": str(tmp_path), "chunk_size": 2, "device": "cpu"})) == 2
+
+
+def test_packages_that_a_policy_needs_are_named() -> None:
+    with pytest.raises(UsageError, match=r"--policy\.type=eo1: 'transformers' is required"):
+        policy_config({"type": "eo1", "device": "cpu"}, trust=True)

@@ -307,6 +307,39 @@ def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, monkeypa
     assert list((tmp_path / "r" / "wandb").glob("offline-run-*"))
 
 
+def test_weights_and_biases_that_is_not_installed_is_named(demos, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(UsageError, match="pip install wandb"):
+        fit(demos, tmp_path / "r", wandb=WandBConfig(enable=True, mode="offline"))
+
+
+def test_a_checkpoint_to_start_from_that_does_not_fit_is_one_line(demos, tmp_path) -> None:
+    path = fit(demos, tmp_path / "r")
+    (path / "model.safetensors").write_bytes(b"\x08" + bytes(7) + b"nothing}")
+    with pytest.raises(ManipError, match=r"does not fit this policy.*cannot be read"):
+        fit(demos, tmp_path / "again", {"path": str(path)})
+
+
+@pytest.mark.parametrize(
+    "name", ["training_step.json", "optimizer_state.safetensors", "scheduler_state.json", "rng_state.safetensors"]
+)
+def test_a_run_whose_state_is_broken_is_not_resumed(name, demos, tmp_path) -> None:
+    settings = {**DIFFUSION, "scheduler_warmup_steps": 1}
+    fit(demos, tmp_path / "r", settings)
+    (tmp_path / "r/checkpoints/last/training_state" / name).write_bytes(b"[[[")
+    with pytest.raises(ManipError, match=rf"{name} is not valid JSON|cannot be resumed .*--overwrite=true"):
+        fit(demos, tmp_path / "r", settings, resume=True)
+
+
+def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(demos, tmp_path) -> None:
+    path = fit(demos, tmp_path / "r") / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    values["steps"].append({"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}})
+    path.write_text(json.dumps(values))
+    with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
+        fit(demos, tmp_path / "r", resume=True)
+
+
 def test_tensorboard_that_is_not_installed_is_named(demos, tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(UsageError, match=r"manip_il\[tensorboard\]"):

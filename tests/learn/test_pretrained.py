@@ -74,10 +74,22 @@ def test_a_folder_without_weights_says_what_is_missing(act):
         LearnedPolicy.load(act)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"type": "act"}', '{"type": "act", "input_features": null}'])
-def test_a_config_that_is_no_policys_is_refused(text, act):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "is not valid JSON"),
+        ("[" * 100_000, "nested too deeply"),
+        ("[]", r"is \[\]; expected an object"),
+        ('{"type": null}', "is not a LeRobot policy's: type is None"),
+        ('{"type": {"act": 1}}', "is not a LeRobot policy's: type is"),
+        ('{"type": "act"}', "is not a LeRobot policy's: input_features is None"),
+        ('{"type": "act", "input_features": null}', "is not a LeRobot policy's: input_features is None"),
+        ('{"type": "act", "input_features": {}, "output_features": []}', "output_features is \\[\\]"),
+    ],
+)
+def test_a_config_that_is_no_policys_is_refused(text, words, act):
     (act / "config.json").write_text(text)
-    with pytest.raises(ManipError, match=r"config\.json is not a LeRobot policy's"):
+    with pytest.raises(ManipError, match=rf"config\.json {words}" if words.startswith("is") else words):
         read_interface(act)
 
 
@@ -96,7 +108,7 @@ def test_a_downloaded_processor_cannot_name_code_to_run(act):
     with pytest.raises(ManipError, match=r"subprocess\.Popen"):
         LearnedPolicy.load(act)
     path.write_text("[")
-    with pytest.raises(ManipError, match=r"policy_preprocessor\.json cannot be read"):
+    with pytest.raises(ManipError, match=r"policy_preprocessor\.json is not valid JSON"):
         LearnedPolicy.load(act)
     path.unlink()
     with pytest.raises(ManipError, match=r"no .*policy_preprocessor\.json"):

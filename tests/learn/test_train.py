@@ -5,21 +5,24 @@ from __future__ import annotations
 import json
 import os
 import stat
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from lerobot.configs.default import WandBConfig
 
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, check_fits, publish, read_meta
 from manip_il.learn.columns import learning_rows, split_by_episode
 from manip_il.learn.losses import LOSSES
+from manip_il.learn.metrics import METRICS_FILE
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.normalise import fit_statistics, scale_targets
 from manip_il.learn.order import ShuffledRows
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import METRICS_FILE, TrainConfig, fit
+from manip_il.learn.train import TrainConfig, fit
 
 
 def tiny(**changes) -> TrainConfig:
@@ -264,3 +267,32 @@ def test_a_checkpoint_is_readable_for_whom_the_umask_lets_read(tmp_path):
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "last" / "model.safetensors").stat().st_mode) == 0o640
+
+
+def test_curves_for_tensorboard_and_weights_and_biases(table, spec, tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_DIR", str(tmp_path))
+    wandb = WandBConfig(enable=True, mode="offline", disable_artifact=True)
+    config = TrainConfig(steps=4, batch_size=8, log_freq=1, tensorboard=True, wandb=wandb)
+    path = fit(table, config, tmp_path / "r", spec=spec)
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "r" / "tensorboard"))
+    events.Reload()
+    assert [point.step for point in events.Scalars("loss")] == [1, 2, 3, 4]
+    assert list((tmp_path / "r" / "wandb").glob("offline-run-*"))
+    plain = fit(table, TrainConfig(steps=4, batch_size=8, log_freq=1), tmp_path / "plain", spec=spec)
+    for name in ("model.safetensors", "manip_il.json"):
+        assert (path / name).read_bytes() == (plain / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "words"),
+    [
+        ("torch.utils.tensorboard", {"tensorboard": True}, r"manip_il\[tensorboard\]"),
+        ("wandb", {"wandb": WandBConfig(enable=True)}, "pip install wandb"),
+    ],
+)
+def test_a_logger_that_is_not_installed_is_named(module, options, words, table, spec, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=words):
+        fit(table, TrainConfig(steps=1, batch_size=8, **options), tmp_path / "r", spec=spec)

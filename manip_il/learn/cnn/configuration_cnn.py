@@ -7,10 +7,12 @@ from typing import override
 
 from lerobot.configs import PreTrainedConfig
 
-from manip_il.errors import MismatchError, UsageError
+from manip_il import checks
+from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 
 MIN_SIDE = 32  # of a picture [pixels]
+MOST_LAYERS, LARGEST = 32, 4_096  # of channels, keypoints, numbers to read off
 
 
 @PreTrainedConfig.register_subclass("cnn")
@@ -39,14 +41,19 @@ class CNNConfig(MLPConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.channels = tuple(self.channels)
-        if len(self.channels) < 2 or min(self.channels) < 1:
-            raise UsageError(f"policy.channels is {list(self.channels)}; expected at least two layers of at least 1")
-        if self.keypoints < 1:
-            raise UsageError(f"policy.keypoints is {self.keypoints}; expected at least 1")
-        for name in ("aux_weight", "privileged_size"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"policy.{name} is {getattr(self, name)}; expected 0 (off) or more")
+        try:
+            self._check()
+        except ManipError as error:
+            raise UsageError(f"policy.{error}") from error
+
+    def _check(self) -> None:
+        layers = checks.array("channels", self.channels, MOST_LAYERS)
+        self.channels = tuple(checks.whole("channels", layer, 1, LARGEST) for layer in layers)
+        if len(self.channels) < 2:
+            raise ManipError(f"channels is {list(self.channels)}; expected at least two layers")
+        checks.whole("keypoints", self.keypoints, 1, LARGEST)
+        checks.whole("privileged_size", self.privileged_size, 0, LARGEST)  # 0: off
+        checks.number("aux_weight", self.aux_weight, 0.0)
 
     @override
     def validate_features(self) -> None:

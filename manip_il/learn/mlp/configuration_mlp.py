@@ -9,9 +9,8 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from manip_il.errors import MismatchError, UnknownName, UsageError
-from manip_il.learn.losses import LOSSES
-from manip_il.learn.network import ACTIVATIONS, Shape
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.learn.network import Shape
 
 
 def _identity_mapping() -> dict[str, NormalizationMode]:
@@ -30,7 +29,7 @@ class MLPConfig(PreTrainedConfig):
     The network needs raw inputs (its targets are relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
 
-    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size below 1.
+    Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of bounds.
     """
 
     width: int = 256
@@ -52,15 +51,12 @@ class MLPConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.loss not in LOSSES:
-            raise UnknownName("loss", self.loss, LOSSES)
-        if self.activation not in ACTIVATIONS:
-            raise UnknownName("activation", self.activation, ACTIVATIONS)
-        for name, least in (("width", 1), ("depth", 1), ("components", 1), ("bins", 2)):
-            if getattr(self, name) < least:
-                raise UsageError(f"policy.{name} is {getattr(self, name)}; expected at least {least}")
-        if not self.clamp > 0:
-            raise UsageError(f"policy.clamp is {self.clamp}; expected more than 0")
+        try:
+            self.network_shape()
+        except UsageError:
+            raise
+        except ManipError as error:
+            raise UsageError(f"policy.{error}") from error
 
     def network_shape(self) -> Shape:
         """The part that the network is built from."""

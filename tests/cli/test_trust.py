@@ -1,0 +1,149 @@
+"""`--trust` is said on the command line alone, to every command that loads a policy; and what `--policy.path` means."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.groups import find_policy
+from manip_il.cli.main import load, main
+from manip_il.cli.options import dump_yaml, options_of, parse
+from manip_il.cli.study_file import read_plan
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.errors import ManipError, UsageError
+
+from .made_runs import ENV, make_eval, make_policy, make_run
+
+COMMANDS = ("train", "dagger", "eval", "replay", "compare", "study", "certify")
+STEP = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "evil/x"}}
+REQUIRED = {
+    "train": ["--dataset.root=x"],
+    "replay": ["x", "--episode=0"],
+    "compare": ["x", "y"],
+    "study": ["x"],
+}
+
+
+@pytest.fixture
+def hostile(tmp_path) -> Path:
+    """A policy of which a processor's step fetches a tokenizer by name."""
+    policy = make_policy(tmp_path / "hostile")
+    path = policy / "policy_preprocessor.json"
+    values = json.loads(path.read_text())
+    values["steps"].append(STEP)
+    path.write_text(json.dumps(values))
+    return policy
+
+
+@pytest.fixture
+def named(tmp_path) -> Path:
+    """A policy whose options name an encoder."""
+    folder = tmp_path / "named"
+    folder.mkdir()
+    features = {"input_features": {}, "output_features": {}}
+    config = {"type": "gaussian_actor", "vision_encoder_name": "evil/x", **features}
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "model.safetensors").touch()
+    return folder
+
+
+def refused(words: list[str], capsys) -> None:
+    assert main(words) == 1
+    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+    assert "evil/x" in line
+    assert "add --trust=true" in line
+
+
+def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, tmp_path, capsys):
+    out = f"--output_dir={tmp_path / 'out'}"
+    words = ["--env.horizon=8", "--workers=1", out]
+    refused(["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words], capsys)
+    refused(["certify", f"--policy.path={hostile}", "--cases=1", *words], capsys)
+    other = make_policy(tmp_path / "other")
+    refused(["compare", str(other), str(hostile), "--eval.n_episodes=1", *words], capsys)
+    file = make_eval(tmp_path / "e" / "eval.json", [True, False])
+    refused(["replay", str(file), "--episode=0", f"--policy.path={hostile}"], capsys)
+    refused(["dagger", f"--policy.path={named}", out], capsys)
+    refused(["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out], capsys)
+    with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
+        parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._config()  # pyright: ignore[reportAttributeAccessIssue]
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_worker_trusts_only_what_its_job_does(hostile):
+    job = RolloutJob(ENV, "policy", policy=hostile, labels="last", batch=1)
+    with Engine(2) as engine, pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
+        list(engine.run(job, [0, 1]))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_file_may_say_it_and_the_resolved_options_do_not(command, tmp_path):
+    cls = load(command)
+    [option] = [option for option in options_of(cls) if option.name == "trust"]
+    assert option.default is False
+    assert "only for sources that you trust" in option.help
+    said = parse(cls, [*REQUIRED.get(command, []), "--trust=true"])
+    assert said.trust is True  # pyright: ignore[reportAttributeAccessIssue]
+    assert "trust" not in dump_yaml(said)
+    (tmp_path / "c.yaml").write_text("trust: true\n")
+    with pytest.raises(UsageError, match=r"c\.yaml: trust: only the command line may say this; give --trust="):
+        parse(cls, [*REQUIRED.get(command, []), f"--config_path={tmp_path / 'c.yaml'}"])
+
+
+def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
+    path = tmp_path / "s.yaml"
+    path.write_text("arms: {a: {rounds: 1}, b: {trust: true}}\ntraining_seeds: 1\n")
+    with pytest.raises(UsageError, match=r"arms\.b: trust: only the command line"):
+        read_plan(path, None)
+    path.write_text("arms: {a: {rounds: 1}}\ntraining_seeds: 1\n")
+    assert read_plan(path, None).arms["a"].trust is False
+    assert read_plan(path, None, trust=True).arms["a"].trust is True
+
+
+def test_a_run_means_its_best_policy_else_its_newest(tmp_path):
+    run = make_run(tmp_path / "run", make_policy(tmp_path / "p"))
+    assert find_policy(run) == run / "best" / "pretrained_model"
+    shutil.rmtree(run / "best")
+    assert find_policy(run) == run / "round_002" / "policy" / "checkpoints" / "last" / "pretrained_model"
+    shutil.rmtree(run / "round_002")
+    assert find_policy(run) == run / "round_001" / "policy" / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path):
+    policy = make_policy(tmp_path / "p")
+    for step in ("000100", "020000", "001000"):
+        shutil.copytree(policy, tmp_path / "run" / "checkpoints" / step / "pretrained_model")
+    assert find_policy(tmp_path / "run") == tmp_path / "run" / "checkpoints" / "020000" / "pretrained_model"
+    (tmp_path / "run" / "checkpoints" / "last").symlink_to("001000")
+    assert find_policy(tmp_path / "run") == tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+
+
+@pytest.mark.parametrize("command", ["train", "dagger"])
+def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, tmp_path, monkeypatch):
+    run = make_run(tmp_path / "run", make_policy(tmp_path / "p"))
+    monkeypatch.chdir(tmp_path)
+    options = parse(load(command), [*REQUIRED.get(command, []), "--policy.path=run"])
+    config = options.config().fit.other(0) if command == "dagger" else options._config()  # pyright: ignore[reportAttributeAccessIssue]
+    assert Path(config.policy.pretrained_path).resolve() == find_policy(run).resolve()
+
+
+@pytest.mark.parametrize("value", ["missing", "null", "5"])
+@pytest.mark.parametrize("command", ["train", "dagger"])
+def test_a_path_without_a_policy_is_one_line(command, value, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, *REQUIRED.get(command, []), f"--policy.path={value}"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "policy" in err
+
+
+def test_eval_on_another_task_than_the_policys_says_which(tmp_path, capsys):
+    policy = make_policy(tmp_path / "p")
+    words = [f"--policy.path={policy}", "--task.type=lift", "--eval.n_episodes=1", f"--output_dir={tmp_path / 'e'}"]
+    assert main(["eval", *words]) == 1
+    assert "task differs: the policy has reach, the environment has lift" in capsys.readouterr().err
