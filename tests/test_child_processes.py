@@ -109,7 +109,7 @@ def test_another_system_has_the_pipe_alone(monkeypatch):
     child_processes._end_with(1)
 
 
-def wait_for[T](what) -> T:
+def wait_for(what):
     """What it gives, once it gives something."""
     ends = time.monotonic() + PATIENCE
     while not (found := what()):

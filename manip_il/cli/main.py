@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _silence_stdout()
             return EXIT_BROKEN_PIPE
         if debug:
-            print(_clean(traceback.format_exc()), file=sys.stderr, end="")
+            print(_clean(traceback.format_exc(), words), file=sys.stderr, end="")
         return _report(error, words)
     return 0
 
@@ -155,15 +155,15 @@ def _group(word: str) -> list[str]:
 def _report(error: BaseException, words: list[str]) -> int:
     """Say on standard error what happened, in one line; return the exit code."""
     if isinstance(error, KeyboardInterrupt):
-        _complain(f"interrupted{_how_to_go_on(error, words)}")
+        _complain(f"interrupted{_how_to_go_on(error, words)}", words)
         return EXIT_INTERRUPTED
     if isinstance(error, ManipError):
-        _complain(f"error: {error}")
+        _complain(f"error: {error}", words)
         return error.exit_code
     if isinstance(error, OSError) and error.strerror and error.filename:
-        _complain(f"error: {error.strerror}: {error.filename}")
+        _complain(f"error: {error.strerror}: {error.filename}", words)
         return 1
-    _complain(f"error: {type(error).__name__}: {error}; run again with --debug for the traceback")
+    _complain(f"error: {type(error).__name__}: {error}; run again with --debug for the traceback", words)
     return 1
 
 
@@ -180,20 +180,25 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     return f"; what was finished is kept; go on with: {resume_command(words)}"
 
 
-def _complain(text: str) -> None:
-    print(f"{PROGRAM}: {_one_line(text)}", file=sys.stderr, flush=True)
+def _complain(text: str, words: list[str]) -> None:
+    print(f"{PROGRAM}: {_one_line(text, words)}", file=sys.stderr, flush=True)
 
 
-def _one_line(text: str) -> str:
+def _one_line(text: str, words: list[str]) -> str:
     """Without its middle where it is too long to be read: what to do next stands at the end."""
-    line = " ".join(_clean(text).split())
+    line = " ".join(_clean(text, words).split())
     return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
 
 
-def _clean(text: str) -> str:
+def _clean(text: str, words: list[str]) -> str:
     """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library."""
-    from manip_il.data.remote.errors import redact
+    from manip_il.data.remote.errors import mask, redact
 
+    if any(":" in word or "@" in word for word in words):
+        from manip_il.data.remote.url import secrets_in
+
+        for secret in (one for word in words for one in secrets_in(word)):
+            text = mask(text, secret)
     return redact(text)
 
 

@@ -21,7 +21,7 @@ def run_command(words: Sequence[str], log: str, warm: bool = False) -> None:
     os.dup2(handle, 1)
     os.dup2(handle, 2)
     if warm:
-        vars(util)["spawnv_passfds"] = _fork_what_would_be_spawned
+        util.spawnv_passfds = _fork_what_would_be_spawned  # pyright: ignore
     sys.exit(main(words))
 
 

@@ -22,6 +22,7 @@ _PATTERNS = (
     ),
     (re.compile(r"(?i)(authorization['\"]?\s*[:=]\s*['\"]?)(?:bearer |basic |aws4[\w-]* )?[^\s'\"]+"), r"\1" + HIDDEN),
 )
+_PART = 4  # characters of a secret that are too many to be seen
 _SHORTEST = 6  # characters of a secret that is hidden wherever it stands: shorter ones are words of any text
 
 
@@ -67,6 +68,22 @@ class TransientError(RemoteError):
     def __init__(self, message: str, after: float | None = None):
         super().__init__(message)
         self.after = after
+
+
+def mask(text: str, secret: str) -> str:
+    """`text` without the secret and without any part of it of four characters or more, spelled as `repr` does too."""
+    spellings = {secret, " ".join(secret.split()), repr(secret)[1:-1]}
+    parts = {one[start : start + _PART] for one in spellings for start in range(max(1, len(one) - _PART + 1))} - {""}
+    if len(secret) < _PART:
+        return text  # a word of any text
+    hidden = bytearray(len(text))
+    for part in parts:
+        at = text.find(part)
+        while at >= 0:
+            hidden[at : at + len(part)] = b"\1" * len(part)
+            at = text.find(part, at + 1)
+    shown = "".join("\0" if is_hidden else letter for letter, is_hidden in zip(text, hidden, strict=True))
+    return re.sub("\0+", HIDDEN, shown)
 
 
 def redact(text: str, *secrets: str) -> str:

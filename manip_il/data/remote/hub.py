@@ -7,7 +7,6 @@ saw; then the tag `v3.0`, by which LeRobot looks for datasets, is moved there.
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, constants
 from manip_il.data.lerobot_layout import VERSION
 from manip_il.data.remote.errors import ConflictError, HashError, NotFoundError, RemoteError, TransientError
 from manip_il.data.remote.hub_count import counted
-from manip_il.data.remote.hub_repo import HubRepo, Type
+from manip_il.data.remote.hub_repo import COMMIT, HubRepo, Type
 from manip_il.data.remote.hub_talk import HF, LOGIN, host, quiet
 from manip_il.data.remote.hub_tree import with_git
 from manip_il.data.remote.manifest import FileEntry, Kind, Manifest
@@ -30,7 +29,6 @@ from manip_il.errors import UsageError
 MAIN = "main"
 BATCH_FILES, BATCH_SIZE = 100, 2**28  # uploaded at once: files, bytes
 _TYPES: dict[Kind, Type] = {"dataset": "dataset", "policy": "model"}
-_COMMIT = re.compile(r"[0-9a-f]{40}")
 _TAG_TRIES = 5
 
 
@@ -129,7 +127,7 @@ class HubRemote:
         if not self._repo.exists_as(_TYPES[self.kind]) and self._repo.exists_as(_TYPES[other]):
             text = f"{self.url.place} is taken by a {other}, {_url(other, self.url.place)}"
             raise UsageError(f"{text}; choose another name for the {self.kind}")
-        if _COMMIT.fullmatch(self.branch):
+        if COMMIT.fullmatch(self.branch):
             raise UsageError(f"{self.url}: a commit cannot be pushed to; name a branch, or none for main")
         self._repo.create(self.private)
         is_new = self.branch not in self._repo.refs()[0]
@@ -137,7 +135,7 @@ class HubRemote:
             self._repo.create_branch(self.branch)  # with what main holds: this push replaces it
         self._absence = ""
         commit = self._repo.find(self.branch)
-        if not _COMMIT.fullmatch(commit):
+        if not COMMIT.fullmatch(commit):
             raise NotFoundError(f"{self.describe()} is not there, although it was made just now; push again")
         if not is_new and self._repo.tree(commit).own:
             raise ConflictError(self.describe())  # nothing was there a moment ago

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import BinaryIO, Literal
 from urllib.parse import quote
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_session
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, GitRefInfo, HfApi, constants, get_session
 from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundError
 from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
 
+from manip_il import checks
 from manip_il.data.remote.errors import HashError, RemoteError, TransientError
-from manip_il.data.remote.hub_talk import CONNECT, talking
+from manip_il.data.remote.hub_client import CONNECT, FILE
+from manip_il.data.remote.hub_talk import host, talking
 from manip_il.data.remote.hub_tree import Tree
 from manip_il.data.remote.manifest import LONGEST_TEXT, Manifest
 from manip_il.data.remote.remote import MANIFEST_FILE
 from manip_il.data.remote.retry import Retry
 
 Type = Literal["dataset", "model"]
+COMMIT = re.compile(r"[0-9a-f]{40}")
 _LIBRARY = "manip_il"
 _UPLOADS = 8  # threads
 
@@ -44,7 +48,8 @@ class HubRepo:
 
         def once() -> str:
             try:
-                return self.api.repo_info(self.place, repo_type=self.type, revision=revision).sha or "no revision"
+                found: object = self.api.repo_info(self.place, repo_type=self.type, revision=revision).sha
+                return self._commit(found) if found else "no revision"
             except RevisionNotFoundError:
                 return "no revision"
             except RepositoryNotFoundError:
@@ -58,9 +63,12 @@ class HubRepo:
 
     def refs(self) -> tuple[dict[str, str], dict[str, str]]:
         """Branches and tags, each name -> commit."""
-        refs = self.ask(lambda: self.api.list_repo_refs(self.place, repo_type=self.type))
-        branches, tags = ({one.name: one.target_commit for one in part} for part in (refs.branches, refs.tags))
-        return branches, tags
+
+        def once() -> tuple[dict[str, str], dict[str, str]]:
+            refs = self.api.list_repo_refs(self.place, repo_type=self.type)
+            return self._heads(refs.branches), self._heads(refs.tags)
+
+        return self.ask(once)
 
     def create(self, private: bool) -> None:
         """Make the repository where it is missing."""
@@ -85,7 +93,7 @@ class HubRepo:
             listed = self.api.list_repo_tree(self.place, repo_type=self.type, revision=commit, recursive=True)
             return Tree.of(commit, listed)
 
-        return self.ask(once)
+        return self.ask(once, listing=True)
 
     def stored_manifest(self, tree: Tree) -> Manifest | None:
         """Our manifest of a commit; None where another program pushed it. Raises `ManifestError`."""
@@ -113,7 +121,10 @@ class HubRepo:
             headers["Range"] = f"bytes={offset}-"
         limits = (CONNECT, float(constants.HF_HUB_DOWNLOAD_TIMEOUT), CONNECT, CONNECT)
         at = offset
-        with self._talking(), get_session().stream("GET", url, headers=headers, timeout=limits) as response:
+        with (
+            self._talking(),
+            get_session().stream("GET", url, headers=headers, timeout=limits, extensions={FILE: True}) as response,
+        ):
             hf_raise_for_status(response)
             skip = offset if response.status_code == 200 else 0  # a server that knows no ranges
             for piece in response.iter_raw():
@@ -139,25 +150,36 @@ class HubRepo:
     ) -> str:
         """One commit on top of `parent`, tried once. Raises `ConflictError` where that is no longer the head."""
         with self._talking():
-            return self.api.create_commit(
+            made = self.api.create_commit(
                 self.place,
                 operations,
                 commit_message=title,
                 repo_type=self.type,
                 revision=branch,
                 parent_commit=parent,
-            ).oid
+            )
+            return self._commit(made.oid)
 
-    def ask[T](self, what: Callable[[], T]) -> T:
-        """What it answers, in the end."""
+    def ask[T](self, what: Callable[[], T], *, listing: bool = False) -> T:
+        """What it answers, in the end. listing: the answer comes in pages."""
 
         def once() -> T:
-            with self._talking():
+            with self._talking(listing=listing):
                 return what()
 
         return self.retry(once)
 
     @contextlib.contextmanager
-    def _talking(self) -> Iterator[None]:
-        with talking(self.shown, self.endpoint):
+    def _talking(self, *, listing: bool = False) -> Iterator[None]:
+        with talking(self.shown, self.endpoint, listing=listing):
             yield
+
+    def _heads(self, refs: Sequence[GitRefInfo]) -> dict[str, str]:
+        return {checks.text("the name of a branch or tag", one.name): self._commit(one.target_commit) for one in refs}
+
+    def _commit(self, value: object) -> str:
+        """A commit's id, which becomes part of URLs, as a Hub answered it."""
+        if not isinstance(value, str) or not COMMIT.fullmatch(value):
+            text = f"{self.shown}: {host(self.endpoint)} names the commit {checks.shorten(value)}"
+            raise RemoteError(f"{text}, expected 40 hexadecimal digits; is it a Hub?")
+        return value

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 
 import httpx
-from huggingface_hub import constants, get_session
+from huggingface_hub import constants
 from huggingface_hub.errors import (
     EntryNotFoundError,
     HfHubHTTPError,
@@ -38,13 +38,15 @@ from manip_il.data.remote.errors import (
     TransientError,
     redact,
 )
+from manip_il.data.remote.hub_client import guarded
 from manip_il.data.remote.retry import retry_after
 from manip_il.errors import ManipError
 
 HF = "https://huggingface.co"
-CONNECT, PATIENCE = 20.0, 120.0  # until a connection is there, until the next byte [s]
 LOGIN = "run `hf auth login`, or set HF_TOKEN"
 _TEMPORARY = (408, 429, 500, 502, 503, 504)
+# What huggingface_hub raises over an answer of the wrong shape: it checks none.
+_NONSENSE = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
 _FULL = (402, 507)  # payment required, insufficient storage
 _QUOTA = re.compile(
     r"(?i)\b(?:storage|quota|space)\b"
@@ -52,19 +54,14 @@ _QUOTA = re.compile(
 
 
 @contextlib.contextmanager
-def talking(place: str, endpoint: str) -> Iterator[None]:
-    """What goes wrong inside is one of our errors, about `place`; time limits hold inside.
-
-    huggingface_hub sets no limits, so that a server that says nothing would be waited for without end.
-    """
+def talking(place: str, endpoint: str, *, listing: bool = False) -> Iterator[None]:
+    """What goes wrong inside is one of our errors, about `place`; the limits of `hub_client` hold inside."""
     noisy = logging.getLogger("httpx")  # it tells every URL, signatures included, wherever INFO is on
     if noisy.getEffectiveLevel() < logging.WARNING:
         noisy.setLevel(logging.WARNING)
-    hooks = get_session().event_hooks["request"]
-    if _limit not in hooks:
-        hooks.append(_limit)
     try:
-        yield
+        with guarded(endpoint, listing=listing):
+            yield
     except ManipError:
         raise
     except Exception as error:
@@ -97,6 +94,8 @@ def quiet(endpoint: str) -> Iterator[None]:
 def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | None:
     """The error in our words; None for one that is no remote's."""
     cause = _cause(error)
+    if isinstance(cause, RemoteError):
+        return cause
     if isinstance(cause, HfHubHTTPError):
         return _answered(cause, place, endpoint)
     if isinstance(cause, OfflineModeIsEnabled):
@@ -113,6 +112,10 @@ def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | 
         return TransientError(f"{place}: the connection to {host(endpoint)} was cut")
     if isinstance(cause, json.JSONDecodeError):
         return TransientError(f"{place}: {host(endpoint)} answered something that is not JSON; is it a Hub?")
+    if isinstance(cause, (httpx.HTTPError, httpx.InvalidURL, *_NONSENSE)):
+        return RemoteError(
+            f"{place}: {host(endpoint)} answered something that no Hub answers ({type(cause).__name__}); is it a Hub?"
+        )
     return None
 
 
@@ -160,10 +163,3 @@ def _cause(error: BaseException) -> BaseException:
     while isinstance(error, RuntimeError) and error.__cause__ is not None:
         error = error.__cause__
     return error
-
-
-def _limit(request: httpx.Request) -> None:
-    given = request.extensions.get("timeout") or {}
-    if all(value is None for value in given.values()):
-        limits = {"connect": CONNECT, "read": PATIENCE, "write": PATIENCE, "pool": PATIENCE}
-        request.extensions = {**request.extensions, "timeout": limits}

@@ -11,10 +11,13 @@ from typing import BinaryIO
 
 from huggingface_hub import RepoFile
 
-from manip_il.data.remote.manifest import FileEntry, Kind, Manifest
+from manip_il.checks import shorten, text, whole
+from manip_il.data.remote.errors import ManifestError
+from manip_il.data.remote.manifest import LARGEST, MOST_FILES, FileEntry, Kind, Manifest
 from manip_il.data.remote.paths import is_hidden
 from manip_il.data.remote.remote import MANIFEST_FILE
 
+MOST_ENTRIES = 2 * MOST_FILES  # with folders
 SMALL = 20_000_000  # a Hub puts larger files into LFS, which knows their sha256 [bytes]
 
 
@@ -27,8 +30,14 @@ class Tree:
 
     @classmethod
     def of(cls, commit: str, files: Iterable[object]) -> Tree:
-        """From what `list_repo_tree` gives."""
-        return cls(commit, {one.path: one for one in files if isinstance(one, RepoFile) and not is_hidden(one.path)})
+        """From what `list_repo_tree` gives. Raises `ManipError` for an entry that is none, and for too many."""
+        found: dict[str, RepoFile] = {}
+        for count, one in enumerate(files, start=1):
+            if count > MOST_ENTRIES:
+                raise ManifestError(f"the commit {commit} has more than {MOST_ENTRIES:,} files and folders: refused")
+            if isinstance(one, RepoFile) and not is_hidden(_checked(one).path):
+                found[one.path] = one
+        return cls(commit, found)
 
     @property
     def own(self) -> Mapping[str, RepoFile]:
@@ -83,6 +92,17 @@ def _git_sha1(file: BinaryIO, size: int) -> str:
     while chunk := file.read(2**20):
         digest.update(chunk)
     return digest.hexdigest()
+
+
+def _checked(file: RepoFile) -> RepoFile:
+    """As a Hub listed it, with the types that it should have; what they may be is the manifest's affair."""
+    text("the path of a file on the Hub", file.path)
+    whole(f"the size of {shorten(file.path)} on the Hub", file.size, 0, LARGEST)
+    text(f"the hash of {shorten(file.path)} on the Hub", file.blob_id)
+    if file.lfs is not None:
+        whole(f"the size of {shorten(file.path)} on the Hub", file.lfs.size, 0, LARGEST)
+        text(f"the hash of {shorten(file.path)} on the Hub", file.lfs.sha256)
+    return file
 
 
 def _entry(file: RepoFile, known: FileEntry | None) -> FileEntry:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import re
 import secrets
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Generator, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -14,12 +15,15 @@ from typing import Any, BinaryIO
 from fsspec.asyn import sync
 from s3fs import S3FileSystem
 
+from manip_il.data.remote import s3_session
 from manip_il.data.remote.blobs import OBJECTS, STALE, Stored
 from manip_il.data.remote.errors import AuthError, NotFoundError, RemoteError, TransientError
 from manip_il.data.remote.manifest import LONGEST_TEXT
 from manip_il.data.remote.object_store import ObjectRemote, in_threads, wrong_when_read
+from manip_il.data.remote.pace import Pace
 from manip_il.data.remote.remote import MANIFEST_FILE, Advance
 from manip_il.data.remote.s3_errors import code_of, explained, status_of
+from manip_il.data.remote.s3_session import read_paced
 from manip_il.data.remote.s3_upload import Part, abort_old, is_as_sent, send_parts
 from manip_il.data.remote.url import RemoteUrl
 from manip_il.errors import UsageError
@@ -51,6 +55,7 @@ class S3Blobs:
         self._left: list[str] = []  # what killed pushes left
         # Botocore's and s3fs' own tries are switched off: `Retry` knows what the server asked for.
         config: dict[str, Any] = {**TIMEOUTS, "retries": {"total_max_attempts": 1}, "max_pool_connections": 32}
+        config["http_session_cls"] = s3_session.BoundedSession
         config |= {"request_checksum_calculation": "when_required", "response_checksum_validation": "when_required"}
         self._fs = S3FileSystem(config_kwargs=config, skip_instance_cache=True, use_listings_cache=False)
 
@@ -110,7 +115,8 @@ class S3Blobs:
                 if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
                     text = f"{self._name}: the store knows no ranges; remove the .pulling folder and pull again"
                     raise RemoteError(text)
-                while chunk := await body.read(CHUNK):
+                pace = Pace(self._name)
+                while chunk := await read_paced(body, CHUNK, pace):
                     target.write(chunk)
             finally:
                 body.close()
@@ -148,7 +154,8 @@ class S3Blobs:
                 answer = self._run(lambda client: client.head_object(**self._at_key(key)), f"read {self._name}")
             except NotFoundError:
                 return None
-            return Stored(int(answer["ContentLength"]), _age(answer["LastModified"], answer))
+            with self._speaking_s3():
+                return Stored(int(answer["ContentLength"]), _age(answer["LastModified"], answer))
 
         return {key: stored for key, stored in in_threads(self.threads, one, keys).items() if stored}
 
@@ -156,13 +163,14 @@ class S3Blobs:
         """Every object."""
         found: dict[str, Stored] = {}
         self._left = []
-        for answer in self._pages(f"{self._prefix}/{OBJECTS}/"):
-            for item in answer.get("Contents", ()):
-                key, age = item["Key"].rpartition("/")[2], _age(item["LastModified"], answer)
-                if _KEY.fullmatch(key):
-                    found[key] = Stored(int(item["Size"]), age)
-                elif age > STALE:
-                    self._left.append(item["Key"])
+        with self._speaking_s3():
+            for answer in self._pages(f"{self._prefix}/{OBJECTS}/"):
+                for item in answer.get("Contents", ()):
+                    key, age = item["Key"].rpartition("/")[2], _age(item["LastModified"], answer)
+                    if _KEY.fullmatch(key):
+                        found[key] = Stored(int(item["Size"]), age)
+                    elif age > STALE:
+                        self._left.append(item["Key"])
         return found
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
@@ -188,13 +196,23 @@ class S3Blobs:
             answer = next(iter(self._pages(f"{self._prefix}/", Delimiter="/", MaxKeys=20)))
         except AuthError:
             return set()  # a key may write without seeing what is there
-        names = [item["Key"] for item in answer.get("Contents", ())]
-        names += [item["Prefix"] for item in answer.get("CommonPrefixes", ())]
-        return {name.removeprefix(f"{self._prefix}/") for name in names}
+        with self._speaking_s3():
+            names = [item["Key"] for item in answer.get("Contents", ())]
+            names += [item["Prefix"] for item in answer.get("CommonPrefixes", ())]
+            return {name.removeprefix(f"{self._prefix}/") for name in names}
+
+    @contextlib.contextmanager
+    def _speaking_s3(self) -> Generator[None]:
+        """What an answer lacks, or has of the wrong type, is the store's fault."""
+        try:
+            yield
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+            text = f"{self._name}: the store answered something that S3 does not ({type(error).__name__})"
+            raise RemoteError(f"{text}; check AWS_ENDPOINT_URL") from error
 
     def _pages(self, prefix: str, **more: Any) -> Iterable[Mapping[str, Any]]:
         token: dict[str, str] = {}
-        while True:
+        for _ in range(s3_session.MOST_PAGES):
             answer = self._run(
                 lambda client, token=token: client.list_objects_v2(Bucket=self._bucket, Prefix=prefix, **more, **token),
                 f"list {self._name}",
@@ -202,7 +220,10 @@ class S3Blobs:
             yield answer
             if not answer.get("IsTruncated"):
                 return
-            token = {"ContinuationToken": answer["NextContinuationToken"]}
+            before, token = token, {"ContinuationToken": answer["NextContinuationToken"]}
+            if token == before:
+                raise RemoteError(f"cannot list {self._name}: the store goes on from where it was; does it speak S3?")
+        raise RemoteError(f"cannot list {self._name}: it has more than {s3_session.MOST_PAGES:,} pages")
 
     def _try_conditions(self) -> bool:
         """Whether writes that must be refused are: on an object that nobody else knows."""
@@ -232,7 +253,8 @@ class S3Blobs:
     async def _get_manifest(self, client: Any) -> tuple[bytes, str]:
         answer = await client.get_object(**self._at(MANIFEST_FILE))
         data = bytearray()
-        while len(data) <= LONGEST_TEXT and (piece := await answer["Body"].read(CHUNK)):
+        pace = Pace(self._name)
+        while len(data) <= LONGEST_TEXT and (piece := await read_paced(answer["Body"], CHUNK, pace)):
             data += piece
         return bytes(data), str(answer["ETag"])
 

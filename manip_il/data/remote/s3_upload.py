@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 from manip_il.data.remote.errors import TransientError
 from manip_il.data.remote.remote import Advance
 from manip_il.data.remote.s3_errors import GONE, code_of, status_of
+from manip_il.data.remote.s3_session import MOST_PAGES
 
 PART = 2**25  # [bytes]
 MOST_PARTS = 9_000  # S3 takes 10,000
@@ -108,7 +109,7 @@ async def abort_old(
 async def _uploads(client: Any, bucket: str, prefix: str) -> AsyncIterator[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """Uploads that were begun and not ended, each with the answer that named it."""
     more: dict[str, str] = {}
-    while True:
+    for _ in range(MOST_PAGES):
         answer = await _asked(client.list_multipart_uploads, Bucket=bucket, Prefix=prefix, **more)
         for item in answer.get("Uploads", ()):
             if item["Key"].startswith(prefix):  # some stores do not know of prefixes here
@@ -128,13 +129,14 @@ async def _under_way(client: Any, place: Mapping[str, str]) -> str | None:
 async def _parts(client: Any, place: Mapping[str, str]) -> dict[int, tuple[str, int]]:
     """ETag and size [bytes] of the parts that have arrived, by number."""
     found, more = dict[int, tuple[str, int]](), dict[str, int]()
-    while True:
+    for _ in range(MOST_PAGES):
         answer = await _asked(client.list_parts, **place, **more)
         for part in answer.get("Parts", ()):
             found[int(part["PartNumber"])] = str(part["ETag"]).strip('"'), int(part["Size"])
         if not answer.get("IsTruncated"):
             return found
         more = {"PartNumberMarker": int(answer["NextPartNumberMarker"])}
+    return found
 
 
 async def _asked(question: Callable[..., Awaitable[Mapping[str, Any]]], **about: Any) -> Mapping[str, Any]:

@@ -28,6 +28,8 @@ _REMOTES = {  # scheme -> what is made of the URL; imported when it is needed
 _HUB_NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?")
 _REVISION = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._/-]{0,254}")
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,253}")
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]{0,15}")
+_LIKE_AN_ADDRESS = re.compile(r"://|:.*@|@.*:|^(?:hf|s3|sftp|file|ssh|scp|ftps?|https?):", re.DOTALL | re.IGNORECASE)
 _SFTP = re.compile(
     r"(?:(?P<user>[^:@/]+)(?::(?P<password>[^@]*))?@)?(?P<host>\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::(?P<port>\d+))?"
 )
@@ -56,7 +58,8 @@ class RemoteUrl:
         if not colon:
             raise UsageError(f"{_shown(text)!r} is no URL; expected one of {'; '.join(FORMS.values())}")
         if scheme not in FORMS:
-            raise UnknownName("scheme", _shown(f"{scheme}://"), [f"{known}://" for known in FORMS])
+            shown = f"{scheme}://" if _SCHEME.fullmatch(scheme) else "..."
+            raise UnknownName("scheme", shown, [f"{known}://" for known in FORMS])
         if not rest or any(ord(letter) < 32 or ord(letter) == 127 for letter in rest):
             raise _wrong(scheme, text)
         return _PARSERS[scheme](text, rest)
@@ -100,6 +103,8 @@ def _is_revision(text: str) -> bool:
 def _s3(text: str, rest: str) -> RemoteUrl:
     bucket, _, prefix = rest.partition("/")
     prefix = prefix.strip("/")
+    if ":" in prefix.rpartition("@")[0]:  # an address of another kind, with a password
+        raise _wrong("s3", text)
     if not _BUCKET.fullmatch(bucket) or any(part in ("", ".", "..") for part in prefix.split("/")):
         raise _wrong("s3", text)
     return RemoteUrl("s3", f"{bucket}/{prefix}")
@@ -108,6 +113,8 @@ def _s3(text: str, rest: str) -> RemoteUrl:
 def _sftp(text: str, rest: str) -> RemoteUrl:
     split = rest.find("/")
     found = _SFTP.fullmatch(rest[:split]) if split > 0 else None
+    if ":" in rest.rpartition("@")[0] and rest.rfind("@") != rest.find("@", 0, split):
+        found = None  # a password that holds / or @ is not told from a host and a path
     path = rest[split:].rstrip("/")
     if found is None or not path or ".." in path.split("/"):
         raise _wrong("sftp", text)
@@ -120,7 +127,7 @@ def _sftp(text: str, rest: str) -> RemoteUrl:
 
 def _file(text: str, rest: str) -> RemoteUrl:
     place = rest.rstrip("/")
-    if not place:
+    if not place or ":" in place.rpartition("@")[0]:  # the latter is an address of another kind, with a password
         raise _wrong("file", text)
     return RemoteUrl("file", place)
 
@@ -129,11 +136,31 @@ _PARSERS = {"hf": _hub, "s3": _s3, "sftp": _sftp, "file": _file}
 
 
 def _wrong(scheme: str, text: str) -> UsageError:
-    return UsageError(f"{_shown(text)!r} cannot be read; expected {FORMS[scheme]}")
+    hint = " (in a password write / as %2F, @ as %40, : as %3A)" if scheme == "sftp" else ""
+    return UsageError(f"{_shown(text)!r} cannot be read; expected {FORMS[scheme]}{hint}")
+
+
+def secrets_in(word: str) -> list[str]:
+    """What may be a secret in a word of a command line: an address's password, or all that may be one.
+
+    Where the address cannot be read, that is everything behind the first colon, or before the last @.
+    """
+    text = word.partition("=")[2] if word.startswith("-") and "=" in word.partition("://")[0] else word.lstrip("-")
+    if not _LIKE_AN_ADDRESS.search(text):
+        return []
+    try:
+        password = RemoteUrl.parse(text).password
+        written = text.partition("://")[2].partition("@")[0].partition(":")[2]
+        return [password, written] if password else []
+    except UsageError:
+        scheme, mark, rest = text.partition("://")
+        rest = rest if mark and _SCHEME.fullmatch(scheme) else text
+        return [rest.partition(":")[2] if ":" in rest else rest.rpartition("@")[0]]
 
 
 def _shown(text: str) -> str:
-    """What was given, less all that may be a password."""
-    scheme, colon, rest = text.rpartition("://")
-    before, at, behind = rest.rpartition("@")
-    return f"{scheme}{colon}...@{behind}" if at and ":" in before else text
+    """What was given, or its scheme alone where anything of the rest may be a password."""
+    scheme, mark, rest = text.partition("://")
+    if mark and _SCHEME.fullmatch(scheme):
+        return f"{scheme}://..." if ":" in rest or "@" in rest else text
+    return "..." if ":" in text or "@" in text else text

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.data.remote import hub_talk
+from manip_il.data.remote import hub_client
 from manip_il.data.remote.errors import ConflictError, HashError, RemoteError
 from manip_il.data.remote.hub import HubRemote
 from manip_il.data.remote.remote import MANIFEST_FILE
@@ -103,7 +103,7 @@ def test_bytes_that_stay_wrong_are_never_taken(hub: Hub, tmp_path: Path):
 
 
 def test_a_server_that_keeps_silent_is_given_up(hub: Hub, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(hub_talk, "PATIENCE", 0.2)
+    monkeypatch.setattr(hub_client, "PATIENCE", 0.2)
     hub.faults.append(Fault("GET /api/datasets", 100, pause=1.0))
     remote = HubRemote(RemoteUrl.parse(DATASET), retry=Retry(tries=2, first=0.01))
     with pytest.raises(RemoteError, match="gave no answer in time; tried 2 times"):

@@ -1,0 +1,87 @@
+"""A server on loopback that answers whatever bytes a test tells it to, and remembers who asked."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+Script = Callable[[str], Iterable[bytes]]  # "GET /path?query" -> all that is sent
+
+
+@dataclass
+class Liar:
+    """`asked`: the head of every request, as it came. One connection a request."""
+
+    script: Script
+    asked: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self._threads: list[threading.Thread] = []
+        self.closing = threading.Event()
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    @property
+    def port(self) -> int:
+        return self._socket.getsockname()[1]
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def close(self) -> None:
+        self.closing.set()
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def _listen(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                connection, _ = self._socket.accept()
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            head = b""
+            while b"\r\n\r\n" not in head:
+                if not (piece := connection.recv(65536)):
+                    return
+                head += piece
+            text, _, body = head.partition(b"\r\n\r\n")
+            self.asked.append(text.decode())
+            length = [line.split(b":")[1] for line in text.lower().splitlines() if line.startswith(b"content-length:")]
+            left = int(length[0]) - len(body) if length else 0
+            while left > 0 and (piece := connection.recv(65536)):
+                left -= len(piece)
+            for piece in self.script(" ".join(text.decode().split()[:2])):
+                if self.closing.is_set():
+                    return
+                connection.sendall(piece)
+
+
+@contextlib.contextmanager
+def a_liar(script: Script) -> Iterator[Liar]:
+    """A running one."""
+    liar = Liar(script)
+    try:
+        yield liar
+    finally:
+        liar.close()
+
+
+def answer(value: Any = b"", status: str = "200 OK", **headers: str) -> list[bytes]:
+    """A whole answer; what is no bytes goes as JSON."""
+    body = value if isinstance(value, bytes) else json.dumps(value).encode()
+    return [head(status, **{"Content-Length": str(len(body)), **headers}), body]
+
+
+def head(status: str = "200 OK", **headers: str) -> bytes:
+    """The first part of an answer; `_` in a header's name is `-`."""
+    given = {"Connection": "close", "Content_Type": "application/json", **headers}
+    lines = [f"{name.replace('_', '-')}: {value}" for name, value in given.items()]
+    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
