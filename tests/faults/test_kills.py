@@ -43,6 +43,11 @@ class Recorder:
         words += [f"--dataset.root={self.root}", f"--workers={self.workers}", *more]
         return self.start("record", *words, log=self.folder / "log")
 
+    @property
+    def resume(self) -> list[str]:
+        """Where something is there to be resumed: a kill may come before that."""
+        return ["--resume=true"] if self.journals.is_dir() and any(self.journals.iterdir()) else []
+
     def run(self, *more: str) -> float:
         """Seconds that an undisturbed recording takes."""
         started = time.monotonic()
@@ -75,7 +80,7 @@ def test_no_kill_loses_a_finished_episode_or_leaves_a_dataset_that_cannot_be_rea
             assert not recorder.root.exists() or tree_of(recorder.root) == expected
             if not killed:
                 break
-        recorder.run("--resume=true")
+        recorder.run(*recorder.resume)
         assert tree_of(recorder.root) == expected
         assert contents(recorder.journals) == episodes
         assert [one for one in examine_folder(recorder.root) if one.severity is Severity.ERROR] == []
@@ -86,7 +91,7 @@ def test_no_kill_loses_a_finished_episode_or_leaves_a_dataset_that_cannot_be_rea
 
 def kill_one(recorder: Recorder, delay: float) -> tuple[bool, dict[str, bytes]]:
     """Start or go on, kill after `delay` [s]; whether it was still at work, and the episodes it had finished then."""
-    process = recorder.begin(*(["--resume=true"] if recorder.journals.exists() else []))
+    process = recorder.begin(*recorder.resume)
     process.join(delay)
     finished = contents(recorder.journals)
     if process.exitcode is not None:
