@@ -11,7 +11,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.cli.options import CONFIG_HEADER
-from manip_il.data.atomic import write_file
+from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.writing import writing
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
@@ -21,9 +21,13 @@ _MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     """Make sure that `folder` may be written to; on return it is absent or empty, unless `resume`.
 
-    It is not created, as LeRobot's writers insist on doing so themselves. Raises what `check_output` raises.
+    It is not created, as LeRobot's writers insist on doing so themselves. What a killed writer left of a file is
+    removed: call it while the folder is held (`exclusive`). Raises what `check_output` raises.
     """
     check_output(folder, resume=resume, overwrite=overwrite)
+    for path in folder.rglob(f".*{PARTIAL}") if resume else ():
+        if path.is_file():  # a folder has a lock of its own, and goes with the next writer
+            path.unlink()
     if overwrite and folder.exists() and any(folder.iterdir()):
         _delete(folder)
 

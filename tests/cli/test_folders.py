@@ -43,6 +43,12 @@ def test_resume_leaves_everything(ours):
     assert (ours / "config.yaml").exists()
 
 
+def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
+    (ours / ".fingerprint.json.x.partial").touch()
+    prepare_output(ours, resume=True, overwrite=False)
+    assert [path.name for path in ours.iterdir()] == ["config.yaml"]
+
+
 def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(tmp_path):
     options = RecordOptions(dataset=DatasetGroup(root=tmp_path / "demos"))
     (tmp_path / f".{CONFIG_FILE}.123.tmp").write_text("# manip-")
