@@ -54,6 +54,8 @@ def read_paths(root: Path) -> Paths | None:
         return None
     table = read_table(root, [s.ENVIRONMENT_STATE, layout.EPISODE_INDEX])
     index, values = table[layout.EPISODE_INDEX], table[s.ENVIRONMENT_STATE]
+    if not len(index):
+        return None
     columns = {thing: [names.index(f"{thing}.{axis}") for axis in "xyz"] for thing in ("object", "goal")}
     episodes = [values[index == episode] for episode in np.unique(index)[:EPISODES]]
     goals = tuple(rows[0, columns["goal"]] for rows in episodes)

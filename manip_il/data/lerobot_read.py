@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from manip_il.mdp import Episode
 
 UNKNOWN_TASK = "unknown"
 _PICTURES = ("video", "image")
+_INDEX = {"dtype": "int64", "shape": (1,)}
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def read_table(
     _check_rows(root, len(table))
     if episodes is not None:
         table = _keep(root, table, episodes, info["total_episodes"])
-    return {name: _to_numpy(table.column(name), table_features[name]["shape"]) for name in names}
+    return {name: _values(root, name, table, table_features[name]) for name in names}
 
 
 def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -97,8 +98,8 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     with closing(_pictures(root, cameras)) as frames:
         for path in _data_files(root):
             table = _read_file(path, [*stored, layout.EPISODE_INDEX])
-            columns = {key: _to_numpy(table.column(key), shapes[key]).reshape(-1, *shapes[key]) for key in stored}
-            index = table.column(layout.EPISODE_INDEX).to_numpy()
+            columns = {key: _values(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
+            index = _values(root, layout.EPISODE_INDEX, table, _INDEX)
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
@@ -303,6 +304,22 @@ def _keep(root: Path, table: pa.Table, episodes: Sequence[int], count: int) -> p
         if not 0 <= episode < count:
             raise UsageError(f"{root} has no episode {episode}; it has 0 to {count - 1}")
     return table.filter(np.isin(table.column(layout.EPISODE_INDEX).to_numpy(), list(episodes)))
+
+
+def _values(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
+    """A column; `ManipError` where its values are of another kind or shape than `feature` says, or some are missing."""
+    shape, dtype = tuple(feature["shape"]), feature["dtype"]
+    column = table.column(name)
+    try:
+        values = _to_numpy(column, shape)
+        kind = "O" if dtype == "string" else np.dtype(dtype).kind
+    except (ValueError, TypeError, pa.ArrowException) as error:
+        raise ManipError(f"{root}: column {name!r} is no {dtype} of shape {shape}: {error}") from error
+    if column.null_count or values.dtype.kind != kind or len(values) != len(column):
+        missing = f" with {column.null_count} missing" if column.null_count else ""
+        holds = checks.shorten(str(column.type))
+        raise ManipError(f"{root}: column {name!r} holds {holds}{missing}; expected {dtype} of shape {shape}")
+    return values
 
 
 def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:

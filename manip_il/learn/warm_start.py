@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from manip_il.errors import MismatchError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.network import MLPNetwork
 
 
@@ -18,9 +19,13 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     The input statistics stay those of the new data: the first layer takes up the difference. (An
     input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
     The range of the targets is that of the new data too; their mean and scale are taken over, being
-    only the unit of the outputs. Raises `MismatchError` for other shapes.
+    only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.
     """
-    saved = load_file(Path(pretrained_model) / "model.safetensors")
+    path = Path(pretrained_model) / "model.safetensors"
+    try:
+        saved = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ManipError(f"cannot read {path} to start from its weights: {' '.join(str(error).split())}") from error
     saved = {name.removeprefix("model."): tensor for name, tensor in saved.items()}
     mean, scale = network.input_mean.clone(), network.input_scale.clone()
     low, high = network.target_low.clone(), network.target_high.clone()

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from manip_il.data import lerobot_layout as layout
@@ -365,3 +367,23 @@ sys.exit(", ".join(heavy & set(sys.modules)))
         [sys.executable, "-c", code], cwd=HERE.parents[1], capture_output=True, text=True, check=False
     )
     assert done.stderr.strip() == ""
+
+
+@pytest.mark.parametrize(
+    ("key", "column"),
+    [
+        (s.ACTION, [[1.0, 2.0], [1.0]] * 10),
+        (s.ACTION, [[1.0, 2.0, 3.0], None] * 10),
+        (s.ACTION, ["text"] * 20),
+        (layout.EPISODE_INDEX, [0, None] * 10),
+        (layout.EPISODE_INDEX, [float("nan")] * 20),
+        (s.SUCCESS, [True, None] * 10),
+        (s.SUCCESS, [{"a": 1}] * 20),
+    ],
+)
+def test_a_column_of_another_kind_or_with_gaps_is_named(root: Path, key: str, column: list[Any]) -> None:
+    path = next(root.glob(layout.DATA_FILES))
+    table = pq.read_table(path)
+    pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), path)
+    with pytest.raises(ManipError, match=f"column '{key}' "):
+        read_table(root, [key])

@@ -6,6 +6,7 @@ import shutil
 from dataclasses import MISSING
 from pathlib import Path
 
+from manip_il.cli import quickstart
 from manip_il.cli.main import COMMANDS, load
 from manip_il.cli.options import dump_yaml, options_of, parse
 
@@ -161,6 +162,15 @@ def _command_of_card(folder: Path) -> None:
     written(folder / "run" / "config.yaml")
 
 
+def make_timings(folder: Path) -> None:
+    """What a quickstart that was stopped had taken."""
+    (folder / "timings.json").write_text('{"demonstrations and DAgger": 61.5, "evaluations": 8.25}')
+
+
+def _read_timings(folder: Path) -> None:
+    quickstart._read_timings(folder / "timings.json")
+
+
 def make_store(folder: Path) -> None:
     """`store`: a policy's folder, pushed."""
     from .remotes import make_small_policy
@@ -194,5 +204,6 @@ TARGETS = (
     Target("episodes.jsonl", make_kept, "episodes.jsonl", mutate_json_lines, (_read_kept,)),
     Target("metrics.jsonl", make_run, "run/metrics.jsonl", mutate_json_lines, (_side, _resume_dagger)),
     Target("config.yaml", make_run, "run/config.yaml", mutate_yaml, (_side, _resume_dagger, _command_of_card)),
+    Target("timings", make_timings, "timings.json", mutate_json, (_read_timings,), share=0.3),
     Target("manifest", make_store, "store/manip_il_manifest.json", mutate_json, (_pull, _push)),
 )

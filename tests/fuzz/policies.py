@@ -87,12 +87,12 @@ _ACT, _MLP = "run/best/pretrained_model", "run/checkpoints/000002/pretrained_mod
 _STATE = "run/checkpoints/000002/training_state"
 _READS = (_load, _load, _describe, _push)
 TARGETS = (
-    Target("act config.json", make_act, f"{_ACT}/config.json", mutate_json, _READS, share=0.7),
-    Target("act preprocessor", make_act, f"{_ACT}/policy_preprocessor.json", mutate_json, _READS, share=0.7),
-    Target("act postprocessor", make_act, f"{_ACT}/policy_postprocessor.json", mutate_json, _READS, share=0.7),
-    Target("act weights", make_act, f"{_ACT}/model.safetensors", mutate_safetensors, (_load,), share=0.7),
-    Target("act statistics", make_act, f"{_ACT}/*processor_step*.safetensors", mutate_safetensors, (_load,), share=0.5),
-    Target("act manip_il.json", make_act, f"{_ACT}/manip_il.json", mutate_json, _READS, share=0.7),
+    Target("act config.json", make_act, f"{_ACT}/config.json", mutate_json, _READS, share=0.3),
+    Target("act preprocessor", make_act, f"{_ACT}/policy_preprocessor.json", mutate_json, _READS, share=0.3),
+    Target("act postprocessor", make_act, f"{_ACT}/policy_postprocessor.json", mutate_json, _READS, share=0.3),
+    Target("act weights", make_act, f"{_ACT}/model.safetensors", mutate_safetensors, (_load,), share=0.3),
+    Target("act statistics", make_act, f"{_ACT}/*processor_step*.safetensors", mutate_safetensors, (_load,), share=0.3),
+    Target("act manip_il.json", make_act, f"{_ACT}/manip_il.json", mutate_json, _READS, share=0.3),
     Target("mlp config.json", make_mlp, f"{_MLP}/config.json", mutate_json, (*_READS, _resume)),
     Target("mlp manip_il.json", make_mlp, f"{_MLP}/manip_il.json", mutate_json, (*_READS, _resume)),
     Target("mlp preprocessor", make_mlp, f"{_MLP}/policy_preprocessor.json", mutate_json, _READS),

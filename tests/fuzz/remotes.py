@@ -231,8 +231,8 @@ def _no_waiting(module: Any) -> Iterator[None]:
 
 _PULL, _PUSH, _S3_PULL, _S3_PUSH = HubTalk(12), HubTalk(30), S3Talk(10), S3Talk(20)
 TARGETS = (
-    Target("hub pull", _PULL.make, "script.json", mutate_script, (_PULL.pull,), _PULL.around),
-    Target("hub push", _PUSH.make, "script.json", mutate_script, (_PUSH.push,), _PUSH.around),
-    Target("s3 pull", _S3_PULL.make, "script.json", mutate_script, (_S3_PULL.pull,), _S3_PULL.around),
-    Target("s3 push", _S3_PUSH.make, "script.json", mutate_script, (_S3_PUSH.push,), _S3_PUSH.around),
+    Target("hub pull", _PULL.make, "script.json", mutate_script, (_PULL.pull,), _PULL.around, share=0.5),
+    Target("hub push", _PUSH.make, "script.json", mutate_script, (_PUSH.push,), _PUSH.around, share=0.5),
+    Target("s3 pull", _S3_PULL.make, "script.json", mutate_script, (_S3_PULL.pull,), _S3_PULL.around, share=0.5),
+    Target("s3 push", _S3_PUSH.make, "script.json", mutate_script, (_S3_PUSH.push,), _S3_PUSH.around, share=0.5),
 )

@@ -28,6 +28,7 @@ class Tally:
 
     inputs: int = 0
     accepted: int = 0
+    seconds: float = 0.0
     slowest: float = 0.0
     largest: float = 0.0
     findings: dict[int, str] = field(default_factory=dict)
@@ -35,6 +36,7 @@ class Tally:
     def add(self, number: int, attempt: Attempt) -> None:
         self.inputs += 1
         self.accepted += attempt.accepted and not attempt.problem
+        self.seconds += attempt.seconds
         self.slowest, self.largest = max(self.slowest, attempt.seconds), max(self.largest, attempt.megabytes)
         if attempt.problem:
             self.findings[number] = attempt.problem
@@ -42,7 +44,7 @@ class Tally:
     def row(self, name: str) -> str:
         refused = self.inputs - self.accepted - len(self.findings)
         counts = f"{self.inputs:>7,}{self.accepted:>10,}{refused:>9,}{len(self.findings):>10,}"
-        return f"{name:24}{counts}{self.slowest:>13.2f}{self.largest:>14.0f}"
+        return f"{name:24}{counts}{self.seconds:>10.0f}{self.slowest:>13.2f}{self.largest:>14.0f}"
 
 
 def work(pipe: Connection, folder: Path) -> None:
@@ -150,13 +152,14 @@ class Run:
 
     def report(self) -> int:
         """Print the table; the exit code."""
-        head = f"{'target':24}{'inputs':>7}{'accepted':>10}{'refused':>9}{'findings':>10}{'slowest [s]':>13}"
-        print(f"{head}{'largest [MB]':>14}")
+        head = f"{'target':24}{'inputs':>7}{'accepted':>10}{'refused':>9}{'findings':>10}{'all [s]':>10}"
+        print(f"{head}{'slowest [s]':>13}{'largest [MB]':>14}")
         everything = Tally()
         for name, tally in self.tallies.items():
             print(tally.row(name))
             everything.inputs += tally.inputs
             everything.accepted += tally.accepted
+            everything.seconds += tally.seconds
             everything.slowest = max(everything.slowest, tally.slowest)
             everything.largest = max(everything.largest, tally.largest)
             everything.findings |= {

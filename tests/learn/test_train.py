@@ -296,3 +296,10 @@ def test_a_logger_that_is_not_installed_is_named(module, options, words, table, 
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UsageError, match=words):
         fit(table, TrainConfig(steps=1, batch_size=8, **options), tmp_path / "r", spec=spec)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff" * 100, b"\x02\0\0\0\0\0\0\0[]"])
+def test_a_warm_start_from_weights_that_cannot_be_read_names_them(table, spec, tmp_path, content):
+    (tmp_path / "model.safetensors").write_bytes(content)
+    with pytest.raises(ManipError, match=f"cannot read {tmp_path}/model.safetensors to start from its weights: "):
+        fit(table, tiny(steps=1, init_from=tmp_path), tmp_path / "run", spec=spec)
