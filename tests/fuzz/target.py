@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-from manip_il.cli.main import LONGEST_LINE, _one_line, load
+from manip_il.cli.main import LONGEST_LINE, PROGRAM, _report, load
 from manip_il.cli.options import parse
 from manip_il.errors import ManipError
 
@@ -113,14 +113,16 @@ def bench(target: Target, folder: Path) -> Iterator[Bench]:
 
 def _line_of(error: BaseException) -> tuple[str, str]:
     """What the command line would print, and what is wrong with that."""
-    line = _one_line(str(error))
+    with contextlib.redirect_stderr(io.StringIO()) as printed:
+        _report(error, [])
+    line = printed.getvalue().rstrip("\n").removeprefix(f"{PROGRAM}: error: ")
     trace = "".join(traceback.format_exception(error))[-6_000:]
     named = isinstance(error, OSError) and error.strerror and error.filename
     if not isinstance(error, ManipError) and not named:
-        return line[:LONGEST_LINE] or "-", f"{type(error).__name__}: {line[:500]}\n{trace}"
-    if not line:
-        return "-", f"an empty message\n{trace}"
-    return line, f"a line of {len(line)} characters: {line[:500]}\n{trace}" if len(line) > LONGEST_LINE else ""
+        return line[:LONGEST_LINE] or "-", f"{line[:500]}\n{trace}"
+    if not line or "\n" in line or len(line) > LONGEST_LINE:
+        return line or "-", f"no line, more than one, or one of {len(line)} characters: {line[:500]}\n{trace}"
+    return line, ""
 
 
 def _reset_peak() -> float:
