@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -114,41 +115,47 @@ def test_a_fit_lowers_the_loss(demos, tmp_path) -> None:
     assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss"} <= records[0].keys()
 
 
-ACTS = """
+def acts(path: Path) -> bytes:
+    """What the policy in a folder does in six states of three episodes."""
+    rng = np.random.default_rng(0)
+    policy = LearnedPolicy.load(path)
+    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
+    actions = [
+        policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
+        for joints, scene in zip(states, environment, strict=True)
+    ]
+    return np.stack(actions).tobytes()
+
+
+ACTS = f"""
 import sys
+from pathlib import Path
 import numpy as np
 from manip_il.learn.policy import LearnedPolicy
-rng = np.random.default_rng(0)
-policy = LearnedPolicy.load(sys.argv[1])
-states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
-actions = [
-    policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
-    for joints, scene in zip(states, environment)
-]
-print(np.stack(actions).tobytes().hex())
+{inspect.getsource(acts)}
+print(*(acts(Path(path)).hex() for path in sys.argv[1:]))
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
-def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(demos, tmp_path, settings) -> None:
-    path = fit(demos, tmp_path / "r", settings)
-    script = [sys.executable, "-c", ACTS, str(path)]
-    one, two = (subprocess.run(script, capture_output=True, text=True, check=True).stdout for _ in range(2))
-    assert one == two
-    trainer = PolicyTrainer(demos, config(settings), tmp_path / "r", CheckpointMeta.of(read_spec(demos)), resume=True)
-    rng = np.random.default_rng(0)
+def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(demos, tmp_path) -> None:
+    paths = [fit(demos, tmp_path / settings["type"], settings) for settings in (ACT, DIFFUSION)]
+    done = subprocess.run([sys.executable, "-c", ACTS, *paths], capture_output=True, text=True, check=True)
+    fresh = [bytes.fromhex(word) for word in done.stdout.splitlines()[-1].split()]
+    assert fresh == [acts(path) for path in paths]
+    # Diffusion draws: in a rollout alone its generator is seeded by the episode.
+    meta = CheckpointMeta.of(read_spec(demos))
+    trainer = PolicyTrainer(demos, config(ACT), tmp_path / "act", meta, resume=True)
+    policy, rng = trainer.policy.eval(), np.random.default_rng(0)
     states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
-    actions = np.frombuffer(bytes.fromhex(one.strip().splitlines()[-1])).reshape(6, 3, 8)
-    if settings is ACT:  # diffusion draws: its generator is seeded by the episode in a rollout alone
-        policy = trainer.policy.eval()
-        with torch.inference_mode():
-            batch = {
-                "observation.state": torch.from_numpy(states[0, :1].astype(np.float32)),
-                "observation.environment_state": torch.from_numpy(environment[0, :1].astype(np.float32)),
-            }
-            ours = trainer.postprocessor(policy.select_action(trainer.preprocessor(batch)))
-        assert ours.numpy().astype(np.float64).tobytes() == actions[0, :1].tobytes()
+    batch = {
+        "observation.state": torch.from_numpy(states[0, :1].astype(np.float32)),
+        "observation.environment_state": torch.from_numpy(environment[0, :1].astype(np.float32)),
+    }
+    with torch.inference_mode():
+        ours = trainer.postprocessor(policy.select_action(trainer.preprocessor(batch)))
+    first = np.frombuffer(fresh[0]).reshape(6, 3, 8)[0, :1]
+    assert ours.numpy().astype(np.float64).tobytes() == first.tobytes()
 
 
 def test_held_out_episodes_are_never_learnt_from(demos) -> None:
