@@ -58,7 +58,7 @@ class FolderExistsError(UsageError):
     """An output folder that holds something already."""
 
     def __init__(self, folder: object):
-        super().__init__(f"{folder} exists already; go on with it by --resume=true, or replace it by --overwrite=true")
+        super().__init__(f"{folder} exists already; continue with --resume=true, or replace it with --overwrite=true")
 
 
 class FolderBusyError(ManipError):

@@ -18,22 +18,22 @@ from manip_il.errors import ManipError, UsageError
 class BuildOptions:
     """Build the LeRobot dataset of a folder of journals.
 
-    The same journals give the same bytes, which are those that record wrote. A journal that cannot be read is left
-    out and named; then the command ends with exit code 1.
+    The same journals give the same bytes, those that record wrote. Unreadable journals are reported and left out; the
+    exit code is then 1.
     """
 
     example: ClassVar[str] = "manip-il build datasets/demos.journals datasets/demos"
     journals: Path = field(metadata={"help": "folder of episode-*.mcap files", "positional": True})
     dataset: Path = field(metadata={"help": "folder of the dataset", "positional": True})
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
-    overwrite: bool = option(False, "replace a dataset that is there")
+    overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
         require_folder(self.journals, "one of episode-*.mcap files")
         if self.dataset.exists() and (not self.dataset.is_dir() or any(self.dataset.iterdir())):
             if not self.overwrite:
-                raise UsageError(f"{self.dataset} exists already; replace it by --overwrite=true")
+                raise UsageError(f"{self.dataset} exists already; replace it with --overwrite=true")
             require_ours(self.dataset)
         if self.repo_id is not None:
             require_repo_id("--repo_id", self.repo_id)

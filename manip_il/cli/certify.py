@@ -43,7 +43,7 @@ class VisitorGroup:
 
 @dataclass
 class CertifyOptions:
-    """Measure how the expert goes on from perturbed states and after wrong actions; writes certificate.json."""
+    """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
 
     example: ClassVar[str] = "manip-il certify --policy.path=runs/dagger --output_dir=runs/certificate"
     robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
@@ -56,7 +56,7 @@ class CertifyOptions:
     workers: int | None = option(None, WORKERS_HELP)
     trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/certificate"), metadata={"help": "folder of certificate.json"})
-    overwrite: bool = option(False, "replace a certificate that is there")
+    overwrite: bool = option(False, "replace an existing certificate")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
@@ -83,7 +83,7 @@ class CertifyOptions:
             try:
                 prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
             except FolderExistsError:
-                raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
+                raise UsageError(f"{self.output_dir} exists already; replace it with --overwrite=true") from None
             save_options(self.output_dir, self)
             certificate = self._certify(engine, env, policy)
             certificate.write(self.output_dir / FILE_NAME)

@@ -1,4 +1,4 @@
-"""`manip-il compare`: which of two is better, on the same seeds, and how sure that is."""
+"""`manip-il compare`: compare two policies or runs on the same seeds, and how sure that is."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class CompareOptions:
     workers: int | None = option(None, WORKERS_HELP)
     trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/compare"), metadata={"help": "folder of compare.json"})
-    resume: bool = option(False, "go on with a comparison that was stopped")
-    overwrite: bool = option(False, "replace a comparison that is there")
+    resume: bool = option(False, "continue an interrupted comparison")
+    overwrite: bool = option(False, "replace an existing comparison")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""

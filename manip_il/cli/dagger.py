@@ -47,8 +47,8 @@ class SamplingGroup:
     """`--sampling.*`: how often frames are learnt from, relative to each other."""
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
-    corrections: float = option(1.0, "of a later one where the expert drove or would have done something else")
-    rollouts: float = option(1.0, "of the other later ones")
+    corrections: float = option(1.0, "of a later frame where the expert drove or would have acted differently")
+    rollouts: float = option(1.0, "of the other later frames")
 
 
 @dataclass
@@ -69,14 +69,14 @@ class DaggerOptions:
         "who drives after round 0: the learner, the expert, or the expert with noise like the learner's errors",
     )
     demonstrations: int = option(50, "successful expert episodes of round 0")
-    rounds: int = option(5, "after round 0; a resumed run may have more")
+    rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more")
     episodes_per_round: int = option(50, "rollouts a round; with --method=cloning successful ones")
     label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
     disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
     beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
     label: Literal["per_state", "takeover", "branch"] = option(
         "per_state",
-        "where the expert is asked: its action, its drive to the end, or a branch of its own (see the docs)",
+        "what the expert gives where it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
     ask: str | None = option(
         None,
@@ -88,26 +88,28 @@ class DaggerOptions:
     sampling: SamplingGroup = field(default_factory=SamplingGroup)
     policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy sees beside its joints; by default images where it is cnn, else state"
+        None, "what the policy sees besides its joints; by default images if it is cnn, else state"
     )
-    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both, for a policy that sees"})
+    cameras: list[str] = field(
+        default_factory=list, metadata={"help": "front, wrist or both, for a policy on pictures"}
+    )
     image: ImageGroup = field(default_factory=ImageGroup)
     refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
     steps: int | None = option(None, f"gradient steps a round; by default {MLP_STEPS:,} for mlp, else 20,000")
     refit_steps: int | None = option(None, "of the rounds after the first, with --refit=warm; by default as many")
     batch_size: int | None = option(None, f"frames a step; by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}")
-    lr: float | None = option(None, f"highest learning rate; by default {MLP_LR} for mlp, else the policy's own")
+    lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
     optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
     scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
     validation_episodes: int = option(200, "unseen episodes that choose the best round")
-    hold: int = option(10, "control steps that a rollout goes on for after success")
+    hold: int = option(10, "control steps of a rollout after success")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
     trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/dagger"), metadata={"help": "folder of the run"})
-    resume: bool = option(False, "go on with a run that was stopped")
-    overwrite: bool = option(False, "replace a run that is there")
+    resume: bool = option(False, "continue an interrupted run")
+    overwrite: bool = option(False, "replace an existing run")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""

@@ -22,16 +22,16 @@ _MODEL = "model_sha256"
 
 @dataclass
 class DoctorOptions:
-    """Examine any LeRobot v3.0 dataset: files, rows, decoded video frames, statistics, journals.
+    """Check any LeRobot v3.0 dataset: files, rows, decoded video frames, statistics, journals.
 
-    One line a finding on standard output; exit code 1 where something is wrong, 0 with warnings alone.
+    One line per finding on standard output; exit code 1 after errors, 0 after warnings alone.
     --repair builds the dataset again from its journals; without them it computes statistics and moves leftovers away.
     What it replaces is kept in DATASET.before-repair.
     """
 
     example: ClassVar[str] = "manip-il doctor datasets/demos"
     dataset: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset", "positional": True})
-    repair: bool = option(False, "put right what can be put right, and keep a copy")
+    repair: bool = option(False, "repair what can be repaired, and keep a copy")
 
     def check(self) -> None:
         """Refuse what is no folder."""

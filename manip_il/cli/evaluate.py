@@ -60,13 +60,13 @@ class EvalGroup:
     """`--eval.*`: what is run."""
 
     n_episodes: int | None = option(
-        None, f"episodes, each on a seed of its own; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
+        None, f"episodes, each with its own seed; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
     )
-    first: int = option(0, "which seed of the stream is the first one: for one part of a larger evaluation")
+    first: int = option(0, "index of the first seed in the stream, for one part of a larger evaluation")
     hold: int | None = option(10, "control steps after success at which an episode ends; null: at the horizon")
     batch_size: int = option(25, "episodes in lockstep that share a call of the policy; changes no outcome")
-    stream: Literal["test", "validation"] = option("test", "seeds: test is what nothing was chosen on")
-    films: int = option(2, "film so many failures, and as many successes")
+    stream: Literal["test", "validation"] = option("test", "seeds; nothing was chosen on those of test")
+    films: int = option(2, "number of failures to film, and of successes")
 
 
 @dataclass
@@ -80,14 +80,14 @@ class EvalOptions:
     env: EnvGroup = field(default_factory=EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
     suite: str = option("nominal", SUITE_HELP)
-    until_width: float | None = option(None, "stop once the interval is so narrow: 0.02 for 2 points")
+    until_width: float | None = option(None, "stop when the interval is this narrow; 0.02 is 2 points")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
     trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
-    resume: bool = option(False, "go on with an evaluation that was stopped, or with more episodes")
-    overwrite: bool = option(False, "replace an evaluation that is there")
+    resume: bool = option(False, "continue an interrupted evaluation, or add more episodes")
+    overwrite: bool = option(False, "replace an existing evaluation")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
@@ -199,7 +199,7 @@ class EvalOptions:
             save_options(self.output_dir, self)
         except FolderExistsError:
             raise UsageError(
-                f"{self.output_dir} exists already; go on with it by --resume=true, or replace it by --overwrite=true"
+                f"{self.output_dir} exists already; continue with --resume=true, or replace it with --overwrite=true"
             ) from None
         except OSError as error:
             raise ManipError(

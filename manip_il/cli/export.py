@@ -30,7 +30,7 @@ class ExportOptions:
     policy: Path = field(metadata={"help": "a run, a checkpoint or a pretrained_model folder", "positional": True})
     format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
     output: Path | None = field(default=None, metadata={"help": "the file; by default policy.onnx or policy.pt"})
-    overwrite: bool = option(False, "replace a file that is there")
+    overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
         """Export, compare, write."""
@@ -55,7 +55,7 @@ class ExportOptions:
         if output.is_dir():
             raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
         if output.exists() and not self.overwrite:
-            raise UsageError(f"{output} exists already; replace it by --overwrite=true, or choose another --output")
+            raise UsageError(f"{output} exists already; replace it with --overwrite=true, or choose another --output")
         return output
 
     def _check(self, path: Path, output: Path) -> None:

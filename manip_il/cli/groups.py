@@ -76,9 +76,9 @@ class MaybeTaskGroup:
 class EnvGroup:
     """`--env.*`: what makes an environment beside robot and task. Defaults are `EnvConfig`'s."""
 
-    tolerance: float = option(0.02, "distance to the goal that counts as there [m]")
+    tolerance: float = option(0.02, "distance to the goal that counts as success [m]")
     horizon: int = option(100, "control steps in an episode")
-    control_hz: int | None = option(None, f"control steps a second; the policy's where there is one, else {DEFAULT_HZ}")
+    control_hz: int | None = option(None, f"control steps a second; by default the policy's, else {DEFAULT_HZ}")
     success_steps: int = option(5, "control steps in a row within the tolerance that make a success")
 
     def config(self, robot: str, task: str, control_hz: int = DEFAULT_HZ) -> EnvConfig:
@@ -190,7 +190,7 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
     if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
         return
     if not path.is_file():
-        raise UsageError(f"{folder} holds no {CONFIG_FILE}, so no run to go on with; choose another folder")
+        raise UsageError(f"{folder} holds no {CONFIG_FILE}, so there is no run to continue; choose another folder")
     before = from_yaml(path, type(options))
     for known in options_of(type(options)):
         was, now = _value(before, known.name), _value(options, known.name)

@@ -31,7 +31,7 @@ _FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
 class HealthOptions:
     """Draw one frame of the default scene, and check what else an evaluation needs.
 
-    Prints what there is to work with; where something is missing, says what and ends with exit code 1.
+    Prints renderer, PyTorch, memory and cores. If something is missing, says what and exits with 1.
     """
 
     example: ClassVar[str] = "manip-il health"

@@ -37,7 +37,7 @@ class KeptEpisodes:
         for key, now in common.items():
             before = lines[0].get(key)
             if before != now:
-                what = f"{key} ({name} was begun with another; --overwrite=true starts anew)"
+                what = f"{key} ({name} was started with another; --overwrite=true starts over)"
                 raise MismatchError(what, "then", before, "now", now)
         return kept
 
@@ -46,7 +46,7 @@ class KeptEpisodes:
         append_jsonl(self.path, result.to_json())
 
     def results(self, seeds: Collection[int]) -> dict[int, EpisodeResult]:
-        """What is there of these seeds. Raises `ManipError` for a line that is no episode."""
+        """What is there of these seeds. Raises `ManipError` for a line that is not an episode."""
         from manip_il.evaluation.results import EpisodeResult
 
         found: dict[int, EpisodeResult] = {}
@@ -56,7 +56,7 @@ class KeptEpisodes:
             except (KeyError, ManipError) as error:
                 why = f"{error} is missing" if isinstance(error, KeyError) else error
                 raise ManipError(
-                    f"{self.path}: a line that is no episode ({why}); start again with --overwrite=true"
+                    f"{self.path}: a line that is not an episode ({why}); start again with --overwrite=true"
                 ) from error
             if result.seed in seeds:
                 found[result.seed] = result

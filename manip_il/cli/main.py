@@ -40,24 +40,30 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
-    "render": Command("manip_il.cli.render:RenderOptions", "a dataset anew, with other cameras, sizes or lights"),
-    "build": Command("manip_il.cli.build:BuildOptions", "build the dataset of a folder of journals again"),
-    "train": Command("manip_il.cli.train:TrainOptions", "fit a policy to a dataset (behaviour cloning)"),
+    "render": Command(
+        "manip_il.cli.render:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
+    ),
+    "build": Command("manip_il.cli.build:BuildOptions", "rebuild a dataset from its journals"),
+    "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
     "dagger": Command("manip_il.cli.dagger:DaggerOptions", "roll out, label, aggregate, refit, and repeat"),
     "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "replay": Command("manip_il.cli.replay:ReplayOptions", "one episode of an evaluation again, alone, as a film"),
-    "merge": Command("manip_il.cli.merge:MergeOptions", "parts of one evaluation, from several machines, as one"),
-    "compare": Command("manip_il.cli.compare:CompareOptions", "which of two is better, on the same seeds"),
-    "study": Command("manip_il.cli.study:StudyOptions", "several arms and training seeds: run, test and compare them"),
-    "certify": Command("manip_il.cli.certify:CertifyOptions", "from where the expert recovers, as a certificate"),
-    "doctor": Command("manip_il.cli.doctor:DoctorOptions", "examine a dataset, and repair it from its journals"),
-    "health": Command("manip_il.cli.health:HealthOptions", "whether this machine can evaluate: draws, counts, checks"),
-    "push": Command("manip_il.cli.push:PushOptions", "a dataset or policy to the Hub, S3, another machine, a folder"),
-    "pull": Command("manip_il.cli.pull:PullOptions", "a dataset or policy from there, every file verified"),
-    "export": Command("manip_il.cli.export:ExportOptions", "a policy as ONNX or TorchScript, for a robot"),
-    "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "a dataset as MCAP files, for Foxglove and others"),
-    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "MCAP files as a dataset, by a mapping file"),
-    "quickstart": Command("manip_il.cli.quickstart:QuickstartOptions", "the whole story, small: watch it learn"),
+    "replay": Command("manip_il.cli.replay:ReplayOptions", "run one episode of an evaluation again, and film it"),
+    "merge": Command("manip_il.cli.merge:MergeOptions", "merge parts of an evaluation from several machines"),
+    "compare": Command("manip_il.cli.compare:CompareOptions", "compare two policies or runs on the same seeds"),
+    "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
+    "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from where the expert recovers"),
+    "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
+    "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
+    "push": Command("manip_il.cli.push:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
+    "pull": Command("manip_il.cli.pull:PullOptions", "download a dataset or policy, every file verified"),
+    "export": Command("manip_il.cli.export:ExportOptions", "write a policy as ONNX or TorchScript, for a robot"),
+    "mcap export": Command(
+        "manip_il.cli.mcap:McapExportOptions", "write a dataset as MCAP files, for Foxglove and others"
+    ),
+    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "write MCAP files as a dataset, by a mapping file"),
+    "quickstart": Command(
+        "manip_il.cli.quickstart:QuickstartOptions", "a small complete run: record, clone, DAgger, report"
+    ),
 }
 
 _HELP_WORDS = ("--help", "-h", "help")
@@ -114,7 +120,7 @@ def _dispatch(words: list[str]) -> None:
     elif words[0] == "--version":
         print(f"{PROGRAM} {__version__}")
     elif words[0].startswith("-"):
-        raise UsageError(f"{words[0]!r} stands before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
+        raise UsageError(f"{words[0]!r} is given before a command; write {PROGRAM} COMMAND {words[0]} (see --help)")
     elif len(words) == 1 and _group(words[0]):
         print(_group_help(words[0]))
     elif "--help" in words or "-h" in words:
@@ -169,7 +175,7 @@ def _report(error: BaseException, words: list[str]) -> int:
 
 def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
-        return f"; kept: {error.kept}; go on with: {error.resume_command or resume_command(words)}"
+        return f"; kept: {error.kept}; continue with: {error.resume_command or resume_command(words)}"
     try:
         name, words_of_it = _split(words)
         options: Any = parse(load(name), words_of_it)
@@ -177,7 +183,7 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
         return ""
     if not hasattr(options, "resume") or not getattr(options, "output_dir", Path()).exists():  # nothing to resume
         return ""
-    return f"; what was finished is kept; go on with: {resume_command(words)}"
+    return f"; finished work is kept; continue with: {resume_command(words)}"
 
 
 def _complain(text: str, words: list[str]) -> None:
@@ -205,7 +211,7 @@ def _clean(text: str, words: list[str]) -> str:
 def _help() -> str:
     return (
         f"usage: {PROGRAM} COMMAND [--option=value ...]\n\n"
-        "Robot-arm imitation learning without a human at the controls.\n\n"
+        "Robot-arm imitation learning without teleoperation.\n\n"
         f"commands:\n{_commands(COMMANDS)}\n\n{_GLOBAL_HELP}\n  --version    show the version\n\n"
         f"{PROGRAM} COMMAND --help lists a command's options.\n"
         f"example: {PROGRAM} quickstart --output_dir=runs/quickstart"

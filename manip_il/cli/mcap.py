@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 @dataclass
 class McapExportOptions:
-    """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file an episode, one topic a column.
+    """Write a LeRobot v3.0 dataset as MCAP, which Foxglove opens: one file per episode, one topic per column.
 
-    Beside the files, mapping.yaml says how `manip-il mcap import` makes the same dataset of them again.
+    With it, mapping.yaml, from which `manip-il mcap import` makes the same dataset again.
     """
 
     example: ClassVar[str] = "manip-il mcap export datasets/demos demos_mcap"
     dataset: Path = field(metadata={"help": "the dataset's folder", "positional": True})
     out: Path = field(metadata={"help": "folder for the files", "positional": True})
-    overwrite: bool = option(False, "replace an export that is there")
+    overwrite: bool = option(False, "replace an existing export")
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
@@ -59,9 +59,9 @@ class McapExportOptions:
 
 @dataclass
 class McapImportOptions:
-    """Write MCAP files as a LeRobot v3.0 dataset: one episode a file, in the order of their names.
+    """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
 
-    The mapping names the topic and the field of every column, and how its messages are brought to the dataset's rate:
+    The mapping names the topic and the field of every column, and how its messages are resampled to the dataset's rate:
     nearest, hold or interpolate, with a tolerance in seconds. A gap beyond it is an error.
     """
 

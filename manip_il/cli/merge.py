@@ -18,15 +18,15 @@ REPORT_FILE = "report.html"
 
 @dataclass
 class MergeOptions:
-    """Merge evaluations of one policy on different seeds, as a cluster of containers makes them, into one eval.json.
+    """Merge evaluations of one policy on different seeds, for example from several containers, into one eval.json.
 
-    Refused where policy, robot, task or settings differ, or a seed was run twice.
+    Refused if policy, robot, task or settings differ, or if a seed was run twice.
     """
 
     example: ClassVar[str] = "manip-il merge out/0 out/1 out/2 --output_dir=out/all"
     files: list[Path] = field(metadata={"help": "two or more eval.json, or their folders", "positional": True})
     output_dir: Path = field(default=Path("runs/merged"), metadata={"help": "folder of the merged eval.json"})
-    overwrite: bool = option(False, "replace a merged evaluation that is there")
+    overwrite: bool = option(False, "replace an existing merged evaluation")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
@@ -58,7 +58,7 @@ class MergeOptions:
             try:
                 prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
             except FolderExistsError:
-                raise UsageError(f"{self.output_dir} exists already; replace it by --overwrite=true") from None
+                raise UsageError(f"{self.output_dir} exists already; replace it with --overwrite=true") from None
             save_options(self.output_dir, self)
             merged.write(self.output_dir / FILE_NAME)
             report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))

@@ -31,7 +31,7 @@ def require_eval(path: Path) -> None:
 def require_folder(path: Path, what: str) -> None:
     """Raise `UsageError` unless there is such a folder. what: it should be."""
     if not path.is_dir():
-        raise UsageError(f"{path} {'is no folder' if path.exists() else 'does not exist'}; expected {what}")
+        raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
 
 
 def require_workers(workers: int | None) -> None:

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 class PullOptions:
     """Pull a dataset or a policy from the Hugging Face Hub, an S3 store, another machine or a folder.
 
-    Every file is verified by its hash before the folder gets its name; after a cut the same command goes on.
-    Paths that leave the folder, links, pickles and code are refused; nothing that comes is run.
+    Every file is verified by its hash before the folder appears. Interrupted transfers resume: run the same command
+    again. Paths that leave the folder, links, pickles and code are refused; nothing that is pulled is executed.
     """
 
     example: ClassVar[str] = "manip-il pull hf://datasets/me/demos datasets/demos"
     remote: str = field(metadata={"help": "what manip-il push was given, or any repo of the Hub", "positional": True})
     target: Path = field(metadata={"help": "new folder for it", "positional": True})
     revision: str | None = option(None, "branch, tag or commit of a repo on the Hub")
-    dry_run: bool = option(False, "only say what would be pulled")
-    overwrite: bool = option(False, "replace a dataset or run that is there")
+    dry_run: bool = option(False, "only list what would be pulled")
+    overwrite: bool = option(False, "replace an existing dataset or run")
 
     def check(self) -> None:
         """Refuse an address that is none, and a folder that may not be replaced."""
@@ -49,7 +49,7 @@ class PullOptions:
                 pulled = pull(url, remote, self.target, moved, overwrite=self.overwrite, dry_run=self.dry_run)
         except FolderExistsError:
             text = (
-                f"{self.target} or its journals exist already; replace them by --overwrite=true, or name a new folder"
+                f"{self.target} or its journals exist already; replace them with --overwrite=true, or name a new folder"
             )
             raise UsageError(text) from None
         finally:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 class PushOptions:
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an S3 store, another machine or a folder.
 
-    A dataset is examined first, as by manip-il doctor, and refused where it is not whole. Only what changed is
-    uploaded; whoever reads the remote sees the old version until the new one is there whole and verified. After a cut
-    the same command goes on. Of two pushes at once one wins, and the other is told.
+    A dataset is checked first, as by manip-il doctor, and refused if it has errors. Only changes are uploaded. Readers
+    see the old version until the new one is complete and verified. Interrupted transfers resume: run the same command
+    again. Of two concurrent pushes one succeeds, and the other says so.
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
@@ -33,9 +33,9 @@ class PushOptions:
             "positional": True,
         }
     )
-    dry_run: bool = option(False, "only say what would be uploaded and removed")
-    journals: bool = option(False, "take the journals along, of which the dataset can be built again")
-    private: bool = option(False, "make a repo that is not on the Hub yet a private one")
+    dry_run: bool = option(False, "only list what would be uploaded and removed")
+    journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
+    private: bool = option(False, "make a new repository on the Hub private")
 
     def check(self) -> None:
         """Refuse an address that is none, and what is no folder."""

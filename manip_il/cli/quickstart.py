@@ -47,7 +47,7 @@ TIMINGS_FILE = "timings.json"
 
 @dataclass
 class QuickstartOptions:
-    """The whole story, small: the expert demonstrates, a policy is cloned, DAgger mends it.
+    """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
     the same unseen seeds, undisturbed and disturbed; OUTPUT_DIR/report.html shows it.
@@ -65,14 +65,14 @@ class QuickstartOptions:
     steps: int = option(3_000, "gradient steps a fit")
     batch_size: int = option(512, "frames a step")
     validation_episodes: int = option(100, "unseen episodes that choose the best round")
-    test_episodes: int = option(200, "unseen episodes that nothing is chosen on")
-    disturbed_episodes: int = option(100, "the first of them once more, disturbed")
+    test_episodes: int = option(200, "unseen test episodes, used for no choice")
+    disturbed_episodes: int = option(100, "the first of them again, disturbed")
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
     output_dir: Path = field(default=Path("runs/quickstart"), metadata={"help": "folder of the run"})
-    resume: bool = option(False, "go on with a run that was stopped")
-    overwrite: bool = option(False, "replace a run that is there")
+    resume: bool = option(False, "continue an interrupted run")
+    overwrite: bool = option(False, "replace an existing run")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""

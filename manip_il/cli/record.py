@@ -56,7 +56,7 @@ class DatasetGroup:
 class RecordOptions:
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
-    Every finished episode is on disk at once, in ROOT.journals; the dataset appears when all are there.
+    Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
@@ -69,8 +69,8 @@ class RecordOptions:
     seed: int = option(0, "shifts every random stream, 0 to 1000")
     engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
     workers: int | None = option(None, WORKERS_HELP)
-    resume: bool = option(False, "go on with a recording, also to more episodes")
-    overwrite: bool = option(False, "replace a dataset that is there")
+    resume: bool = option(False, "continue a recording, or add more episodes")
+    overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
@@ -129,7 +129,7 @@ class RecordOptions:
         if not root.is_dir() or not any(root.iterdir()):
             return False
         if not journals.is_dir():
-            raise ManipError(f"no {journals} to go on from; record {root} anew by --overwrite=true")
+            raise ManipError(f"no {journals} to continue from; record {root} again with --overwrite=true")
         return dataset_info(root).episodes == self.dataset.num_episodes
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:

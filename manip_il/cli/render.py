@@ -15,7 +15,7 @@ from manip_il.errors import UsageError
 
 @dataclass
 class RenderOptions:
-    """Picture a dataset's states anew: TARGET is SOURCE with other cameras, sizes or lights, not simulated again."""
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
 
     example: ClassVar[str] = "manip-il render datasets/demos datasets/demos_dim --cameras=front --look.brightness=0.6"
     source: Path = field(metadata={"help": "a dataset of this program, with or without pictures", "positional": True})
@@ -24,7 +24,7 @@ class RenderOptions:
     image: ImageGroup = field(default_factory=ImageGroup)
     look: LookGroup = field(default_factory=LookGroup)
     workers: int | None = option(None, "processes; by default one a core")
-    overwrite: bool = option(False, "replace a dataset that is there")
+    overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
@@ -66,5 +66,5 @@ class RenderOptions:
             raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")
         if self.target.exists() and (not self.target.is_dir() or any(self.target.iterdir())):
             if not self.overwrite:
-                raise UsageError(f"{self.target} exists already; replace it by --overwrite=true")
+                raise UsageError(f"{self.target} exists already; replace it with --overwrite=true")
             require_ours(self.target)

@@ -23,14 +23,15 @@ NO_FILES = ("expert", "random")
 class PlaceGroup:
     """`--policy.*` of what is replayed."""
 
-    path: Path | None = field(default=None, metadata={"help": "where it lies now; by default as eval.json says"})
+    path: Path | None = field(default=None, metadata={"help": "its present path; by default the one in eval.json"})
 
 
 @dataclass
 class ReplayOptions:
-    """Run one episode of an evaluation again: the same policy, seed and circumstances, alone.
+    """Run one episode of an evaluation again, alone: the same policy, seed and conditions.
 
-    Says what was drawn and what came of it, films it, and exits 1 where it came out otherwise than in eval.json.
+    Prints the drawn conditions and the outcome, films the episode, and exits with 1 if the outcome is not that of
+    eval.json.
     """
 
     example: ClassVar[str] = "manip-il replay runs/eval/eval.json --episode 17 --video out.mp4"

@@ -46,7 +46,7 @@ class Stages:
         self.close()
         self._stop.__exit__(kind, error, trace)
         if isinstance(error, ManipError) and not isinstance(error, UsageError):
-            error.args = (f"{error}; kept: {self.kept}; go on by --resume=true",)
+            error.args = (f"{error}; kept: {self.kept}; continue with --resume=true",)
 
     def start(self, description: str, total: int) -> None:
         """Close the bar of the stage before and open one of `total` episodes or steps."""

@@ -34,7 +34,7 @@ class StudyOptions:
     """Run every arm of FILE with several training seeds, test all on the same unseen seeds, and compare.
 
     FILE holds `common` and `arms` (options of manip-il dagger), training_seeds, eval, checkpoint, at, baseline and
-    target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and report.html the answer.
+    target. OUTPUT_DIR/ARM/seed_0, seed_1, ... are the runs; study.json, table.md and report.html the results.
     """
 
     example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
@@ -44,8 +44,8 @@ class StudyOptions:
     workers: int | None = option(None, WORKERS_HELP)
     trust: bool = trust_option()
     output_dir: Path = field(default=Path("runs/study"), metadata={"help": "folder of the study"})
-    resume: bool = option(False, "go on with a study that was stopped")
-    overwrite: bool = option(False, "replace a study that is there")
+    resume: bool = option(False, "continue an interrupted study")
+    overwrite: bool = option(False, "replace an existing study")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""

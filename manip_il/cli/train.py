@@ -60,26 +60,26 @@ class TrainOptions:
     dataset: SourceGroup
     policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy sees beside its joints; by default images where the policy is cnn, else state"
+        None, "what the policy sees besides its joints; by default images if the policy is cnn, else state"
     )
     steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
     batch_size: int | None = option(None, f"frames a step (and process); by default {MLP_BATCH_SIZE} for mlp, else 8")
-    lr: float | None = option(None, f"highest learning rate; by default {MLP_LR} for mlp, else the policy's own")
+    lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
     optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
     scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
-    image_augment: bool = option(True, "shift and recolour pictures while training")
-    image_cache_gb: float = option(20.0, "most that decoded pictures may take on disk; beyond, LeRobot's loader reads")
+    image_augment: bool = option(True, "random crops and colour jitter of pictures while training")
+    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
     num_workers: int = option(4, "processes of LeRobot's loader")
     output_dir: Path = field(default=Path("runs/train"), metadata={"help": "folder of the run"})
     seed: int = option(0, "of weights and batches, 0 to 1000")
-    threads: int = option(1, "more help only where cores are free")
+    threads: int = option(1, "PyTorch threads; more help only on free cores")
     save_freq: int | None = option(None, "steps between checkpoints; by default 1,000 for mlp, else 20,000")
     log_freq: int = option(200, "steps between metrics")
     tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
     wandb: Open = field(default_factory=dict, metadata={"help": "Weights & Biases: enable, project, mode, ..."})
     trust: bool = trust_option()
-    resume: bool = option(False, "go on from the last checkpoint")
-    overwrite: bool = option(False, "replace a run that is there")
+    resume: bool = option(False, "continue from the last checkpoint")
+    overwrite: bool = option(False, "replace an existing run")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""

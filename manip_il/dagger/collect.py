@@ -113,7 +113,7 @@ def collect_successes(
     while good < count:
         more = seeds[tried : tried + count - good]
         if tried + count - good > min(len(seeds), MAX_TRIES * count):
-            raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} were asked for")
+            raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} are needed")
         tried += len(more)
         for collected in collect(engine, job, more, journals, on_episode):
             good += collected.success

@@ -82,7 +82,7 @@ def read_records(stream: BinaryIO, *wanted: Opcode, check: bool = False) -> Iter
     size = os.fstat(stream.fileno()).st_size
     stream.seek(0)
     if (magic := stream.read(len(_MAGIC))) != _MAGIC:
-        raise ValueError("it is no MCAP file")
+        raise ValueError("it is not an MCAP file")
     at, checksum = len(magic), zlib.crc32(magic)
     while True:
         if len(head := stream.read(_HEAD.size)) < _HEAD.size:

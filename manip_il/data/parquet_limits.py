@@ -55,7 +55,7 @@ class _Page:
 def check_parquet(paths: Iterable[Path], columns: Sequence[str] | None = None, least: int = LARGEST_FILE) -> None:
     """Raise `ValueError` where columns (all by default) unpack to more than `least` and 100 times the files' size.
 
-    Also for a page that does, and for what is no parquet file; `OSError` and pyarrow's errors for an unreadable one.
+    Also for a page that does, and for what is not a parquet file; `OSError` and pyarrow's errors for an unreadable one.
     """
     size = taken = 0
     names = None if columns is None else tuple(columns)
@@ -72,7 +72,7 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
     """The most that the columns' values take, unpacked [bytes]. version: of the file, so that it is read once."""
     with path.open("rb") as stream:
         if stream.seek(0, 2) < 12:
-            raise ValueError("it is no parquet file")
+            raise ValueError("it is not a parquet file")
         with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
             footer = _footer(data)
             schema = pq.read_metadata(stream).schema  # which looks at no column's place or size
@@ -115,7 +115,7 @@ class _Chunk:
 def _footer(data: mmap.mmap) -> bytes:
     size = int.from_bytes(data[-8:-4], "little")
     if data[-4:] != _MAGIC or size > len(data) - 12:
-        raise ValueError("it is no parquet file")
+        raise ValueError("it is not a parquet file")
     if size > LARGEST_FOOTER:
         raise ValueError(f"its footer has {size:,} bytes; expected at most {LARGEST_FOOTER:,}")
     return data[len(data) - 8 - size : len(data) - 8]

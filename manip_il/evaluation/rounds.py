@@ -61,7 +61,7 @@ History = tuple[Round, ...]
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
     """A run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are none of a run."""
     if not records:
-        raise ManipError(f"{name} has no finished round yet; go on with it by manip-il dagger --resume=true")
+        raise ManipError(f"{name} has no finished round yet; continue with manip-il dagger --resume=true")
     rounds: list[Round] = []
     seconds = validating = 0.0
     for number, record in enumerate(sorted(records, key=_number)):

@@ -58,7 +58,7 @@ def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, capsys):
     assert main(words) == 0
     before = files(tmp_path / "x")
     assert main(words) == 2
-    assert "replace it by --overwrite=true" in capsys.readouterr().err
+    assert "replace it with --overwrite=true" in capsys.readouterr().err
     assert main([*words, "--overwrite=true", "--repo_id=you/demos"]) == 0
     assert {name for name, data in files(tmp_path / "x").items() if data != before[name]} == {"meta/manip_il.json"}
     (tmp_path / "mine").mkdir()

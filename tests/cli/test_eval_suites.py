@@ -189,7 +189,7 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys):
     (act / "model.safetensors").write_bytes((act / "model.safetensors").read_bytes()[:-4] + b"\0\0\1\0")
     capsys.readouterr()
     assert evaluate("e", *words, "--resume=true") == 1
-    assert "policy_sha256 (e was begun with another; --overwrite=true starts anew) differs" in error(capsys)
+    assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error(capsys)
 
 
 @pytest.mark.slow

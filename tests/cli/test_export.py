@@ -74,7 +74,7 @@ def test_a_file_that_is_there_stays_unless_told_otherwise(here, capsys):
     (here / "mine.pt").write_bytes(b"mine")
     words = ["export", "run", "--format=torchscript", "--output=mine.pt"]
     assert main(words) == 2
-    assert complaint(capsys) == "mine.pt exists already; replace it by --overwrite=true, or choose another --output"
+    assert complaint(capsys) == "mine.pt exists already; replace it with --overwrite=true, or choose another --output"
     assert (here / "mine.pt").read_bytes() == b"mine"
     assert main([*words, "--overwrite=true"]) == 0
     assert (here / "mine.pt").read_bytes().startswith(b"PK")

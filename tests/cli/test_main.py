@@ -81,13 +81,13 @@ def test_a_commands_help_holds_options_defaults_and_an_example(capsys):
         (
             ["fake", "--act=interrupt", "--dataset.num_episodes=3"],
             130,
-            "manip-il: interrupted; what was finished is kept; go on with: "
+            "manip-il: interrupted; finished work is kept; continue with: "
             "manip-il fake --act=interrupt --dataset.num_episodes=3 --resume=true",
         ),
         (
             ["--seed=1", "record"],
             2,
-            "manip-il: error: '--seed=1' stands before a command; write manip-il COMMAND --seed=1 (see --help)",
+            "manip-il: error: '--seed=1' is given before a command; write manip-il COMMAND --seed=1 (see --help)",
         ),
     ],
 )
@@ -133,7 +133,7 @@ def test_a_stop_in_good_order_says_what_is_kept_and_how_to_go_on():
     lines = done.stderr.strip().splitlines()
     assert lines[0] == "stopping after the step in hand (Ctrl-C again to stop at once)"
     assert lines[1] == (
-        "manip-il: interrupted; kept: 1 of 50 episodes in x; go on with: manip-il fake --act=stop --resume=true"
+        "manip-il: interrupted; kept: 1 of 50 episodes in x; continue with: manip-il fake --act=stop --resume=true"
     )
 
 

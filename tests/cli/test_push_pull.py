@@ -74,7 +74,7 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(
     target.mkdir()
     (target / "thesis.txt").write_text("mine")
     assert main(["pull", url, str(target)]) == 2
-    assert "exist already; replace them by --overwrite=true" in capsys.readouterr().err
+    assert "exist already; replace them with --overwrite=true" in capsys.readouterr().err
     assert main(["pull", url, str(target), "--overwrite=true"]) == 2
     assert "manip-il did not make" in capsys.readouterr().err
     assert (target / "thesis.txt").read_text() == "mine"
@@ -181,7 +181,7 @@ def test_ctrl_c_says_how_to_go_on(
 
     monkeypatch.setattr("manip_il.data.remote.push.push", interrupted)
     assert main(["push", str(run), url]) == 130
-    assert "kept: what has come so far; go on with: the same command" in capsys.readouterr().err
+    assert "kept: what has come so far; continue with: the same command" in capsys.readouterr().err
 
 
 def test_bytes_as_people_read_them() -> None:

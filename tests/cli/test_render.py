@@ -70,7 +70,7 @@ def test_two_workers_write_the_bytes_of_one(demos):
         (["demos", "demos", "--overwrite=true"], 2, "TARGET demos overlaps SOURCE demos"),
         (["demos", ".", "--overwrite=true"], 2, "overlaps SOURCE demos"),
         (["demos", "demos/meta", "--overwrite=true"], 2, "overlaps SOURCE demos"),
-        (["demos", "full"], 2, "full exists already; replace it by --overwrite=true"),
+        (["demos", "full"], 2, "full exists already; replace it with --overwrite=true"),
         (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
         (["nothing", "x"], 2, "nothing does not exist; expected the folder of a LeRobot dataset"),
     ],

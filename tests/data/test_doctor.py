@@ -133,7 +133,7 @@ def test_a_file_without_footer(root: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "text"), [(b"", "is empty"), (b"x" * 99, "is no parquet file"), (b"PAR1" * 9, "cannot be read")]
+    ("content", "text"), [(b"", "is empty"), (b"x" * 99, "is not a parquet file"), (b"PAR1" * 9, "cannot be read")]
 )
 def test_a_file_that_is_no_parquet(root: Path, content: bytes, text: str) -> None:
     (root / DATA).write_bytes(content)

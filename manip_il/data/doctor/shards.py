@@ -76,7 +76,7 @@ def open_shard(name: str, path: Path) -> Shard:
         if size == 0:
             return Shard(name, path, "is empty")
         if first != MAGIC:
-            return Shard(name, path, "is no parquet file")
+            return Shard(name, path, "is not a parquet file")
         if last != MAGIC or size < 12:
             return Shard(name, path, NO_FOOTER)
         check_parquet([path])

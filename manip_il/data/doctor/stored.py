@@ -1,4 +1,4 @@
-"""What `meta/stats.json` says, as arrays; anything that is no number there is nothing."""
+"""What `meta/stats.json` says, as arrays; anything that is not a number there is nothing."""
 
 from __future__ import annotations
 

@@ -87,7 +87,9 @@ class HubRemote:
         with quiet(self.endpoint):
             parent = before.token if before else self._begin()
             if before is not None and self.branch != MAIN and self.branch not in self._repo.refs()[0]:
-                raise UsageError(f"{self.describe()}: {self.branch} is no branch; push to one, or name none for main")
+                raise UsageError(
+                    f"{self.describe()}: {self.branch} is not a branch; push to a branch, or leave it out for main"
+                )
             now = self._repo.tree(parent)
             ours = with_git(manifest, local)
             new = [entry for entry in ours.files if not now.holds(entry)]

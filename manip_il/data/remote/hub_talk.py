@@ -101,9 +101,9 @@ def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | 
     if isinstance(cause, OfflineModeIsEnabled):
         return RemoteError(f"{place} cannot be reached: HF_HUB_OFFLINE is set; unset it")
     if isinstance(cause, LocalTokenNotFoundError):
-        return AuthError(f"{place}: nobody is logged in at {host(endpoint)}; {LOGIN}")
+        return AuthError(f"{place}: not logged in at {host(endpoint)}; {LOGIN}")
     if isinstance(cause, HFValidationError):
-        return NotFoundError(f"{place} is no name that a Hub may have; expected USER/NAME of letters, digits, - _ .")
+        return NotFoundError(f"{place} is not a valid name on a Hub; expected USER/NAME of letters, digits, - _ .")
     if isinstance(cause, httpx.ConnectError):
         return TransientError(f"{place} cannot be reached: nothing answers at {host(endpoint)}; is HF_ENDPOINT right?")
     if isinstance(cause, httpx.TimeoutException):
@@ -142,7 +142,7 @@ def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
         text = f"{place}: that Hub has no space left for this account{said}"
         return NoSpaceError(f"{text}; delete what is old there, or get more, and push again: what has come is kept")
     if status == 401:
-        wrong = f"the token is refused{said}" if get_token() else "nobody is logged in"
+        wrong = f"the token is refused{said}" if get_token() else "not logged in"
         return AuthError(f"{place}: {wrong}; {LOGIN}, with a token from {host(endpoint)}/settings/tokens")
     if status == 403:
         text = f"{place}: this token may not do that{said}"

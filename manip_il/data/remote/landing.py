@@ -46,7 +46,7 @@ class Landing:
             self._mismatches += 1
             text = f"{entry.path} is not what the manifest says: its hash differs"
             if self._mismatches > 1:
-                raise HashError(f"{text}, twice; nothing of it was kept: have it pushed anew, to an empty place")
+                raise HashError(f"{text}, twice; nothing was kept; push it again, to an empty place")
             raise TransientError(text)
 
     def _hash_what_is_there(self, digest: Hasher) -> int:
@@ -102,7 +102,7 @@ class _Incoming(io.RawIOBase):
         chunk = memoryview(cast("bytes", data))
         if self.position + len(chunk) > self._entry.size:
             text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
-            raise HashError(f"{text}; nothing of it was kept: have it pushed anew, to an empty place")
+            raise HashError(f"{text}; nothing was kept; push it again, to an empty place")
         if self._hashed is not None:
             self._hashed.result()
         # A large one is hashed while it is written and the next one is fetched.

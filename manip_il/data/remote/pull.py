@@ -167,7 +167,7 @@ def _check_target(target: Path, manifest: Manifest, overwrite: bool) -> None:
     if not target.name:
         raise UsageError(f"{target} cannot be pulled to; name a new folder")
     if target.is_symlink() or (target.exists() and not target.is_dir()):
-        raise UsageError(f"{target} is no folder; name a new one to pull to")
+        raise UsageError(f"{target} is not a folder; name a new one to pull to")
     if target.exists() and any(target.iterdir()) and not overwrite:
         raise FolderExistsError(target)
     beside = _journals(target)
@@ -226,7 +226,7 @@ def _holds(beside: Path, manifest: Manifest) -> bool:
 
 
 def _leaves(folder: Path) -> list[Path]:
-    """Everything below that is no folder; links are not followed."""
+    """Everything below that is not a folder; links are not followed."""
     return [Path(base) / name for base, folders, names in os.walk(folder) for name in _names(base, folders, names)]
 
 

@@ -41,9 +41,9 @@ def explained(error: Exception, what: str, bucket: str) -> RemoteError:
     """One line that says what to do. what: what was being done, with the place."""
     name, code, status = type(error).__name__, code_of(error), status_of(error)
     if name in ("NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError", "ProfileNotFound"):
-        return AuthError(f"cannot {what}: nobody is logged in; set {CREDENTIALS}")
+        return AuthError(f"cannot {what}: not logged in; set {CREDENTIALS}")
     if code in _KEYS or status == 401:
-        return AuthError(f"cannot {what}: the key is not taken ({code or status}); set {CREDENTIALS} anew")
+        return AuthError(f"cannot {what}: the key is not accepted ({code or status}); set {CREDENTIALS} again")
     if code == "NoSuchBucket":
         return NotFoundError(f"cannot {what}: there is no bucket {bucket}; make it, or check the name and the endpoint")
     if code in _FULL or status == 507:
@@ -57,9 +57,9 @@ def explained(error: Exception, what: str, bucket: str) -> RemoteError:
         text = "this key has no right to it; ask the bucket's owner for it, or set the key of somebody who has"
         return AuthError(f"cannot {what}: {text}")
     if name == "EndpointConnectionError" and "Could not connect" in str(error):
-        return TransientError(f"cannot {what}: nobody answers at {_endpoint(error)}; check AWS_ENDPOINT_URL")
+        return TransientError(f"cannot {what}: no answer from {_endpoint(error)}; check AWS_ENDPOINT_URL")
     if status == 0 and (isinstance(error, OSError | TimeoutError | EOFError) or _is_cut(error)):
-        return TransientError(f"cannot {what}: the connection was cut ({name})")
+        return TransientError(f"cannot {what}: the connection was lost ({name})")
     return RemoteError(f"cannot {what}: {code or name}: {' '.join(str(error).split())[:300]}")
 
 

@@ -59,7 +59,7 @@ def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, 
 def kind_of(root: Path) -> Kind:
     """What a folder holds; `UsageError` where it is neither."""
     if not root.is_dir():
-        raise UsageError(f"{root} is no folder; expected the folder of a dataset or of a run")
+        raise UsageError(f"{root} is not a folder; expected the folder of a dataset or of a run")
     if (root / INFO).is_file():
         return "dataset"
     if any((root / name).exists() for name in _POLICY_FILES):
@@ -102,7 +102,7 @@ def _files(folder: Path, journals: bool) -> Iterator[Path]:
         elif entry.is_file():
             yield path
         else:
-            raise ManifestError(f"{path} is no plain file; move it out of the folder")
+            raise ManifestError(f"{path} is not a regular file; move it out of the folder")
 
 
 def _is_last(path: Path) -> bool:

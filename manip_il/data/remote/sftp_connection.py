@@ -136,11 +136,11 @@ class Connection:
             return NoSpaceError(f"{what}: the disk is full; make room and try again")
         refused = isinstance(error, NoValidConnectionsError)
         if refused:
-            return TransientError(f"{what}: nobody answers at {host}, port {self._url.port or 22}")
+            return TransientError(f"{what}: no answer from {host}, port {self._url.port or 22}")
         if isinstance(error, ConnectionError | TimeoutError | EOFError | paramiko.SSHException) or (
             isinstance(error, OSError) and (error.errno in _CUT or "closed" in str(error).lower())
         ):
-            return TransientError(f"{what}: the connection was cut")
+            return TransientError(f"{what}: the connection was lost")
         text = redact(" ".join(str(error).split())[:200], self._url.password or "")
         if text == "Failure":  # all that SFTP says of a full disk, a quota, a name that is taken
             return NoSpaceError(f"{what}: the other side says only 'Failure'; most often its disk or quota is full")

@@ -56,7 +56,7 @@ class RemoteUrl:
         """Raises `UsageError` for an unknown scheme and for what is not written as `FORMS` has it."""
         scheme, colon, rest = text.partition("://")
         if not colon:
-            raise UsageError(f"{_shown(text)!r} is no URL; expected one of {'; '.join(FORMS.values())}")
+            raise UsageError(f"{_shown(text)!r} is not a URL; expected one of {'; '.join(FORMS.values())}")
         if scheme not in FORMS:
             shown = f"{scheme}://" if _SCHEME.fullmatch(scheme) else "..."
             raise UnknownName("scheme", shown, [f"{known}://" for known in FORMS])

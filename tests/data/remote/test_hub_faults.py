@@ -91,7 +91,7 @@ def test_a_download_goes_on_where_it_was_cut(hub: Hub, tmp_path: Path):
     hub.faults.append(Fault("GET .*/resolve/.*data/chunk", cut=200_000))
     do_pull(tmp_path / "back")
     sent = sum(one.sent for one in hub.requests("GET .*/resolve/.*data/chunk"))
-    assert size <= sent < size + 100_000  # what was on its way when the connection was cut
+    assert size <= sent < size + 100_000  # what was on its way when the connection was lost
 
 
 def test_bytes_that_stay_wrong_are_never_taken(hub: Hub, tmp_path: Path):

@@ -28,7 +28,7 @@ def said(kind: type[ManipError], work: Callable[[], object]) -> str:
 
 def test_no_token(hub: Hub, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("HF_TOKEN")
-    assert "nobody is logged in; run `hf auth login`" in said(AuthError, lambda: do_push(SAMPLE))
+    assert "not logged in; run `hf auth login`" in said(AuthError, lambda: do_push(SAMPLE))
 
 
 def test_a_token_that_nobody_was_given(hub: Hub, monkeypatch: pytest.MonkeyPatch):

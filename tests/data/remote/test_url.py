@@ -37,7 +37,7 @@ def test_a_host_with_everything() -> None:
     ("text", "words"),
     [
         ("s4://bucket/x", r"unknown scheme 's4://' \(did you mean 's3://'\?\); known: file://, hf://, s3://, sftp://"),
-        ("datasets/demos", "is no URL; expected one of hf://datasets/USER/NAME"),
+        ("datasets/demos", "is not a URL; expected one of hf://datasets/USER/NAME"),
         ("s3://bucket", "cannot be read; expected s3://BUCKET/FOLDER"),
         ("s3://bucket/../x", "expected s3://"),
         ("hf://demos", "expected hf://"),
