@@ -315,7 +315,8 @@ def _values(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) 
         kind = "O" if dtype == "string" else np.dtype(dtype).kind
     except (ValueError, TypeError, pa.ArrowException) as error:
         raise ManipError(f"{root}: column {name!r} is no {dtype} of shape {shape}: {error}") from error
-    if column.null_count or values.dtype.kind != kind or len(values) != len(column):
+    fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
+    if column.null_count or values.dtype.kind != kind or len(values) != len(column) or not fits:
         missing = f" with {column.null_count} missing" if column.null_count else ""
         holds = checks.shorten(str(column.type))
         raise ManipError(f"{root}: column {name!r} holds {holds}{missing}; expected {dtype} of shape {shape}")

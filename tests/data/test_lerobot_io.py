@@ -375,6 +375,7 @@ sys.exit(", ".join(heavy & set(sys.modules)))
         (s.ACTION, [[1.0, 2.0], [1.0]] * 10),
         (s.ACTION, [[1.0, 2.0, 3.0], None] * 10),
         (s.ACTION, ["text"] * 20),
+        (s.ACTION, [1.0] * 20),
         (layout.EPISODE_INDEX, [0, None] * 10),
         (layout.EPISODE_INDEX, [float("nan")] * 20),
         (s.SUCCESS, [True, None] * 10),
