@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
+from manip_il.data.video_open import open_video
 from manip_il.data.video_read import count_packets
 from manip_il.errors import ManipError, UnknownName, UsageError
 
@@ -106,7 +107,7 @@ class VideoConfig:
 
     def info(self, path: Path) -> dict[str, Any]:
         """What LeRobot's `info.json` says of a camera whose video files are like `path`."""
-        with contextlib.closing(av.open(str(path))) as container:
+        with contextlib.closing(open_video(path)) as container:
             stream = container.streams.video[0]
             found = {
                 "video.height": stream.height,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -13,9 +14,10 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.video_open import open_video
 from manip_il.errors import ManipError, UsageError
 
-_UNREADABLE = (av.FFmpegError, IndexError)  # IndexError: there is no video stream
+_UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 
 
 class VideoReader:
@@ -47,7 +49,7 @@ class VideoReader:
     def _opened(self, path: Path) -> InputContainer:
         if self._container is None or self._path != path:
             self.close()
-            self._container, self._path = av.open(str(path)), path
+            self._container, self._path = open_video(path), path
         return self._container
 
 
@@ -85,7 +87,7 @@ class DatasetPictures:
 def count_frames(path: Path) -> int:
     """Decode a whole video file and count its frames. Raises `ManipError` for one that cannot be decoded."""
     try:
-        with closing(av.open(str(path))) as container:
+        with closing(open_video(path)) as container:
             return sum(1 for _ in container.decode(container.streams.video[0]))
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
@@ -94,7 +96,7 @@ def count_frames(path: Path) -> int:
 def count_packets(path: Path) -> int:
     """Count the coded frames of a video file without decoding them. Raises `ManipError` for an unreadable one."""
     try:
-        with closing(av.open(str(path))) as container:
+        with closing(open_video(path)) as container:
             return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
@@ -106,15 +108,17 @@ def _decode(container: InputContainer, first: int, count: int, fps: int) -> list
     tick = stream.time_base or 1  # [s]
     container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before
     pictures: list[NDArray[np.uint8]] = []
-    for frame in container.decode(stream):
+    for frame in itertools.islice(container.decode(stream), first + count):  # however many say that they come before
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))
+            if pictures[-1].shape != pictures[0].shape:
+                raise ValueError(f"its pictures change their size at frame {first + len(pictures) - 1}")
         if ahead > 0 or len(pictures) == count:
             break
     return pictures
 
 
 def _unreadable(path: Path, error: Exception) -> ManipError:
-    reason = error.strerror if isinstance(error, av.FFmpegError) else "it holds no video"
+    reason = "it holds no video" if isinstance(error, IndexError) else getattr(error, "strerror", None) or str(error)
     return ManipError(f"cannot read {path}: {reason}")

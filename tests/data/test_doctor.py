@@ -346,7 +346,7 @@ def test_a_video_of_another_length(filmed: Path, tmp_path: Path) -> None:
     assert said(filmed, VIDEO, "20 decoded frames for 21 rows of 3 episodes")
     assert said(filmed, VIDEO, "has no frame at the time of rows of 1 episode (2)")
     encode(filmed / VIDEO, frames=25, fps=20)
-    assert said(filmed, VIDEO, "25 decoded frames for 21 rows")
+    assert said(filmed, VIDEO, "more than 21 decoded frames for 21 rows")
 
 
 def test_a_video_of_another_rate_or_size(filmed: Path) -> None:

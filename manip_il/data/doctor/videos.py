@@ -16,6 +16,7 @@ from manip_il.data.doctor.dataset import Clips, Dataset, Episodes
 from manip_il.data.doctor.finding import Finding, error, plural, some
 from manip_il.data.doctor.info import Feature, Info
 from manip_il.data.doctor.pixels import Brightness, check_brightness
+from manip_il.data.video_open import open_video
 
 F64 = NDArray[np.float64]
 TOLERANCE = 1e-4  # LeRobot's reader refuses a frame that is further from its row [s]
@@ -54,11 +55,11 @@ def check_videos(dataset: Dataset) -> Iterator[Finding]:
 
 
 def decode(path: Path, expected: int, brightness: Brightness | None = None) -> Film:
-    """Decode a whole file, one frame in memory at a time."""
+    """Decode a whole file, one frame in memory at a time, but at most one frame more than `expected`."""
     film, times = Film(), list[float]()
     every = max(1, expected // _SAMPLES)
     try:
-        with closing(av.open(str(path))) as container:
+        with closing(open_video(path)) as container:
             if not container.streams.video:
                 return Film("holds no video")
             stream = container.streams.video[0]
@@ -68,6 +69,8 @@ def decode(path: Path, expected: int, brightness: Brightness | None = None) -> F
                 if brightness is not None and len(times) % every == 0:
                     brightness.add(frame.to_ndarray(format="rgb24"))
                 times.append(float((frame.pts or 0) * (frame.time_base or 1)))
+                if len(times) > expected:
+                    break
     except (av.FFmpegError, OSError, ValueError, MemoryError, ArithmeticError) as problem:
         film.problem = _explain(path, problem, len(times))
     film.times = np.sort(np.array(times, dtype=np.float64))
@@ -119,7 +122,10 @@ def _check_film(
         yield error(name, f"runs at {film.rate:.6g} frames a second; {layout.INFO} says {info.fps:.6g}")
     expected = int(episodes.length[rows].sum())
     if len(film.times) != expected:
-        text = f"{plural(len(film.times), 'decoded frame')} for {plural(expected, 'row')}"
+        found = plural(len(film.times), "decoded frame")
+        if len(film.times) > expected:
+            found = f"more than {plural(expected, 'decoded frame')}"
+        text = f"{found} for {plural(expected, 'row')}"
         yield error(name, f"{text} of {plural(len(rows), 'episode')}")
     yield from _check_times(name, film, feature, info, episodes, clips, rows)
 

@@ -1,0 +1,155 @@
+"""A video file from outside opens nothing else, and neither its pictures nor its index fill the memory."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import av
+import numpy as np
+import pytest
+from av.video.codeccontext import VideoCodecContext
+
+from manip_il.data import video_open
+from manip_il.data.doctor import videos
+from manip_il.data.video_open import open_video
+from manip_il.data.video_read import VideoReader, count_frames, count_packets
+from manip_il.errors import ManipError
+
+FRAMES, FPS = 6, 10
+SIZE = (48, 64)  # height, width
+
+
+def film(path: Path, *sizes: tuple[int, int], **options: str) -> Path:
+    """`FRAMES` motion JPEG frames of every size in one stream; a decoder finds the size in each."""
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream("mjpeg", FPS)
+        for part, (height, width) in enumerate(sizes):
+            encoder = stream.codec_context if part == 0 else av.CodecContext.create("mjpeg", "w")
+            encoder = cast(VideoCodecContext, encoder)
+            encoder.height, encoder.width, encoder.pix_fmt = height, width, "yuvj420p"
+            encoder.framerate, encoder.time_base = Fraction(FPS), Fraction(1, FPS)
+            for number in range(FRAMES):
+                frame = av.VideoFrame.from_ndarray(np.full((height, width, 3), 90, np.uint8), format="rgb24")
+                frame.pts, frame.time_base = part * FRAMES + number, Fraction(1, FPS)
+                for packet in encoder.encode(frame):
+                    packet.stream = stream
+                    container.mux_one(packet)
+    return path
+
+
+def refuse(path: Path, words: str) -> None:
+    """By every way that videos are read."""
+    with pytest.raises((ValueError, av.FFmpegError)):
+        open_video(path)
+    for read in (count_frames, count_packets, lambda path: VideoReader().read(path, 0, FRAMES, FPS)):
+        with pytest.raises(ManipError, match=words) as caught:
+            read(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    found = videos.decode(path, FRAMES)
+    assert found.problem
+    assert not len(found.times)
+
+
+def claim(path: Path, box: bytes, at: int, value: int) -> Path:
+    """Overwrite a number of 32 bits, `at` bytes behind the name of a box."""
+    data = bytearray(path.read_bytes())
+    start = data.index(box) + len(box) + at
+    data[start : start + 4] = value.to_bytes(4)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_plain_film_is_read(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE)
+    assert VideoReader().read(path, 2, 3, FPS).shape == (3, *SIZE, 3)
+    assert count_frames(path) == count_packets(path) == len(videos.decode(path, FRAMES).times) == FRAMES
+
+
+@pytest.mark.parametrize("name", ["a:b.mp4", "concat:x|y.mp4", "http:x.mp4", "%03d.mp4"])
+def test_a_name_is_a_path_and_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    film(tmp_path / "film.mp4", SIZE).rename(name)
+    assert count_frames(Path(name)) == FRAMES
+
+
+def test_a_playlist_opens_no_other_file(tmp_path: Path) -> None:
+    film(tmp_path / "secret.mp4", SIZE)
+    path = tmp_path / "file-000.mp4"
+    path.write_text("ffconcat version 1.0\nfile secret.mp4\n")
+    with closing(av.open(str(path))) as container:  # FFmpeg on its own follows it
+        assert sum(1 for _ in container.decode(video=0)) == FRAMES
+    refuse(path, "Invalid data")
+
+
+def test_a_playlist_for_streaming_opens_no_other_file(tmp_path: Path) -> None:
+    film(tmp_path / "secret.mp4", SIZE)
+    path = tmp_path / "file-000.mp4"
+    lines = ("#EXTM3U", "#EXT-X-TARGETDURATION:1", "#EXTINF:0.6,", "secret.mp4", "#EXT-X-ENDLIST")
+    path.write_text("\n".join(lines))
+    refuse(path, "Invalid data")
+
+
+def test_pictures_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(video_open, "MOST_PIXELS", 48 * 64 - 1)
+    refuse(film(tmp_path / "film.mp4", SIZE), "its pictures have 64 x 48 pixels; expected at most 3,071 in all")
+
+
+def test_pictures_may_not_grow_beyond_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = film(tmp_path / "film.mp4", SIZE, (480, 640))
+    assert count_frames(path) == 2 * FRAMES
+    monkeypatch.setitem(video_open._OPTIONS, "max_pixels", str(2 * 48 * 64))
+    with pytest.raises(ManipError, match="cannot read"):
+        count_frames(path)
+    found = videos.decode(path, 2 * FRAMES)
+    assert found.problem.startswith(f"breaks off after {FRAMES} frames")
+
+
+def test_pictures_of_two_sizes_are_one_line(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE, (96, 64))
+    with pytest.raises(ManipError, match=f"its pictures change their size at frame {FRAMES}"):
+        VideoReader().read(path, 0, 2 * FRAMES, FPS)
+
+
+@pytest.mark.parametrize("count", [video_open.MOST_INDEXED + 1, 170_000_000, 2**32 - 1])
+def test_an_index_of_equal_sizes_is_not_made_on_its_word(tmp_path: Path, count: int) -> None:
+    path = film(tmp_path / "film.mp4", SIZE)
+    claim(claim(path, b"stsz", 4, 1), b"stsz", 8, count)
+    refuse(path, f"it declares {count:,} frames")
+
+
+def test_edits_that_repeat_an_index_are_counted(tmp_path: Path) -> None:
+    path = claim(film(tmp_path / "film.mp4", SIZE), b"elst", 4, 10**6)
+    refuse(path, "it declares 6 frames and 1,000,000 edits")
+
+
+def test_fragments_are_refused(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE, movflags="frag_keyframe+empty_moov")
+    refuse(path, "it has a box mvex")
+
+
+def test_what_lies_among_the_coded_frames_is_not_looked_at(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE)
+    data = path.read_bytes()
+    path.write_bytes(data + (24).to_bytes(4) + b"mdat" + b"moofmvexstszelst")
+    assert count_frames(path) == FRAMES
+
+
+def test_decoding_stops_one_frame_behind_what_is_expected(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE)
+    assert [len(videos.decode(path, expected).times) for expected in (2, 5, 6, 7)] == [3, 6, 6, 6]
+
+
+def test_a_place_beyond_all_time_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ManipError, match="cannot read"):
+        VideoReader().read(film(tmp_path / "film.mp4", SIZE), 10**30, 1, FPS)
+
+
+def test_an_empty_file_and_a_missing_one_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "empty.mp4").touch()
+    refuse(tmp_path / "empty.mp4", "Invalid data")
+    with pytest.raises(ManipError, match=r"cannot read .*missing\.mp4: No such file"):
+        count_frames(tmp_path / "missing.mp4")
