@@ -7,11 +7,12 @@ bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages. Fo
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import math
 import os
 import re
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from manip_il.data.foxglove_episode import channels, frame_times
 from manip_il.data.mcap_records import (
     MIB,
     Budget,
+    Record,
     check_both_sums,
     chunk_records,
     read_records,
@@ -121,16 +123,12 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
     with _explain(path), path.open("rb") as stream:
         check_both_sums(stream)
         header = _header(stream)
-        budget = Budget(path.stat().st_size, LARGEST_EPISODE, _LARGEST_RATIO)
-        columns: dict[str, NDArray[Any]] = {}
-        for record in read_records(stream, Opcode.ATTACHMENT):
-            budget.take(len(record.body))
-            name, data = to_attachment(record.body)
-            columns[name.removesuffix(_NPY)] = _from_npy(data)
-            if len(columns) > _MOST_COLUMNS:
-                raise ValueError(f"it holds more than {_MOST_COLUMNS} columns")
+        budget = _budget(stream)
+        columns = {name: _from_npy(data) for name, data in _attachments(stream, budget)}
         if header.spec.cameras:  # else nothing in the messages is needed
-            columns |= _read_pictures(stream, header, budget)
+            shape = (header.frames, *header.spec.image_size, 3)
+            pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
+            columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
         episode = Episode(header.seed, columns, header.success, header.success_at_end)
         if len(episode) != header.frames:
             raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
@@ -189,7 +187,10 @@ def clean_temporary(folder: Path) -> list[Path]:
 
 
 def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> bytes:
-    """A journal file's content; the same episode gives the same bytes."""
+    """A journal file's content; the same episode gives the same bytes.
+
+    Raises `ManipError` for an episode that `read_episode` would refuse for its size.
+    """
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library=_RECORD)
@@ -211,7 +212,20 @@ def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str,
             continue  # pictures travel as messages, without loss as well
         writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
     writer.finish()
+    _check_limits(stream, episode.seed)
     return stream.getvalue()
+
+
+def _check_limits(stream: io.BytesIO, seed: int) -> None:
+    """Raise `ManipError` where a journal is larger than what reading allows."""
+    try:
+        header, budget = _header(stream), _budget(stream)
+        parts = [_attachments(stream, budget), _messages(stream, header, budget) if header.spec.cameras else ()]
+        for _ in itertools.chain(*parts):
+            pass
+    except (ManipError, ValueError) as error:
+        advice = "record shorter episodes, or smaller or fewer pictures"
+        raise ManipError(f"the journal of the episode with seed {seed} could not be read: {error}; {advice}") from error
 
 
 def _add_channels(writer: Writer, episode: Episode, spec: RobotTaskSpec) -> None:
@@ -242,15 +256,26 @@ def _from_npy(data: memoryview) -> NDArray[Any]:
     return np.ndarray(shape, dtype, bytearray(content), order="F" if is_fortran else "C")
 
 
-def _read_pictures(stream: BinaryIO, header: Header, budget: Budget) -> dict[str, NDArray[Any]]:
-    """Columns of pictures, uint8 (T, height, width, 3)."""
-    spec = header.spec
-    budget.take(len(spec.cameras) * header.frames * math.prod(spec.image_size) * 3)
-    packed = Budget(os.fstat(stream.fileno()).st_size, 2 * LARGEST_EPISODE, 2 * _LARGEST_RATIO)
-    chunks = read_records(stream, Opcode.CHUNK)
-    messages = (one for chunk in chunks for one in chunk_records(unpack(chunk, packed, check=False), packed))
-    pictures = foxglove.read_images(messages, spec.cameras, (header.frames, *spec.image_size, 3))
-    return {IMAGES + camera: frames for camera, frames in pictures.items()}
+def _budget(stream: BinaryIO, times: int = 1) -> Budget:
+    return Budget(stream.seek(0, os.SEEK_END), times * LARGEST_EPISODE, times * _LARGEST_RATIO)
+
+
+def _attachments(stream: BinaryIO, budget: Budget) -> Iterator[tuple[str, memoryview]]:
+    """Names and files of the columns that are no pictures."""
+    for count, record in enumerate(read_records(stream, Opcode.ATTACHMENT), start=1):
+        if count > _MOST_COLUMNS:
+            raise ValueError(f"it holds more than {_MOST_COLUMNS} columns")
+        budget.take(len(record.body))
+        name, data = to_attachment(record.body)
+        yield name.removesuffix(_NPY), data
+
+
+def _messages(stream: BinaryIO, header: Header, budget: Budget) -> Iterator[Record]:
+    """Channels and messages, the pictures among them."""
+    budget.take(len(header.spec.cameras) * header.frames * math.prod(header.spec.image_size) * 3)
+    packed = _budget(stream, times=2)
+    for chunk in read_records(stream, Opcode.CHUNK):
+        yield from chunk_records(unpack(chunk, packed, check=False), packed)
 
 
 def _header(stream: BinaryIO) -> Header:

@@ -79,7 +79,7 @@ def read_records(stream: BinaryIO, *wanted: Opcode, check: bool = False) -> Iter
     check: compare the checksum over the data section, where the file has one. Raises `ValueError` for what is no MCAP
     file, ends too early, does not fit its checksum, or holds a wanted record beyond its kind's limit.
     """
-    size = os.fstat(stream.fileno()).st_size
+    size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     if (magic := stream.read(len(_MAGIC))) != _MAGIC:
         raise ValueError("it is not an MCAP file")

@@ -28,11 +28,12 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from . import mcap_forgery as forge
-from .pictures import with_cameras
+from .pictures import numbered_episodes, with_cameras
 
 MIB = 1024 * 1024
 BOMB = LARGEST_CHUNK + 32 * MIB
 AtMost = Callable[[int], AbstractContextManager[None]]
+MakeEpisode = Callable[..., Episode]
 
 
 @pytest.fixture
@@ -477,3 +478,58 @@ def test_a_bomb_takes_less_than_a_gigabyte(
     assert sum(line.startswith("manip-il: error: ") for line in said) == 1, done.stderr
     assert len(said) <= 2  # and how far it had come
     assert peak < 1024, f"{peak} MiB"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("LARGEST_EPISODE", 1_000, r"it unpacks to more than [\d,]+ bytes"),
+        ("_MOST_COLUMNS", 3, "it holds more than 3 columns"),
+        ("MOST_FRAMES", 8, "its number of frames is 9; expected a whole number from 1 to 8"),
+    ],
+)
+def test_what_could_not_be_read_is_not_written(
+    tmp_path: Path,
+    make_episode: MakeEpisode,
+    spec: s.RobotTaskSpec,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    value: int,
+    words: str,
+) -> None:
+    monkeypatch.setattr(journal, "_LARGEST_RATIO", 0)
+    journal.write_episode(tmp_path / "within", make_episode(7), spec, {})
+    monkeypatch.setattr(journal, name, value)
+    with pytest.raises(
+        ManipError, match=f"^the journal of the episode with seed 7 could not be read: {words}; record "
+    ):
+        journal.write_episode(tmp_path / "beyond", make_episode(7), spec, {})
+    assert not (tmp_path / "beyond").exists()
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "words"),
+    [
+        ("LARGEST_CHUNK", 100, "a chunk, unpacked, has [0-9,]+ bytes; expected at most 100"),
+        ("MOST_RECORDS", 5, "it holds more than 5 messages"),
+    ],
+)
+def test_pictures_that_could_not_be_read_are_not_written(
+    make_episode: MakeEpisode,
+    spec: s.RobotTaskSpec,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: str,
+    value: int,
+    words: str,
+) -> None:
+    filmed = with_cameras(spec, "front")
+    episode = numbered_episodes(make_episode, filmed)[0]
+    journal.encode_episode(episode, filmed, {})
+    monkeypatch.setattr(mcap_records, limit, value)
+    with pytest.raises(ManipError, match=words):
+        journal.encode_episode(episode, filmed, {})
+
+
+def test_a_fingerprint_that_could_not_be_read_is_not_written(make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> None:
+    with pytest.raises(ManipError, match=r"a metadata record has [\d,]+ bytes; expected at most 1,048,576"):
+        journal.encode_episode(make_episode(7), spec, {"text": "x" * 2**20})
