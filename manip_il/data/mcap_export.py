@@ -186,7 +186,10 @@ def _tasks(root: Path) -> dict[int, str]:
         table = pq.read_table(root / layout.TASKS, columns=[layout.TASK_INDEX, "task"]).to_pydict()
     except (OSError, ValueError, pa.ArrowException) as error:
         raise ManipError(f"cannot read {root / layout.TASKS}: {error}; `manip-il doctor` tells what is left") from error
-    return dict(zip(table[layout.TASK_INDEX], table["task"], strict=True))
+    numbers, texts = table[layout.TASK_INDEX], table["task"]
+    if not all(isinstance(number, int) for number in numbers):
+        raise ManipError(f"{root / layout.TASKS}: column {layout.TASK_INDEX!r} holds other than whole numbers")
+    return dict(zip(numbers, texts, strict=True))
 
 
 def _task(root: Path, tasks: dict[int, str], number: int) -> str:

@@ -181,6 +181,16 @@ def test_a_column_without_a_place_in_mcap_is_refused(
         open_source(tmp_path)
 
 
+@pytest.mark.parametrize("numbers", [[[0]], ["0"], [None], [{"a": 1}]])
+def test_tasks_without_numbers_are_refused(ours: Path, tmp_path: Path, numbers: list[Any]) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data").symlink_to(ours / "data")
+    (tmp_path / layout.INFO).symlink_to(ours / layout.INFO)
+    pq.write_table(pa.table({layout.TASK_INDEX: numbers, "task": ["Lift."]}), tmp_path / layout.TASKS)
+    with pytest.raises(ManipError, match=r"tasks\.parquet: column 'task_index' holds other than whole numbers"):
+        list(export_dataset(open_source(tmp_path), tmp_path))
+
+
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ManipError, match="is not a LeRobot dataset"):
         open_source(tmp_path)
