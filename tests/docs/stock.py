@@ -1,0 +1,76 @@
+"""The folders that documented commands take for granted, each made once, when it is first needed, and small."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from pathlib import Path
+
+from manip_il.cli.main import main
+
+from .pages import ROOT, command_of
+from .sizes import small_words
+
+_EXPERT = "eval --policy.type=expert"
+RECIPES = {  # folder -> the command that makes it, relative to the same place
+    "datasets/demos": "record --dataset.root=datasets/demos",
+    "datasets/demos.journals": "record --dataset.root=datasets/demos",
+    "datasets/seen": "record --cameras=front,wrist --dataset.root=datasets/seen",
+    "demos_mcap": "mcap export datasets/demos demos_mcap",
+    "runs/act": "train --policy.type=act --dataset.root=datasets/demos --output_dir=runs/act",
+    "runs/cloned": "train --dataset.root=datasets/demos --output_dir=runs/cloned",
+    "policy": "train --dataset.root=datasets/demos --output_dir=policy",
+    "runs/dagger": "dagger --output_dir=runs/dagger",
+    "runs/cloning": "dagger --method=cloning --output_dir=runs/cloning",
+    "runs/eval": f"{_EXPERT} --output_dir=runs/eval",
+    "out/0": f"{_EXPERT} --eval.first=0 --output_dir=out/0",
+    "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
+    "out/2": f"{_EXPERT} --eval.first=4 --output_dir=out/2",
+}
+SAMPLE = "datasets/sample"  # comes with the repository
+_OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root")
+_TARGETS = ("build", "render", "mcap export", "mcap import", "pull")  # their second place is made, not read
+
+
+class Stock:
+    """Makes and keeps them in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def bring(self, words: tuple[str, ...], target: Path) -> None:
+        """Put what a line reads, and nobody has made there yet, into `target`."""
+        for path in inputs(words):
+            name = next((name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None)
+            if name is None or (target / name).exists():
+                continue
+            made = self._made(name)
+            if made != target / name:
+                shutil.copytree(made, target / name)
+
+    def _made(self, name: str) -> Path:
+        if name == SAMPLE:
+            return ROOT / SAMPLE
+        if not (self.folder / name).exists():
+            words = tuple(RECIPES[name].split())
+            self.bring(("manip-il", *words), self.folder)
+            with contextlib.chdir(self.folder):
+                assert main(small_words(words)) == 0, f"nothing made {name}"
+        return self.folder / name
+
+
+def inputs(words: tuple[str, ...]) -> list[str]:
+    """The words of a line, and the values of its options, that may name what it reads."""
+    program, rest = words[0], words[1:]
+    name, own = command_of(rest) if program == "manip-il" else ("", list(rest))
+    made_by_record = name == "record" and not any(word.startswith("--resume") for word in own)
+    found: list[str] = []
+    places = 0
+    for word in own:
+        option, _, value = word[2:].partition("=") if word.startswith("--") else ("", "", word)
+        if not option:
+            places += 1
+        is_output = option in _OUTPUTS or (option == "dataset.root" and made_by_record)
+        if not is_output and not (not option and places == 2 and name in _TARGETS):
+            found.append(value.removeprefix("./"))
+    return found

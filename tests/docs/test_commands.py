@@ -1,0 +1,152 @@
+"""Every command line and snippet in README, docs and help runs, verbatim but for sizes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import boto3
+import pytest
+from huggingface_hub import constants
+
+from manip_il.cli.main import load
+from manip_il.cli.options import parse
+
+from ..data.remote.hub_server import Hub, clean_environment, hub_server
+from ..data.remote.hub_use import TOKEN
+from ..data.remote.s3 import KEY, SECRET, running_moto, variables
+from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
+from .sizes import shrink_study
+from .stock import Stock
+from .workplace import PROGRAM, RULES, LeRobot, Workplace
+
+BUCKET = "robots"  # the one in the docs
+_DRAWS = ("--cameras=", "--video", "manip-il render", "manip-il health", "datasets/seen")
+
+
+@pytest.fixture(scope="session")
+def stock(tmp_path_factory: pytest.TempPathFactory) -> Stock:
+    return Stock(tmp_path_factory.mktemp("stock"))
+
+
+@pytest.fixture(scope="session")
+def running_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
+    with hub_server(tmp_path_factory.mktemp("hub")) as hub:
+        hub.add_token(TOKEN, "user")
+        yield hub
+
+
+@pytest.fixture(scope="session")
+def bucket() -> Iterator[dict[str, str]]:
+    """What a program must have in its environment to find it."""
+    with running_moto() as endpoint:
+        client = boto3.client("s3", endpoint_url=endpoint, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
+        client.create_bucket(Bucket=BUCKET)
+        yield variables(endpoint)
+
+
+@pytest.fixture(scope="session")
+def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LeRobot]:
+    """Runs one of LeRobot's commands in a folder; the Hub of the tests is the only one that it knows."""
+    home = tmp_path_factory.mktemp("home")
+    clean = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
+    clean |= clean_environment(running_hub, home / "hf", TOKEN)
+    clean |= {"HOME": str(home), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    started: list[subprocess.Popen[str]] = []
+
+    def run(words: list[str], folder: Path) -> None:
+        if not started:
+            child = [sys.executable, str(Path(__file__).with_name("lerobot_child.py"))]
+            pipe = subprocess.PIPE
+            started.append(subprocess.Popen(child, env=clean, stdin=pipe, stdout=pipe, text=True, cwd=ROOT))
+        (process,) = started
+        assert process.stdin is not None
+        assert process.stdout is not None
+        log = home / "log"
+        print(json.dumps({"words": words, "folder": str(folder), "log": str(log)}), file=process.stdin, flush=True)
+        answer = process.stdout.readline()
+        assert answer == "0\n", f"{words} ended with {answer}{log.read_text(encoding='utf-8')[-4000:]}"
+
+    yield run
+    for process in started:
+        assert process.stdin is not None
+        process.stdin.close()
+        process.wait(60)
+
+
+@pytest.fixture
+def workplace(
+    tmp_path: Path,
+    stock: Stock,
+    lerobot: LeRobot,
+    running_hub: Hub,
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Workplace:
+    """A folder with the repository's configs, studies made small, and servers that answer for the Hub and S3."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    for study in (tmp_path / "configs" / "studies").glob("*.yaml"):
+        shrink_study(study)
+    page = request.node.callspec.params.get("page")
+    stored = any("s3://" in block.text for block in blocks(page)) if page else False
+    servers = request.getfixturevalue("bucket") if stored else {}  # takes seconds to start
+    for name, value in (servers | {"HF_TOKEN": TOKEN, "HF_ENDPOINT": running_hub.url}).items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(constants, "ENDPOINT", running_hub.url)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "no_token"))
+    return Workplace(tmp_path, stock, lerobot)
+
+
+def _pages() -> list[object]:
+    """Pages with something to run; `gl` where it draws."""
+    found: list[object] = []
+    for page in PAGES:
+        texts = [block.text for block in blocks(page) if block.language != "text"]
+        marks = [pytest.mark.gl] if any(word in text for text in texts for word in _DRAWS) else []
+        if texts:
+            found.append(pytest.param(page, marks=marks, id=page))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", _pages())
+def test_every_line_of_a_page_runs(page: str, workplace: Workplace):
+    for block in blocks(page):
+        workplace.run_block(block)
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+@pytest.mark.parametrize("line", help_lines(), ids=lambda line: line.where)
+def test_the_example_in_the_help_runs(line: Line, workplace: Workplace):
+    assert line.words[0] == PROGRAM
+    workplace.run(line)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_of_a_page_is_of_a_kind_that_the_tests_know(page: str):
+    for block in blocks(page):
+        assert block.language in LANGUAGES, block.where
+        if block.language == "text":
+            first_words = {line.split()[0] for line in block.text.splitlines() if line.split()}
+            assert not first_words & {PROGRAM, *RULES}, f"{block.where}: commands belong into a block of `sh`"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_line_is_one_that_the_command_line_takes(page: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(ROOT)
+    for line in page_lines(page):
+        if line.words[0] == PROGRAM:
+            name, own = command_of(line.words[1:])
+            kind = load(name)
+            if "--help" not in own:
+                parse(kind, own)
+        else:
+            assert line.words[0] in RULES or line.words[0].startswith("lerobot-"), line

@@ -1,0 +1,161 @@
+"""A folder in which the lines of a page are run, one after the other, as a user would."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import yaml
+
+from manip_il.cli.main import load, main
+from manip_il.cli.options import parse
+
+from .pages import ROOT, Block, Line, command_of, shell_lines
+from .sizes import small_lerobot, small_words
+from .stock import RECIPES, Stock
+
+PROGRAM = "manip-il"
+_NAMES = {"USER": "user", "NAME": "name", "//me/": "//user/", "datasets/me/": "datasets/user/"}
+_OF_A_CONTAINER = re.compile(r"(?:(?<=^)|(?<==))/(?=(?:policy|out)\b)")  # its volumes, as folders of this place
+
+LeRobot = Callable[[list[str], Path], None]
+
+
+class Workplace:
+    """Runs lines. A line that no rule covers is an error."""
+
+    def __init__(self, folder: Path, stock: Stock, lerobot: LeRobot) -> None:
+        self.folder, self.stock, self.lerobot = folder, stock, lerobot
+
+    def run_block(self, block: Block) -> None:
+        """Every command of a shell block, a Python block, or what a YAML block is for."""
+        match block.language:
+            case "sh":
+                for line in shell_lines(block):
+                    self.run(line)
+            case "python":
+                self._python_block(block)
+            case "yaml":
+                self._yaml_block(block)
+            case _:
+                pass
+
+    def run(self, line: Line) -> None:
+        """One command, at a small size; fails unless it ends with exit code 0."""
+        first = line.words[0]
+        words = tuple(_OF_A_CONTAINER.sub("", _named(word)) for word in line.words)
+        if first == PROGRAM:
+            self.stock.bring(words, self.folder)
+            self._manip_il(words[1:], line)
+        elif first.startswith("lerobot-"):
+            self.stock.bring(words, self.folder)
+            self.lerobot(small_lerobot(words), self.folder)
+        else:
+            rule = RULES.get(first)
+            assert rule is not None, f"{line}: no rule says how the tests run this"
+            rule(self, line)
+
+    def _manip_il(self, words: tuple[str, ...], line: Line) -> None:
+        with contextlib.chdir(self.folder):
+            small = small_words(words)
+            assert main(small) == 0, f"{line}\nas: {PROGRAM} {shlex.join(small)}"
+
+    def _python_block(self, block: Block) -> None:
+        self.stock.bring(("python", *(name for name in RECIPES if f'"{name}"' in block.text)), self.folder)
+        with contextlib.chdir(self.folder):
+            exec(compile(block.text, block.where, "exec"), {"__name__": "__main__"})
+
+    def _yaml_block(self, block: Block) -> None:
+        """`# NAME.yaml` in its first line names a file for the lines that follow; else it is a job of Kubernetes."""
+        first = block.text.splitlines()[0]
+        if named := re.fullmatch(r"# ([\w.-]+\.yaml)", first):
+            (self.folder / named[1]).write_text(block.text, encoding="utf-8")
+            return
+        job = yaml.safe_load(block.text)
+        assert job["kind"] == "Job", f"{block.where}: neither a file with a name nor a job"
+        (container,) = job["spec"]["template"]["spec"]["containers"]
+        assert container["command"] == ["sh", "-c"]
+        for words in _as_the_shell_sees(container["args"][0]):
+            self.run(Line(block.where, (PROGRAM, *words)))
+
+    def _make(self, line: Line) -> None:
+        """What the target would run of this program; the rest of it is machinery that CI runs itself."""
+        clean = {name: value for name, value in os.environ.items() if name not in ("MAKEFLAGS", "MAKELEVEL")}
+        done = subprocess.run(
+            ["make", "--dry-run", *line.words[1:]], capture_output=True, text=True, cwd=ROOT, env=clean, check=False
+        )
+        assert done.returncode == 0, f"{line}: {done.stderr}"
+        for recipe in done.stdout.splitlines():
+            if recipe.startswith(f".venv/bin/{PROGRAM} "):
+                self.run(Line(line.where, (PROGRAM, *shlex.split(recipe)[1:])))
+
+    def _docker(self, line: Line) -> None:
+        """Building and running are CI's; what is asked of the program in the container must be words it knows."""
+        if line.words[1] == "build":
+            arguments = [word.partition("=")[0] for word in line.words if re.fullmatch(r"[A-Z_]+=\w+", word)]
+            assert all(f"ARG {name}=" in (ROOT / "Dockerfile").read_text(encoding="utf-8") for name in arguments)
+            return
+        assert line.words[1] == "run", f"{line}: neither build nor run"
+        _, _, asked = shlex.join(line.words).partition(f" {PROGRAM}")
+        if asked.strip():
+            name, own = command_of(tuple(shlex.split(asked)))
+            parse(load(name), own)
+
+    def _python(self, line: Line) -> None:
+        script = ROOT / line.words[1]
+        done = subprocess.run(
+            [sys.executable, str(script), *line.words[2:], "--quick"],
+            capture_output=True, text=True, cwd=self.folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{line}: {(done.stdout + done.stderr)[-3000:]}"
+
+    def _mkdir(self, line: Line) -> None:
+        subprocess.run(line.words, cwd=self.folder, check=True)
+
+    def _export(self, line: Line) -> None:
+        """The tests' own servers have set them."""
+        names = [word.partition("=")[0] for word in line.words[1:]]
+        assert all(name in os.environ for name in names), f"{line}: no server of the tests reads these"
+
+    def _activate(self, line: Line) -> None:
+        assert line.words == (".", ".venv/bin/activate")
+        assert (Path(sys.prefix) / "bin" / "activate").is_file()
+
+    def _apt_get(self, line: Line) -> None:
+        """The packages are those with which CI starts from a bare Debian, and those that `make` brings."""
+        assert line.words[1:3] == ("install", "-y")
+        text = "".join((ROOT / ".ci" / name).read_text(encoding="utf-8") for name in ("fresh", "system"))
+        missing = set(line.words[3:]) - set(re.findall(r"[\w.-]+", text))
+        assert not missing, f"{line}: CI does without {missing}"
+
+
+RULES: dict[str, Callable[[Workplace, Line], None]] = {
+    "make": Workplace._make,
+    "docker": Workplace._docker,
+    "python": Workplace._python,
+    "mkdir": Workplace._mkdir,
+    "export": Workplace._export,
+    ".": Workplace._activate,
+    "apt-get": Workplace._apt_get,
+}
+
+
+def _named(word: str) -> str:
+    for name, ours in _NAMES.items():
+        word = word.replace(name, ours)
+    return word
+
+
+def _as_the_shell_sees(text: str) -> list[list[str]]:
+    """The words of every `manip-il` in a script, as `sh` makes them in the second pod of a job."""
+    script = f"{PROGRAM}() {{ printf '%s\\0' \"$@\"; printf '\\n'; }}\n{text}"
+    done = subprocess.run(
+        ["bash", "-c", script], capture_output=True, text=True, check=True, env={"JOB_COMPLETION_INDEX": "1"}
+    )
+    return [line.split("\0")[:-1] for line in done.stdout.splitlines()]
