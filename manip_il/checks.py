@@ -105,10 +105,13 @@ def mapping(what: str, value: object) -> dict[str, Any]:
     return value
 
 
-def parse_json(what: str, data: str | bytes) -> Any:
-    """Return what a JSON text holds; broken, too deep, or with NaN or Infinity, it is refused."""
+def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> Any:
+    """Return what a JSON text holds; broken, too deep, or with NaN or Infinity, it is refused.
+
+    nan_is_none: NaN and Infinity are read as None instead.
+    """
     try:
-        return json.loads(data, parse_constant=_refuse_constant)
+        return json.loads(data, parse_constant=_to_none if nan_is_none else _refuse_constant)
     except RecursionError as error:
         raise ManipError(f"{what} is not valid JSON: it is nested too deeply") from error
     except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are
@@ -130,6 +133,10 @@ def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, A
 def _is_float(value: float) -> bool:
     """Whether a number is finite and no int beyond what a float holds."""
     return abs(value) <= sys.float_info.max
+
+
+def _to_none(constant: str) -> None:
+    return None
 
 
 def _refuse_constant(constant: str) -> Any:

@@ -78,7 +78,7 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Every record, without a torn last line; none where there is no file.
+    """Every record, without a torn last line; none where there is no file. A number that is not finite is None.
 
     Raises `ManipError` for any other line that is not a JSON object.
     """
@@ -158,7 +158,7 @@ def _read_at(file: Any, position: int) -> bytes:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
-        return checks.mapping("a record", checks.parse_json("a record", line))
+        return checks.mapping("a record", checks.parse_json("a record", line, nan_is_none=True))
     except ManipError:
         return None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -43,7 +44,10 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 
 @contextmanager
 def json_lines(path: Path, step: int) -> Iterator[Writer]:
-    """A function that adds a line; lines after `step`, of a run that was killed, go first."""
+    """A function that adds a line, null where a number is not finite.
+
+    Lines after `step`, of a run that was killed, go first.
+    """
     kept = []
     if path.is_file() and step > 0:
         for line in path.read_text(errors="replace").splitlines():
@@ -54,7 +58,7 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
 
     def write(record: Record) -> None:
         with writing(path), path.open("ab") as file:
-            file.write((json.dumps(dict(record)) + "\n").encode())
+            file.write((json.dumps(_finite(record), allow_nan=False) + "\n").encode())
 
     yield write
 
@@ -87,6 +91,10 @@ def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
         raise UsageError("--wandb.enable=true needs Weights & Biases: pip install wandb") from error
     logger = WandBLogger(config)
     yield lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])
+
+
+def _finite(record: Record) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
 
 
 def _step_of(line: str) -> int | None:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.dagger import learning_curve
 from manip_il.cli.main import main
+from manip_il.cli.sides import read_side
 from manip_il.evaluation import runner
 
 from .made_runs import ENV, OPTIONS, make_eval, make_policy, make_run, mark
@@ -128,6 +130,23 @@ def test_a_policy_meets_a_run_in_the_runs_environment(here, policy, evaluated):
     assert compare("p", "a", *SIZES, "--overwrite=true", "--seed=1") == 0
     assert result()["test_seeds"][0] == 114_000_000
     assert evaluated == ["p", "a"] * 2
+
+
+def test_a_run_keeps_its_learning_curve_where_a_loss_was_not_finite(here, policy):
+    run = make_run(here / "run", policy)
+    lines = (run / "metrics.jsonl").read_text()
+    before = learning_curve(run)
+    (run / "metrics.jsonl").write_text(lines.replace('"beta": 0.0', '"beta": 0.0, "grad_norm": NaN'))
+    assert "NaN" in (run / "metrics.jsonl").read_text()
+    assert learning_curve(run) == before
+    assert len(before.dagger) == 3
+
+
+def test_a_fit_whose_metrics_have_nan_is_a_policy_to_compare(here, policy):
+    shutil.copytree(policy, here / "fit" / "checkpoints" / "last" / "pretrained_model")
+    (here / "fit" / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5, "grad_norm": NaN}\n')
+    (source,) = read_side(here / "fit").sources
+    assert source.policy == here / "fit" / "checkpoints" / "last" / "pretrained_model"
 
 
 def test_a_run_that_is_not_finished_is_said_to_be_so(here, policy, capsys):

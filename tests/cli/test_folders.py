@@ -173,3 +173,9 @@ def test_nan_is_not_written(tmp_path):
     with pytest.raises(NotFiniteError, match="not finite"):
         append_jsonl(tmp_path / "m.jsonl", {"loss": float("nan")})
     assert not (tmp_path / "m.jsonl").exists()
+
+
+def test_numbers_that_are_not_finite_are_missing(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"step": 1, "grad_norm": NaN}\n{"step": 2, "grad_norm": null, "x": [Infinity, -Infinity]}\n')
+    assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None, "x": [None, None]}]
