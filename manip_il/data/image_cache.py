@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from manip_il.data.atomic import PARTIAL, new_folder
 from manip_il.data.frame_build import build_frames
 from manip_il.data.frame_source import FrameSource, find_frames
+from manip_il.data.writing import WriteError
 from manip_il.errors import ManipError, UsageError
 
 FRAMES = "frames.npy"
@@ -76,9 +77,10 @@ def open_frame_cache(
                     return None
                 for source in missing:
                     opened[source.key] = _build(folder, source, workers, on_frames)
-    except OSError as error:
+    except (OSError, WriteError) as error:
+        refusal = error.__cause__ if isinstance(error, WriteError) else error
         raise ManipError(
-            f"cannot keep decoded pictures in {folder}: {error.strerror or error}; "
+            f"cannot keep decoded pictures in {folder}: {getattr(refusal, 'strerror', None) or refusal}; "
             "make room there, or set XDG_CACHE_HOME to another disk"
         ) from error
     return {key: frames for key, frames in opened.items() if frames is not None}
