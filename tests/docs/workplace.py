@@ -81,7 +81,7 @@ class Workplace:
         assert job["kind"] == "Job", f"{block.where}: neither a file with a name nor a job"
         (container,) = job["spec"]["template"]["spec"]["containers"]
         assert container["command"] == ["sh", "-c"]
-        for words in _as_the_shell_sees(container["args"][0]):
+        for words in _as_the_shell_sees(_OF_A_CONTAINER.sub("", container["args"][0]), self.folder):
             self.run(Line(block.where, (PROGRAM, *words)))
 
     def _make(self, line: Line) -> None:
@@ -152,10 +152,15 @@ def _named(word: str) -> str:
     return word
 
 
-def _as_the_shell_sees(text: str) -> list[list[str]]:
-    """The words of every `manip-il` in a script, as `sh` makes them in the second pod of a job."""
+def _as_the_shell_sees(text: str, folder: Path) -> list[list[str]]:
+    """The words of every `manip-il` in a script, as `sh` makes them in `folder` in the second pod of a job."""
     script = f"{PROGRAM}() {{ printf '%s\\0' \"$@\"; printf '\\n'; }}\n{text}"
     done = subprocess.run(
-        ["bash", "-c", script], capture_output=True, text=True, check=True, env={"JOB_COMPLETION_INDEX": "1"}
+        ["bash", "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=folder,
+        env={"JOB_COMPLETION_INDEX": "1"},
     )
     return [line.split("\0")[:-1] for line in done.stdout.splitlines()]
