@@ -2,6 +2,7 @@
 
 Importing the package registers its environments with gymnasium, as packages of environments do: at once where
 gymnasium is loaded, else when somebody imports it, so that a command that needs no environment starts without it.
+The OpenGL for pictures is chosen too, as mujoco reads MUJOCO_GL when it is imported, never after.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 obey_parent()  # before all other imports: they take a second, in which the process that started this one may be killed
+
+from manip_il.sim.gl import choose_backend  # noqa: E402
+
+choose_backend()
 
 __version__ = "0.1.0"
 

@@ -132,10 +132,9 @@ def _dispatch(words: list[str]) -> None:
         if hasattr(options, "check"):
             options.check()
         from manip_il.data.lerobot_log import shorten_ffmpeg_warning
-        from manip_il.sim.gl import choose_backend, require_known_backend
+        from manip_il.sim.gl import require_known_backend
 
         require_known_backend()
-        choose_backend()  # mujoco takes the OpenGL that is chosen when it is imported, never another
         shorten_ffmpeg_warning()
         options.run()
 
