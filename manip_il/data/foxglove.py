@@ -37,7 +37,6 @@ NANOSECONDS = 1_000_000_000
 WORLD = "world"
 IMAGE_TOPICS = "/observation/images/"  # before a camera's name, as LeRobot has it
 RGB = "rgb8"  # bytes R, G, B
-_SLOT = "\0"  # stands for a number in a template; no label has this character
 
 # LeRobot's own, word for word (`lerobot.utils.foxglove_visualization`)
 _NAMED_NUMBER = {"type": "object", "properties": {"label": {"type": "string"}, "value": {"type": "number"}}}
@@ -112,9 +111,9 @@ def frame_transforms(topic: str, places: Mapping[str, tuple[F64, F64]], times: T
 
 def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) -> Channel:
     """Labelled numbers; rows: T of Python's numbers, which must be finite, as JSON has no others."""
-    template = json.dumps({"scalars": [{"label": label, "value": _SLOT} for label in labels]}, separators=(",", ":"))
     # filling a template is five times as fast as encoding a dict
-    template = template.replace("%", "%%").replace(json.dumps(_SLOT), "%r")
+    slots = (f'{{"label":{json.dumps(label).replace("%", "%%")},"value":%r}}' for label in labels)
+    template = f'{{"scalars":[{",".join(slots)}]}}'
     schema = Schema(SCALARS["title"], "jsonschema", json.dumps(SCALARS).encode())
     return Channel(topic, schema, ((template % tuple(row)).encode() for row in rows))
 

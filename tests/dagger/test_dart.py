@@ -41,7 +41,7 @@ def table() -> dict[str, np.ndarray]:
 def noise(table, errors, monkeypatch) -> tuple[np.ndarray, Wrong]:
     policy = Wrong(table, errors)
     monkeypatch.setattr(dart, "read_table", lambda root, columns: table)
-    monkeypatch.setattr(LearnedPolicy, "load", lambda path: policy)
+    monkeypatch.setattr(LearnedPolicy, "load", lambda path, *, trust: policy)
     return np.array(dart.fitted_noise(Path("p"), Path("d"))), policy
 
 

@@ -95,6 +95,12 @@ def test_pictures_come_back_bit_for_bit(pictures: np.ndarray) -> None:
 
 
 @pytest.mark.slow
+def test_a_label_may_be_any_text() -> None:
+    labels = ["\0", "%r", "%", '"', "{}"]
+    (message,) = foxglove.scalars("/scalars", labels, [range(5)]).messages
+    assert json.loads(message)["scalars"] == [{"label": label, "value": n} for n, label in enumerate(labels)]
+
+
 def test_the_scalars_schema_is_lerobots() -> None:
     from lerobot.utils import foxglove_visualization as lerobots
 
