@@ -151,7 +151,7 @@ class Builder:
         """Make the dataset whole, with where it came from. Raises `NothingToLearnError` where no episode is left."""
         if not self.count:
             raise NothingToLearnError(
-                "no episode is left to learn from: nobody asked the expert, or it had no sound answer"
+                "no episode has labels to learn from: the expert was never queried, or gave no valid label"
             )
         seeds = {"seeds": [self._seeds[0], self._seeds[-1]], "tried": self._rollouts} if self._seeds else {}
         return self._writer.finish({**self._recording.provenance, **seeds})

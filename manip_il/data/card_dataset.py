@@ -97,7 +97,7 @@ def _labels(root: Path) -> str:
 def _provenance(one: Mapping[str, Any], name: str = "") -> Iterator[str]:
     """One line a source, whatever another program wrote there."""
     if not one:
-        yield "Nothing is known of where its episodes came from."
+        yield "The origin of its episodes is unknown."
         return
     sources = one.get("merged") or one.get("sources")
     if isinstance(sources, list):

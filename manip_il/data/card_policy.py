@@ -22,7 +22,7 @@ _PLACES = tuple(
     f"{folder}{CONFIG}" for folder in ("", "pretrained_model/", "*/pretrained_model/", "*/*/pretrained_model/")
 )
 _LEVELS = re.compile(r"pretrained_model|policy|best|last|checkpoints|\d+")  # folders of one run, above its weights
-_TAUGHT = "Taught by an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
+_TAUGHT = "Taught by an inverse-kinematics expert in MuJoCo; there were no human demonstrations.\n\n"
 _PLUGIN = "manip_il.lerobot_plugin"  # our robots and policies in LeRobot's own commands
 _DATASET = "dataset"  # of a DAgger run: what its policy was fitted to
 _REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
@@ -60,7 +60,7 @@ def policy_card(root: Path, url: str) -> str:
         return _card(root, policy, url)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ManipError(
-            f"{root}: its card cannot be written, as a JSON file beside the policy holds odd values "
+            f"{root}: its card cannot be written, as a JSON file beside the policy holds unexpected values "
             f"({type(error).__name__}: {checks.shorten(str(error))}); restore the file"
         ) from error
 
@@ -153,7 +153,7 @@ def _success(policy: Policy) -> str:
     sure = float(found.get("confidence", 0.95))
     count = f"{found['n_episodes']:,} episodes"
     text = f"**{found['success_rate']:.1%}** [{low:.1%}, {high:.1%}] ({sure:.0%} interval, {count})"
-    return f"{text}, on the seeds that it was chosen by" if policy.chosen_by else f"{text}, on unseen seeds"
+    return f"{text}, on the seeds that it was chosen on" if policy.chosen_by else f"{text}, on unseen seeds"
 
 
 def _use(policy: Policy, place: str) -> str:
@@ -194,7 +194,7 @@ lerobot-eval --policy.path={place} \\
   {environment}
 ```
 
-In Docker, with no network and no rights, after the pull:
+In Docker, with no network and no privileges, after the pull:
 
 ```sh
 mkdir -p out

@@ -39,7 +39,7 @@ def table(rows: Iterable[tuple[str, object]]) -> str:
 def fingerprint_rows(fingerprint: Mapping[str, Any]) -> str:
     """Versions and hashes, folded away."""
     if not fingerprint:
-        return "Another program made this: there is no fingerprint of its environment.\n"
+        return "Made by another program: there is no fingerprint of its environment.\n"
     rows = "\n".join(f"| {_cell(name)} | `{_cell(value)}` |" for name, value in fingerprint.items())
     head = "<details><summary>Fingerprint of the environment</summary>"
     return f"{head}\n\n| | |\n|---|---|\n{rows}\n\n</details>\n"

@@ -29,7 +29,7 @@ _VERSION = 1  # of what is stored: another one makes all caches stale
 _PART_BYTES = 32 * 1024 * 1024  # of pictures that are decoded at once
 _LEAST = 32  # frames that are, however large: decoding starts at the last key frame before them
 _PLACES = ("length", "dataset_from_index")
-_SEE_DOCTOR = "`manip-il doctor` tells what is wrong"
+_SEE_DOCTOR = "run `manip-il doctor` to see what is wrong"
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def open_frame_cache(
         return None
     folder = cache_folder() if folder is None else folder
     if folder.resolve().is_relative_to(root.resolve()):
-        raise UsageError(f"{folder} is in the dataset {root}; decoded pictures belong elsewhere")
+        raise UsageError(f"{folder} is in the dataset {root}; set XDG_CACHE_HOME to a folder outside it")
     try:
         opened = {key: _open(folder, source) for key, source in sources.items()}
         if any(frames is None for frames in opened.values()):
@@ -117,7 +117,7 @@ def _build(
         about = {"dataset": str(source.root.resolve()), "camera": source.key, "shape": source.shape}
         (partial / ABOUT).write_text(json.dumps(about, indent=4) + "\n", encoding="utf-8")
         if find_frames(source.root, source.key).fingerprint != source.fingerprint:
-            raise ManipError(f"{source.root} was changed while it was read; try again when that is done")
+            raise ManipError(f"{source.root} changed while it was being read; try again when nothing writes to it")
     return _open(folder, source)
 
 

@@ -307,4 +307,4 @@ def _explain(path: Path) -> Generator[None]:
         raise ManipError(f"no such episode file: {path}") from error
     except Exception as error:  # a damaged file can make a parser raise anything
         why = str(error) or type(error).__name__
-        raise ManipError(f"{path} is not a whole episode: {why}; --resume=true records it anew") from error
+        raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error

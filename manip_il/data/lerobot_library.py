@@ -113,7 +113,7 @@ def _metadata(root: Path) -> Metadata:
     check_dataset(root)
     meta = Metadata(f"local/{root.name}", root=root)
     if meta.stats is None:
-        raise ManipError(f"{root} has no statistics (meta/stats.json); `manip-il doctor` tells what is left")
+        raise ManipError(f"{root} has no statistics (meta/stats.json); run `manip-il doctor` to see what is left")
     return meta
 
 
@@ -131,7 +131,7 @@ def lerobot_windows(
     """
     for pattern in (INFO, TASKS, EPISODES_FILES):  # what LeRobot would ask the Hub for
         if not any(root.glob(pattern)):
-            raise ManipError(f"{root} is not a whole LeRobot dataset: no file matches {pattern}")
+            raise ManipError(f"{root} is not a complete LeRobot dataset: no file matches {pattern}")
     check_dataset(root)
     return _LocalDataset(
         repo_id,
@@ -147,7 +147,7 @@ def lerobot_windows(
 class _LocalDataset(LeRobotDataset):
     @override
     def _download(self, download_videos: bool = True, *, token: str | bool | None = None) -> None:
-        raise ManipError(f"{self.root} lacks data or video files of its episodes; `manip-il doctor` tells which")
+        raise ManipError(f"{self.root} lacks data or video files of its episodes; run `manip-il doctor` to see which")
 
 
 def _to_bytes(pictures: Any) -> Any:

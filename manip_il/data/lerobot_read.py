@@ -213,7 +213,7 @@ def _check_files(root: Path, paths: list[Path], columns: list[str] | None) -> No
         check_parquet(paths, columns)
     except (OSError, ValueError, pa.ArrowException) as error:
         where = paths[0] if len(paths) == 1 else f"{root}/{paths[0].relative_to(root).parts[0]}"
-        raise ManipError(f"cannot read {where}: {error}; `manip-il doctor` tells what is left") from error
+        raise ManipError(f"cannot read {where}: {error}; run `manip-il doctor` to see what is left") from error
 
 
 def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
@@ -292,7 +292,7 @@ def _read_file(path: Path, columns: list[str]) -> pa.Table:
         # one thread: handing out pieces of one episode costs more than reading them
         table = pq.ParquetFile(path).read(columns, use_threads=False)
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ManipError(f"cannot read {path}: {error}; `manip-il doctor` tells what is left") from error
+        raise ManipError(f"cannot read {path}: {error}; run `manip-il doctor` to see what is left") from error
     for name in columns:
         if name not in table.column_names:
             raise UnknownName(f"column in {path}", name, table.column_names)
@@ -314,7 +314,7 @@ def _values(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) 
         values = _to_numpy(column, shape)
         kind = "O" if dtype == "string" else np.dtype(dtype).kind
     except (ValueError, TypeError, pa.ArrowException) as error:
-        raise ManipError(f"{root}: column {name!r} is no {dtype} of shape {shape}: {error}") from error
+        raise ManipError(f"{root}: column {name!r} is not {dtype} of shape {shape}: {error}") from error
     fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
     if column.null_count or values.dtype.kind != kind or len(values) != len(column) or not fits:
         missing = f" with {column.null_count} missing" if column.null_count else ""

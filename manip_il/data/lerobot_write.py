@@ -72,7 +72,7 @@ def new_dataset(
         finally:
             writer.close()
         if not writer.finished:
-            raise ManipError(f"{root} was not finished: nothing is left of it")
+            raise ManipError(f"{root} was not finished and has been removed")
 
 
 def write_dataset(
@@ -129,7 +129,7 @@ class DatasetWriter:
         this one or one before it, cannot be written.
         """
         if self.finished:
-            raise ManipError(f"{self._root} is finished: it takes no more episodes")
+            raise ManipError(f"{self._root} is finished: no episodes can be added")
         columns = fitted_columns(episode, self._spec)
         pictures = {key: columns.pop(key) for key in self._spec.image_keys}
         columns |= self._index_columns(len(episode))

@@ -91,8 +91,8 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
 
 
 _HEADER = """\
-# manip-il mcap import FOLDER NEW_DATASET --mapping=FOLDER/mapping.yaml makes the dataset again.
-# Pictures are taken as they are (video: false); with video: true they are encoded, with loss, once more.
+# manip-il mcap import FOLDER NEW_DATASET --mapping=FOLDER/mapping.yaml recreates the dataset.
+# Pictures are kept as they are (video: false); with video: true they are re-encoded, with loss.
 """
 
 
@@ -185,10 +185,12 @@ def _tasks(root: Path) -> dict[int, str]:
         check_parquet([root / layout.TASKS])
         table = pq.read_table(root / layout.TASKS, columns=[layout.TASK_INDEX, "task"]).to_pydict()
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise ManipError(f"cannot read {root / layout.TASKS}: {error}; `manip-il doctor` tells what is left") from error
+        raise ManipError(
+            f"cannot read {root / layout.TASKS}: {error}; run `manip-il doctor` to see what is left"
+        ) from error
     numbers, texts = table[layout.TASK_INDEX], table["task"]
     if not all(isinstance(number, int) for number in numbers):
-        raise ManipError(f"{root / layout.TASKS}: column {layout.TASK_INDEX!r} holds other than whole numbers")
+        raise ManipError(f"{root / layout.TASKS}: column {layout.TASK_INDEX!r} holds values that are not whole numbers")
     return dict(zip(numbers, texts, strict=True))
 
 

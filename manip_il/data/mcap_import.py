@@ -174,7 +174,7 @@ def _column(path: Path, key: str, source: Values, rows: list[list[Any]], chosen:
 
 def _text(who: str, row: list[Any]) -> str:
     if len(row) != 1 or not isinstance(row[0], str):
-        raise ManipError(f"{who}: got {row!r}; expected one text")
+        raise ManipError(f"{who}: got {row!r}; expected one string")
     return row[0]
 
 
@@ -188,7 +188,7 @@ def _numbers(who: str, rows: list[list[Any]], dtype: np.dtype[Any]) -> NDArray[A
                 raise ManipError(f"{who}: message {number} holds {value!r}; expected a number")
             if not (low <= value <= high and (is_float or int(value) == value)):  # false for NaN
                 kind = NotFiniteError if isinstance(value, float) and not math.isfinite(value) else ManipError
-                raise kind(f"{who}: message {number} holds {value!r}, which is no {dtype}")
+                raise kind(f"{who}: message {number} holds {value!r}, which is not a valid {dtype}")
     if is_float:
         return np.array(rows, np.float64)
     return np.array([[int(value) for value in row] for row in rows], dtype)

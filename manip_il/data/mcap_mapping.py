@@ -89,7 +89,7 @@ class Values(Source):
             isinstance(size, int) and not isinstance(size, bool) and 0 < size <= _MOST_VALUES for size in sizes
         )
         is_shape = is_shape and len(sizes) <= _MOST_AXES and math.prod(sizes) <= _MOST_VALUES
-        _require("shape", self.shape, f"a list of whole numbers, in all at most {_MOST_VALUES:,} values", is_shape)
+        _require("shape", self.shape, f"a list of whole numbers, at most {_MOST_VALUES:,} values in all", is_shape)
 
     @property
     def width(self) -> int | None:

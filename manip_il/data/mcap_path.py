@@ -81,7 +81,7 @@ def parse_path(text: str) -> FieldPath:
         match = (_SELECTOR if steps and text[place] == "[" else _NAME).match(text, place)
         if match is None or match.group().startswith(".") != bool(steps and match.re is _NAME):
             raise UsageError(
-                f"the path {text!r} goes wrong at character {place + 1}; expected names and selectors, "
+                f"the path {text!r} is invalid at character {place + 1}; expected names and selectors, "
                 "as in joints[name=elbow].position, scalars[:].value, data[0]"
             )
         steps.append(_step(match))
@@ -104,7 +104,7 @@ def _unquoted(text: str) -> str:
     try:
         return json.loads(text, strict=False)
     except ValueError as error:
-        raise UsageError(f"{text} is not quoted as JSON quotes text: {error}") from error
+        raise UsageError(f"{text} is not a valid JSON string: {error}") from error
 
 
 def _text(step: Step) -> str:

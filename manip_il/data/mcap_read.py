@@ -79,7 +79,9 @@ def read_topics(path: Path, topics: Iterable[str], values: dict[str, Values]) ->
                 row = _row(path, key, source, reading)
                 kept += _ROW_BYTES + sum(map(sys.getsizeof, row))
                 if kept > LARGEST_ROWS:
-                    raise ManipError(f"{path}: its values take more than {LARGEST_ROWS // MIB} MiB; cut it in episodes")
+                    raise ManipError(
+                        f"{path}: its values take more than {LARGEST_ROWS // MIB} MiB; split it into episodes"
+                    )
                 found.rows[key].append(row)
     for topic, mine in stamps.items():
         if not mine:
@@ -197,4 +199,4 @@ def _explain(path: Path) -> Generator[None]:
         raise
     except Exception as error:  # a damaged file can make a parser raise anything
         why = str(error) or type(error).__name__
-        raise ManipError(f"cannot read {path}: {why}; expected a whole MCAP file") from error
+        raise ManipError(f"cannot read {path}: {why}; expected a complete MCAP file") from error

@@ -77,7 +77,7 @@ def read_records(stream: BinaryIO, *wanted: Opcode, check: bool = False) -> Iter
     """Yield the wanted records in order, up to the footer.
 
     check: compare the checksum over the data section, where the file has one. Raises `ValueError` for what is no MCAP
-    file, ends too early, does not fit its checksum, or holds a wanted record beyond its kind's limit.
+    file, ends too early, does not match its checksum, or holds a wanted record beyond its kind's limit.
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
@@ -143,7 +143,7 @@ def unpack(record: Record, budget: Budget, *, check: bool = True) -> bytes:
     if len(data) != size:
         raise ValueError(f"a chunk unpacks to {len(data):,} bytes or more; it declares {size:,}")
     if check and chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("a chunk does not fit its checksum")
+        raise ValueError("a chunk does not match its checksum")
     return data
 
 
@@ -215,9 +215,9 @@ def check_both_sums(stream: BinaryIO) -> None:
     if opcode != Opcode.DATA_END or data_sum == 0:
         raise ValueError("no checksum over its data")
     if _sum_of(stream, 0, data_end) != data_sum:
-        raise ValueError("its data does not fit its checksum")
+        raise ValueError("its data does not match its checksum")
     if _sum_of(stream, summary, size - len(_MAGIC) - 4) != summary_sum:
-        raise ValueError("its summary does not fit its checksum")
+        raise ValueError("its summary does not match its checksum")
 
 
 class _Channels:
@@ -241,9 +241,9 @@ class _Channels:
     def of(self, message: Message) -> tuple[Schema | None, Channel]:
         channel = self._channels.get(message.channel_id)
         if channel is None:
-            raise ValueError(f"a message of channel {message.channel_id}, which it does not hold")
+            raise ValueError(f"a message of channel {message.channel_id}, which it does not define")
         if channel.schema_id and channel.schema_id not in self._schemas:
-            raise ValueError(f"channel {channel.topic} has schema {channel.schema_id}, which it does not hold")
+            raise ValueError(f"channel {channel.topic} has schema {channel.schema_id}, which it does not define")
         return self._schemas.get(channel.schema_id), channel
 
 
@@ -269,7 +269,7 @@ def _unpack_lz4(data: bytes, size: int) -> bytes:
 def _compare_checksum(body: bytes, found: int, *, check: bool) -> None:
     declared = int.from_bytes(body[:4], "little")
     if check and declared not in (0, found):
-        raise ValueError("its data does not fit its checksum")
+        raise ValueError("its data does not match its checksum")
 
 
 def _pieces(stream: BinaryIO, head: bytes, length: int) -> Iterator[bytes]:

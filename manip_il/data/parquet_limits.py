@@ -64,7 +64,7 @@ def check_parquet(paths: Iterable[Path], columns: Sequence[str] | None = None, l
         size += there.st_size
         taken += _unpacked_size(path, names, (there.st_ino, there.st_size, there.st_mtime_ns))
         if taken > max(least, _FILE_RATIO * size):
-            raise ValueError(f"its columns unpack to {taken:,} bytes or more from {size:,}; no dataset's do")
+            raise ValueError(f"its columns unpack to {taken:,} bytes or more from {size:,}; no dataset unpacks so far")
 
 
 @lru_cache(1_000)
@@ -180,7 +180,7 @@ def _pages(data: mmap.mmap, chunk: _Chunk) -> Iterator[_Page]:
     """The pages that pyarrow would read. Raises `ValueError` for one that is not what it may be."""
     at, stop, seen = chunk.start, chunk.start + chunk.size, 0
     if not 0 < at <= stop <= len(data):
-        raise ValueError("a column lies outside the file")
+        raise ValueError("a column is outside the file")
     while seen < chunk.values and at < stop:
         page = _page(data, at, stop)
         _check_page(page, stop)
@@ -197,7 +197,9 @@ def _check_page(page: _Page, stop: int) -> None:
         raise ValueError(f"a page of {page.packed:,} bytes unpacks to {page.unpacked:,}; expected at most {most:,}")
     if page.encoding not in _ENCODINGS and page.kind in (_DATA, _DATA_V2):
         name = "DELTA_BYTE_ARRAY" if page.encoding == _DELTA_BYTES else f"number {page.encoding}"
-        raise ValueError(f"a page has the encoding {name}, by which its size cannot be told; write it with another")
+        raise ValueError(
+            f"a page has the encoding {name}, which does not tell its size; write the file with another encoding"
+        )
 
 
 def _page(data: mmap.mmap, at: int, stop: int) -> _Page:

@@ -25,7 +25,7 @@ def open_picture(content: bytes) -> Image.Image:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             picture = Image.open(BytesIO(content), formats=_FORMATS)
     except Image.UnidentifiedImageError as error:
-        raise ValueError(f"it is no {' or '.join(_FORMATS)}") from error
+        raise ValueError(f"it is not a {' or '.join(_FORMATS)}") from error
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise ValueError(f"it has more than {MOST_PIXELS:,} pixels") from error
     if picture.width * picture.height > MOST_PIXELS:

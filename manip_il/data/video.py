@@ -95,7 +95,7 @@ class VideoConfig:
         with av.logging.Capture() as log:
             try:
                 if len(av.VideoFormat(self.pix_fmt).components) < 3:
-                    raise ValueError(f"{self.pix_fmt} has no colours")
+                    raise ValueError(f"{self.pix_fmt} has no colour")
                 encoder = _encoder(self, size, fps)
                 encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
                 encoder.encode(None)

@@ -56,7 +56,9 @@ def _check_index(path: Path) -> None:
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for start, stop in _outside_media(data):
             if found := _ELSEWHERE.search(data, start, stop):
-                raise ValueError(f"it has a box {found[0].decode()}, as no dataset's videos do; write it as plain MP4")
+                raise ValueError(
+                    f"it has a box {found[0].decode()}, which videos of datasets do not have; write it as plain MP4"
+                )
             for match in _COUNTS.finditer(data, start, stop):
                 is_edits = match[1] == b"elst"
                 at = match.end() + (0 if is_edits else 4)  # behind the size that all frames may have

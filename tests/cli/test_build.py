@@ -44,7 +44,7 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
     cut.write_bytes(cut.read_bytes()[:-40])
     assert main(["build", str(journals), str(tmp_path / "x")]) == 1
     err = capsys.readouterr().err
-    assert f"warning: {cut} is not a whole episode" in err
+    assert f"warning: {cut} is not a complete episode" in err
     assert "error: 1 journal could not be read" in err
     assert dataset_info(tmp_path / "x").episodes == 2
     capsys.readouterr()

@@ -188,12 +188,12 @@ def test_an_episode_without_rows(root: Path) -> None:
 
 def test_rows_of_an_episode_that_is_not_listed(root: Path) -> None:
     edit_table(root / DATA, lambda table: table.update(episode_index=[0] * 7 + [1] + [5] * 12))
-    assert said(root, DATA, "holds rows of episode 5, which meta/episodes does not know")
+    assert said(root, DATA, "holds rows of episode 5, which meta/episodes does not list")
 
 
 def test_rows_twice(root: Path) -> None:
     shutil.copy(root / DATA, root / "data/chunk-000/file-001.parquet")
-    assert said(root, "data: rows of episodes 0, 1, 2 lie in several places", "file-001")
+    assert said(root, "data: rows of episodes 0, 1, 2 are in several places", "file-001")
     assert said(root, "data/chunk-000/file-001.parquet", "no episode refers to it, but LeRobot reads it")
 
 
@@ -219,7 +219,7 @@ def test_columns_that_are_missing_or_unknown(root: Path) -> None:
     table = table.drop_columns([s.BETA]).append_column("speed", pa.array(np.zeros(20)))
     pq.write_table(table, root / DATA)
     assert said(root, DATA, "lacks the column beta")
-    assert said(root, DATA, "has the column speed, which meta/info.json does not know")
+    assert said(root, DATA, "has the column speed, which meta/info.json does not list")
 
 
 def test_a_column_of_another_type_or_size(root: Path) -> None:
@@ -234,7 +234,7 @@ def test_a_column_of_another_type_or_size(root: Path) -> None:
 
 def test_a_column_with_empty_values(root: Path) -> None:
     edit_table(root / DATA, lambda table: table[s.BETA].__setitem__(2, None))
-    assert said(root, f"{DATA}: beta", "holds 1 empty values")
+    assert said(root, f"{DATA}: beta", "holds 1 missing values")
 
 
 def test_no_tasks(root: Path) -> None:
@@ -312,7 +312,7 @@ def test_a_spec_that_cannot_be_read(root: Path) -> None:
 
 def test_our_own_file_lost(root: Path) -> None:
     (root / layout.OURS).unlink()
-    assert said(root, "meta/manip_il.json: is missing, as after LeRobot's tools", warning=True)
+    assert said(root, "meta/manip_il.json: is missing (LeRobot's tools drop it)", warning=True)
     assert not any(line.startswith("error") for line in lines(root))
 
 
@@ -376,8 +376,8 @@ def test_times_of_a_video_that_are_wrong(filmed: Path) -> None:
         ("videos/observation.images.top/chunk-000/file-000.mp4", "videos/observation.images.top", "no episode refers"),
         ("meta/episodes/old.parquet", "meta/episodes/old.parquet", "no episode refers to it"),
         ("images/front/episode-000003/frame-000000.png", "images", "1 picture that LeRobot's recorder"),
-        ("tmpab12cd_9/x.mp4", "tmpab12cd_9", "temporary folder of 1 file that a dead video encoder left"),
-        (".cache/huggingface/x.lock", ".cache", "what a download from the Hub left"),
+        ("tmpab12cd_9/x.mp4", "tmpab12cd_9", "temporary folder of 1 file left by a killed video encoder"),
+        (".cache/huggingface/x.lock", ".cache", "left by a download from the Hub"),
         ("meta/.stats.json.xyz.partial", "meta/.stats.json.xyz.partial", "temporary file"),
         ("../.lift.abc.partial/meta/info.json", "../.lift.abc.partial", "killed writer"),
     ],
@@ -407,8 +407,8 @@ def test_a_journal_cut_anywhere_is_named(root: Path, journals: Path) -> None:
     content = path.read_bytes()
     for keep in np.linspace(0, len(content) - 1, 40).astype(int):
         path.write_bytes(content[:keep])
-        assert said(root, "lift.journals/episode-000000000006.mcap", "is not a whole episode")
-        assert said(root, "no whole journal for 1 episode of the dataset (seed 6)", warning=True)
+        assert said(root, "lift.journals/episode-000000000006.mcap", "is not a complete episode")
+        assert said(root, "no intact journal for 1 episode of the dataset (seed 6)", warning=True)
 
 
 def test_a_journal_with_a_changed_byte_is_named(root: Path, journals: Path) -> None:

@@ -68,7 +68,7 @@ def test_what_lerobots_tools_make_of_it_has_no_errors(recorded: Path, tmp_path: 
     for made in ("deleted", "split/x", "split/y", "merged"):
         found = lines(tmp_path / made)
         assert not any(line.startswith("error") for line in found), (made, found)
-        assert all("LeRobot's tools leave them so" in line for line in found), (made, found)
+        assert all("LeRobot's tools do not update them" in line for line in found), (made, found)
 
 
 @pytest.mark.parametrize("kind", KINDS)

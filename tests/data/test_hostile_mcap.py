@@ -401,9 +401,9 @@ def test_schemas_and_channels_have_a_limit_together(tmp_path: Path, mapping: Map
 
 def test_messages_of_nobody_are_refused(tmp_path: Path, mapping: Mapping) -> None:
     path = forge.write_mcap(tmp_path / "a.mcap", forge.message(b"{}", channel=7))
-    refuse_import(path, mapping, "a message of channel 7, which it does not hold")
+    refuse_import(path, mapping, "a message of channel 7, which it does not define")
     path = forge.write_mcap(tmp_path / "b.mcap", forge.json_channel(schema=5), forge.message(b"{}"))
-    refuse_import(path, mapping, "has schema 5, which it does not hold")
+    refuse_import(path, mapping, "has schema 5, which it does not define")
 
 
 def test_an_attachment_is_never_held(tmp_path: Path, mapping: Mapping, at_most: AtMost) -> None:

@@ -92,20 +92,22 @@ def test_the_attack_is_one(marker: Path) -> None:
 
 def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) -> None:
     found = [str(finding) for finding in check_pictures(Dataset(pictured))]
-    assert any("the picture in row 0 cannot be decoded: it is no PNG or JPEG (1 row like this)" in one for one in found)
+    assert any(
+        "the picture in row 0 cannot be decoded: it is not a PNG or JPEG (1 row like this)" in one for one in found
+    )
     name = next(pictured.glob(layout.DATA_FILES)).relative_to(pictured).as_posix()
-    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+    with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
         list(ParquetPart(name, 0).read(pictured, KEY, 20))
-    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+    with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
         list(DatasetFrames(pictured, {KEY: "image"}).read(KEY, 0, 1))
-    with pytest.raises(ManipError, match="it is no PNG or JPEG"):
+    with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
         decode_bytes(EPS)
     assert not marker.exists()
 
 
 @pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "WEBP"])
 def test_other_formats_are_refused(kind: str) -> None:
-    with pytest.raises(ValueError, match="no PNG or JPEG"):
+    with pytest.raises(ValueError, match="not a PNG or JPEG"):
         open_picture(saved(np.zeros((8, 8, 3), np.uint8), kind))
 
 

@@ -105,7 +105,7 @@ def test_pictures_may_not_grow_beyond_it(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(ManipError, match="cannot read"):
         count_frames(path)
     found = videos.decode(path, 2 * FRAMES)
-    assert found.problem.startswith(f"breaks off after {FRAMES} frames")
+    assert found.problem.startswith(f"cannot be decoded beyond {FRAMES} frames")
 
 
 def test_pictures_of_two_sizes_are_one_line(tmp_path: Path) -> None:

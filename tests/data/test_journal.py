@@ -104,7 +104,7 @@ def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Pa
 def test_a_truncated_file_is_refused_by_name(path: Path, keep: float) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * keep)])
-    with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a whole episode"):
+    with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
         journal.read_episode(path)
 
 

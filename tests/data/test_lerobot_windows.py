@@ -117,7 +117,7 @@ def test_nothing_is_asked_of_the_hub(roots: dict[str, Path], tmp_path: Path, mon
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     whole = roots["h264"]
     assert len(windows(whole)) == 29
-    with pytest.raises(ManipError, match=r"not a whole LeRobot dataset: no file matches meta/info\.json"):
+    with pytest.raises(ManipError, match=r"not a complete LeRobot dataset: no file matches meta/info\.json"):
         windows(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
     for name, message in ((layout.TASKS, "no file matches meta/tasks"), ("videos", "lacks data or video files")):

@@ -187,7 +187,9 @@ def test_tasks_without_numbers_are_refused(ours: Path, tmp_path: Path, numbers: 
     (tmp_path / "data").symlink_to(ours / "data")
     (tmp_path / layout.INFO).symlink_to(ours / layout.INFO)
     pq.write_table(pa.table({layout.TASK_INDEX: numbers, "task": ["Lift."]}), tmp_path / layout.TASKS)
-    with pytest.raises(ManipError, match=r"tasks\.parquet: column 'task_index' holds other than whole numbers"):
+    with pytest.raises(
+        ManipError, match=r"tasks\.parquet: column 'task_index' holds values that are not whole numbers"
+    ):
         list(export_dataset(open_source(tmp_path), tmp_path))
 
 

@@ -172,7 +172,7 @@ STEADY = range(0, 1000, 100)
         ([(0, {"x": 300})], {"dtype": "uint8"}, "holds 300, which is no uint8"),
         ([(0, {"x": float("inf")})], {"dtype": "int64"}, "holds inf, which is no int64"),
         ([(0, {"x": 2})], {"dtype": "bool"}, "holds 2, which is no bool"),
-        ([(0, {"x": 2})], {"dtype": "string"}, r"got \[2\]; expected one text"),
+        ([(0, {"x": 2})], {"dtype": "string"}, r"got \[2\]; expected one string"),
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "topic /a at 0 ns: 2 values, f has 1"),
         ([(0, {"x": [1, 2]}), (100, {"x": [1]})], {}, "message 1 has 1 values, the first one 2"),
         ([(0, {"x": 1}), (100, {"y": 1})], {}, "topic /a at 100000000 ns: x: no field 'x'"),
@@ -201,7 +201,7 @@ def test_a_file_that_is_cut_is_refused(tmp_path: Path, load: Callable[..., Mappi
     path = write(tmp_path / "cut.mcap", {"/a": ramp(range(1000))})
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(len(data) * keep)])
-    with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: .*; expected a whole MCAP file"):
+    with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: .*; expected a complete MCAP file"):
         read_import(path, load({"f": feature()}))
 
 

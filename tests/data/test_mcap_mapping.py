@@ -94,7 +94,7 @@ def test_a_wrong_value_is_refused_by_name(tmp_path: Path, change: dict[str, Any]
         ("action", {"dtype": "flaot32"}, r"unknown dtype 'flaot32' \(did you mean 'float32'\?\)"),
         ("action", {"dtype": "int64", "resample": "interpolate"}, "resample is interpolate, which int64 cannot be"),
         ("action", {"field": []}, r"field is \[\]; expected a path or a list of paths"),
-        ("action", {"field": "a[b"}, r"the path 'a\[b' goes wrong at character 2"),
+        ("action", {"field": "a[b"}, r"the path 'a\[b' is invalid at character 2"),
         ("action", {"shape": [0]}, r"shape is \(0,\)"),
         ("action", {"shape": 3}, "shape is 3; expected a list of whole numbers"),
         ("observation.images.c", {"video": "yes"}, "video is 'yes'; expected true or false"),

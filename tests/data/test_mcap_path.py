@@ -105,5 +105,5 @@ def test_a_path_that_leads_nowhere_says_where_it_ends(path: str, message: object
     ],
 )
 def test_a_bad_path_shows_where_it_goes_wrong(text: str, character: int) -> None:
-    with pytest.raises(UsageError, match=rf"goes wrong at character {character};"):
+    with pytest.raises(UsageError, match=rf"is invalid at character {character};"):
         parse_path(text)

@@ -181,7 +181,7 @@ AV1 = {"vcodec": "libsvtav1"}
         ),
         ({**AV1, "preset": "slow"}, UsageError, "preset='slow'"),
         ({**AV1, "pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
-        ({"pix_fmt": "gray"}, UsageError, "gray has no colours"),
+        ({"pix_fmt": "gray"}, UsageError, "gray has no colour"),
         ({"pix_fmt": "colourful"}, UsageError, "not a pixel format: 'colourful'"),
     ],
 )

@@ -176,7 +176,7 @@ def _texts(table: pa.Table) -> list[list[str]]:
         raise BadColumn("has no column 'tasks'")
     rows = table.column("tasks").to_pylist()
     if not all(isinstance(row, list) and all(isinstance(text, str) for text in row) for row in rows):
-        raise BadColumn("column 'tasks' holds something else than lists of texts")
+        raise BadColumn("column 'tasks' does not hold lists of strings")
     return rows
 
 

@@ -27,7 +27,7 @@ def check_journals(dataset: Dataset) -> Iterator[Finding]:
             yield error(f"{folder.name}/{path.name}", header, Remedy.NONE)
         dataset.on_file()
     for path in sorted([*folder.glob(f".episode-*{PARTIAL}"), *folder.glob("*.damaged")]):
-        yield warning(f"{folder.name}/{path.name}", "what a killed writer or a damaged episode left; nothing reads it")
+        yield warning(f"{folder.name}/{path.name}", "left by a killed writer or a damaged episode; nothing reads it")
     try:
         recording = Recording.read(folder)
     except ManipError as problem:
@@ -62,7 +62,7 @@ def _compare(dataset: Dataset, expected: list[int]) -> Iterator[Finding]:
         text = f"the dataset lacks {plural(len(absent), 'episode')} of the journals (seed {some(absent)})"
         yield warning(place, f"{text}; build it again from them", Remedy.REBUILD)
     if alone := sorted(seeds - set(expected)):
-        text = f"no whole journal for {plural(len(alone), 'episode')} of the dataset (seed {some(alone)})"
+        text = f"no intact journal for {plural(len(alone), 'episode')} of the dataset (seed {some(alone)})"
         yield warning(place, f"{text}: only the dataset holds them")
 
 

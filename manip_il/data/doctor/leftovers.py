@@ -39,18 +39,18 @@ def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
     """No temporary files or folders, in the dataset or beside it."""
     root = dataset.root
     if pictures := len(_files(root, IMAGES)):
-        text = f"{plural(pictures, 'picture')} that LeRobot's recorder had not encoded or not cleared away when it died"
+        text = f"{plural(pictures, 'picture')} that LeRobot's recorder had not encoded or not removed when it died"
         yield warning(IMAGES, text, Remedy.MOVE)
     if (root / ".cache").is_dir():
-        yield warning(".cache", "what a download from the Hub left; nothing needs it", Remedy.MOVE)
+        yield warning(".cache", "left by a download from the Hub; nothing needs it", Remedy.MOVE)
     for path in sorted(root.iterdir()):
         if _TEMPORARY_FOLDER.fullmatch(path.name) and path.is_dir():
-            text = f"a temporary folder of {plural(len(_files(path, '.')), 'file')} that a dead video encoder left"
+            text = f"a temporary folder of {plural(len(_files(path, '.')), 'file')} left by a killed video encoder"
             yield warning(path.name, text, Remedy.MOVE)
     for path in [*sorted(path for path in root.iterdir() if path.is_file()), *_files(root, "meta")]:
         name = path.relative_to(root).as_posix()
         if _TEMPORARY.fullmatch(path.name) and not name.startswith(_FOLDERS):
-            yield warning(name, "a temporary file that a killed writer left", Remedy.MOVE)
+            yield warning(name, "a temporary file left by a killed writer", Remedy.MOVE)
     yield from _beside(root.absolute())
 
 
@@ -58,13 +58,13 @@ def _beside(root: Path) -> Iterator[Finding]:
     lock = root.with_name(f".{root.name}.lock")
     if lock.is_file() and _is_held(lock):
         holder = lock.read_text(errors="replace").strip() or "unknown"
-        text = f"process {holder} is at work on this dataset; what is said here may change"
+        text = f"process {holder} is writing to this dataset; these findings may change"
         yield warning(f"{BESIDE}{lock.name}", text)
     for path in sorted(root.parent.iterdir()):
         is_partial = path.name.startswith(f".{root.name}.") and path.name.endswith(PARTIAL)
         is_deleted = path.name.startswith(f".{root.name}.deleting.")
         if (is_partial or is_deleted) and not _is_held(path):
-            yield warning(f"{BESIDE}{path.name}", "what a killed writer of this dataset left", Remedy.MOVE)
+            yield warning(f"{BESIDE}{path.name}", "left by a killed writer of this dataset", Remedy.MOVE)
 
 
 def _is_held(path: Path) -> bool:

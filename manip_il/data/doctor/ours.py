@@ -24,7 +24,7 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
         return
     if not dataset.is_ours:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= info.features.keys():
-            yield warning(layout.OURS, "is missing, as after LeRobot's tools: the task and the fingerprint are unknown")
+            yield warning(layout.OURS, "is missing (LeRobot's tools drop it): the task and the fingerprint are unknown")
         return
     try:
         spec = read_spec(dataset)

@@ -53,7 +53,7 @@ def _advice(dataset: Dataset, whole: int, open_files: list[str]) -> str:
         return "LeRobot can neither read nor resume this: record again, into another folder"
     frames = int(dataset.episodes.length[:whole].sum())
     return (
-        f"the first {count_frames(whole, frames)} are whole: LeRobot reads them again once those files are moved "
-        f'away and meta/info.json counts so many, with "train": "0:{whole}" in its splits; then --repair=true '
+        f"the first {count_frames(whole, frames)} are intact: LeRobot reads them again once those files are moved "
+        f'away and meta/info.json has these counts, with "train": "0:{whole}" in its splits; then --repair=true '
         f"computes their statistics"
     )

@@ -43,7 +43,7 @@ def repair(dataset: Dataset, findings: Sequence[Finding]) -> Iterator[str]:
             yield f"not repaired, as {reason}: {some(one.place for one in wants_rebuild)}"
         for one in findings:
             if one.remedy is Remedy.NONE and one.severity is Severity.ERROR:
-                yield f"not repaired, as nothing holds a copy of it: {one.place}"
+                yield f"not repaired, as there is no copy of it: {one.place}"
 
 
 def _why_not_rebuild(dataset: Dataset) -> str:
@@ -89,7 +89,7 @@ def _in_place(dataset: Dataset, findings: Sequence[Finding], kept: Path) -> Iter
     for place in dict.fromkeys(one.place for one in findings if one.remedy is Remedy.MOVE):
         source, target = _way(dataset, place, kept)
         if not _is_inside(dataset.root, source, beside=place.startswith(BESIDE)):
-            yield f"not moved, as a link leads to it from outside the dataset: {place}"
+            yield f"not moved, as it is outside the dataset (reached through a link): {place}"
             continue
         _move(source, target)
         yield f"moved away: {place}"
@@ -99,7 +99,7 @@ def _compute_statistics(dataset: Dataset, kept: Path) -> str:
     """Statistics of every column of numbers; those of pictures stay as they are."""
     path = dataset.root / layout.STATS
     if not _is_inside(dataset.root, path):
-        return f"not computed again, as {layout.STATS} lies outside the dataset: a link leads there"
+        return f"not recomputed: {layout.STATS} is outside the dataset (reached through a link)"
     if path.exists():
         (kept / layout.STATS).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, kept / layout.STATS)
@@ -109,7 +109,7 @@ def _compute_statistics(dataset: Dataset, kept: Path) -> str:
     for key in fine:
         stats[key] = _statistics(dataset, features[key])
     write_file(path, json.dumps(stats, indent=4, ensure_ascii=False).encode())
-    return f"computed again from the data: {layout.STATS}, {plural(len(fine), 'column')}"
+    return f"recomputed from the data: {layout.STATS}, {plural(len(fine), 'column')}"
 
 
 def _statistics(dataset: Dataset, feature: Feature) -> dict[str, list[float]]:

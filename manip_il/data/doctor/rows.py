@@ -27,7 +27,7 @@ def check_columns(dataset: Dataset) -> Iterator[Finding]:
         if missing := sorted(wanted - set(shard.columns)):
             yield error(shard.name, f"lacks the column {some(missing)} of {layout.INFO}")
         if extra := sorted(set(shard.columns) - wanted):
-            yield error(shard.name, f"has the column {some(extra)}, which {layout.INFO} does not know")
+            yield error(shard.name, f"has the column {some(extra)}, which {layout.INFO} does not list")
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
@@ -59,10 +59,10 @@ def _against_episodes(dataset: Dataset, episodes: Episodes) -> Iterator[Finding]
     if (counts > 1).any():
         twice = numbers[counts > 1]
         files = dict.fromkeys(runs.files[row] for row in np.flatnonzero(runs.episode == twice[0]))
-        yield error(_DATA, f"rows of {episodes_text(twice)} lie in several places ({some(files)})")
+        yield error(_DATA, f"rows of {episodes_text(twice)} are in several places ({some(files)})")
     if len(unknown := np.setdiff1d(numbers, episodes.index)) and dataset.knows_all_episodes:
         file = runs.files[first[np.searchsorted(numbers, unknown[0])]]
-        yield error(file, f"holds rows of {episodes_text(unknown)}, which {EPISODES} does not know")
+        yield error(file, f"holds rows of {episodes_text(unknown)}, which {EPISODES} does not list")
     unread = {shard.name for shard in dataset.data_shards} - dataset.scan.readable  # named already
     named = np.array([file not in unread for file in episodes.files], dtype=bool)
     if len(missing := np.setdiff1d(episodes.index[named], numbers)):

@@ -96,7 +96,7 @@ def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int
         if isinstance(array.type, pa.BaseExtensionType):
             array = array.storage
         if array.null_count:
-            raise BadColumn(f"holds {array.null_count:,} empty values")
+            raise BadColumn(f"holds {array.null_count:,} missing values")
         if not _is_list(array.type):
             break
         array = array.flatten()
@@ -108,12 +108,12 @@ def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int
 
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
-    """A column of whole numbers, (T,). Raises `BadColumn` for a missing one, empty values or another type."""
+    """A column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
     if name not in table.column_names:
         raise BadColumn(f"has no column {name!r}")
     column = table.column(name)
     if not pa.types.is_integer(column.type) or column.null_count:
-        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} empty values; expected integers")
+        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} missing values; expected integers")
     return column.to_numpy().astype(np.int64)
 
 
@@ -123,7 +123,7 @@ def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
         raise BadColumn(f"has no column {name!r}")
     column = table.column(name)
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)) or column.null_count:
-        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} empty values; expected numbers")
+        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} missing values; expected numbers")
     return column.to_numpy().astype(np.float64)
 
 

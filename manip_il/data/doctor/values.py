@@ -37,12 +37,12 @@ def check_statistics(dataset: Dataset) -> Iterator[Finding]:
         return
     if stats is None:
         state = "cannot be read" if (dataset.root / layout.STATS).exists() else "is missing"
-        yield error(layout.STATS, f"{state}: nothing can be normalised by it", Remedy.STATISTICS)
+        yield error(layout.STATS, f"{state}: nothing can be normalised with it", Remedy.STATISTICS)
         for feature in info.of_dtype(*PICTURES):
             yield error(f"{layout.STATS}: {feature.key}", "is missing")
         return
     if unknown := sorted(set(stats) - set(info.features)):
-        yield warning(layout.STATS, f"has statistics of {some(unknown)}, which {layout.INFO} does not know")
+        yield warning(layout.STATS, f"has statistics of {some(unknown)}, which {layout.INFO} does not list")
     stale: list[str] = []
     for feature in info.of_dtype(*NUMBERS):
         if not dataset.reads_all_rows or feature.key not in dataset.scan.moments:
@@ -54,7 +54,7 @@ def check_statistics(dataset: Dataset) -> Iterator[Finding]:
             yield from findings
     if stale:
         what = f"statistics of {some(stale)} are not the data's"
-        text = f"{what}; LeRobot's tools leave them so, and nothing needs them"
+        text = f"{what}; LeRobot's tools do not update them, and nothing needs them"
         yield warning(layout.STATS, text, Remedy.STATISTICS)
     for feature in info.of_dtype(*PICTURES):
         if not isinstance(stats.get(feature.key), dict):

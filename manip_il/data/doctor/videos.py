@@ -79,7 +79,7 @@ def decode(path: Path, expected: int, brightness: Brightness | None = None) -> F
 
 def _explain(path: Path, problem: Exception, decoded: int) -> str:
     if decoded:
-        return f"breaks off after {plural(decoded, 'frame')}: {_reason(problem)}"
+        return f"cannot be decoded beyond {plural(decoded, 'frame')}: {_reason(problem)}"
     if path.stat().st_size == 0:
         return "is empty"
     if b"moov" not in _boxes(path):
