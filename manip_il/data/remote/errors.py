@@ -38,7 +38,7 @@ class ConflictError(RemoteError):
 
     def __init__(self, place: str):
         super().__init__(
-            f"{place} was changed by another push meanwhile; nothing of this one is seen there; push again"
+            f"{place} was changed by another push in the meantime; nothing of this push is visible there; push again"
         )
 
 

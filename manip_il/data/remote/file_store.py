@@ -112,7 +112,7 @@ class FileBlobs:
                 self._folders.add(folder)
             try:
                 if copy_file(source, partial) != key:
-                    text = f"{source} changed while it was pushed, or {self._name} does not keep it whole"
+                    text = f"{source} changed while it was being pushed, or {self._name} did not store it intact"
                     raise TransientError(text)
                 os.replace(partial, f"{folder}/{key}")
             except BaseException:
@@ -175,7 +175,7 @@ class FileBlobs:
                 break
             except FolderBusyError:
                 if time.monotonic() > last:
-                    raise RemoteError(f"another push is switching {self._name} over; wait, and push again") from None
+                    raise RemoteError(f"another push is updating {self._name}; wait, and push again") from None
                 time.sleep(0.05)
         with stack:
             yield
@@ -185,7 +185,7 @@ class FileBlobs:
         try:
             fcntl.flock(handle, fcntl.LOCK_SH)
         except OSError:
-            text = f"{self._name} lies on a file system without locks: two pushes at once are not kept apart"
+            text = f"{self._name} is on a file system without locks: two pushes at once can overwrite each other"
             self.warnings = (*self.warnings, text)
         finally:
             os.close(handle)
@@ -198,11 +198,11 @@ class FileBlobs:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise NoSpaceError(f"cannot {what}: the disk is full; make room there and push again") from None
             if isinstance(error, PermissionError) or error.errno == errno.EROFS:
-                text = f"cannot {what}: {error.strerror}; ask its owner for the right, or choose another place"
+                text = f"cannot {what}: {error.strerror}; ask its owner for permission, or choose another place"
                 raise AuthError(text) from None
             if error.errno in (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EINTR):
                 raise TransientError(f"cannot {what}: {error.strerror}") from None
-            raise RemoteError(f"cannot {what}: {error.strerror or error}; look at that folder") from None
+            raise RemoteError(f"cannot {what}: {error.strerror or error}; check that folder") from None
 
 
 def _digest(path: Path) -> str:

@@ -83,7 +83,7 @@ class HubRemote:
         revision that is no branch.
         """
         if manifest.kind != self.kind:
-            raise UsageError(f"a {manifest.kind} cannot be pushed to {self.url}, the place of a {self.kind}")
+            raise UsageError(f"a {manifest.kind} cannot be pushed to {self.url}, which is for a {self.kind}")
         with quiet(self.endpoint):
             parent = before.token if before else self._begin()
             if before is not None and self.branch != MAIN and self.branch not in self._repo.refs()[0]:
@@ -114,7 +114,7 @@ class HubRemote:
             other: Kind = "policy" if self.kind == "dataset" else "dataset"
             if self._repo.exists_as(_TYPES[other]):
                 return f" (there is only a {other} of that name, {_url(other, self.url.place)})"
-            hidden = " that this token may not see" if get_token() else f", for which you {LOGIN}"
+            hidden = " that this token cannot access" if get_token() else f", for which you {LOGIN}"
             return f" (no such {self.kind}, or a private one{hidden})"
         if found == "no revision":
             branches, tags = self._repo.refs()
@@ -138,7 +138,7 @@ class HubRemote:
         self._absence = ""
         commit = self._repo.find(self.branch)
         if not COMMIT.fullmatch(commit):
-            raise NotFoundError(f"{self.describe()} is not there, although it was made just now; push again")
+            raise NotFoundError(f"{self.describe()} is missing, although it was just created; push again")
         if not is_new and self._repo.tree(commit).own:
             raise ConflictError(self.describe())  # nothing was there a moment ago
         return commit
@@ -165,7 +165,7 @@ class HubRemote:
         listed = ours.to_json()
         named = [CommitOperationAdd(MANIFEST_FILE, listed), *operations]
         count = sum(isinstance(one, CommitOperationAdd) for one in operations)
-        title = f"manip-il push: {count} files new, {len(operations) - count} gone"
+        title = f"manip-il push: {count} files added, {len(operations) - count} removed"
 
         def once() -> str:
             try:
@@ -178,8 +178,8 @@ class HubRemote:
 
         commit = self.retry(once)
         if wrong := self._repo.tree(commit).differences(ours):
-            text = f"{self.describe()} holds other bytes than were sent: {', '.join(wrong[:3])}"
-            raise HashError(f"{text}; push again, and have the server looked at where it stays so")
+            text = f"{self.describe()} does not hold the bytes that were sent: {', '.join(wrong[:3])}"
+            raise HashError(f"{text}; push again, and check the server if it happens again")
         return commit
 
     def _move_tag(self, commit: str) -> None:

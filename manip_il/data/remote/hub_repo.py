@@ -143,7 +143,9 @@ class HubRepo:
                     self.place, additions, repo_type=self.type, revision=branch, num_threads=_UPLOADS, free_memory=False
                 )
         except TransientError as error:  # the library has tried again by itself
-            raise RemoteError(f"{error}; tried several times, try again later: what is there is kept") from None
+            raise RemoteError(
+                f"{error}; tried several times, try again later: what has been transferred is kept"
+            ) from None
 
     def commit(
         self, branch: str, parent: str, operations: Sequence[CommitOperationAdd | CommitOperationDelete], title: str

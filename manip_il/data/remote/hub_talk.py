@@ -114,7 +114,7 @@ def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | 
         return TransientError(f"{place}: {host(endpoint)} answered something that is not JSON; is it a Hub?")
     if isinstance(cause, (httpx.HTTPError, httpx.InvalidURL, *_NONSENSE)):
         return RemoteError(
-            f"{place}: {host(endpoint)} answered something that no Hub answers ({type(cause).__name__}); is it a Hub?"
+            f"{place}: {host(endpoint)} gave an answer that is not a Hub's ({type(cause).__name__}); is it a Hub?"
         )
     return None
 
@@ -136,17 +136,19 @@ def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
     if isinstance(error, RepositoryNotFoundError):
         return NotFoundError(f"{place} is not at {host(endpoint)}, or is private: check the name, or {LOGIN}")
     if status == 413:
-        text = f"{place}: that Hub takes no files as large as these{said}"
+        text = f"{place}: that Hub does not accept files this large{said}"
         return NoSpaceError(f"{text}; ask who runs it for a higher limit, or push in parts")
     if status in _FULL or (status == 403 and _QUOTA.search(said)):
         text = f"{place}: that Hub has no space left for this account{said}"
-        return NoSpaceError(f"{text}; delete what is old there, or get more, and push again: what has come is kept")
+        return NoSpaceError(
+            f"{text}; delete old files there or get more space, and push again: what has been transferred is kept"
+        )
     if status == 401:
         wrong = f"the token is refused{said}" if get_token() else "not logged in"
         return AuthError(f"{place}: {wrong}; {LOGIN}, with a token from {host(endpoint)}/settings/tokens")
     if status == 403:
         text = f"{place}: this token may not do that{said}"
-        return AuthError(f"{text}; make one with the right to write there at {host(endpoint)}/settings/tokens")
+        return AuthError(f"{text}; create one with write permission at {host(endpoint)}/settings/tokens")
     if status in (409, 412):
         return ConflictError(place)
     return RemoteError(f"{place}: {host(endpoint)} answered {status}{said}")

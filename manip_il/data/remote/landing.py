@@ -44,9 +44,9 @@ class Landing:
         if digest.hexdigest() != (entry.sha256 or entry.git_sha1):
             part.unlink()
             self._mismatches += 1
-            text = f"{entry.path} is not what the manifest says: its hash differs"
+            text = f"{entry.path} does not match the manifest: its hash differs"
             if self._mismatches > 1:
-                raise HashError(f"{text}, twice; nothing was kept; push it again, to an empty place")
+                raise HashError(f"{text}, twice; nothing was kept; push it again, to an empty folder")
             raise TransientError(text)
 
     def _hash_what_is_there(self, digest: Hasher) -> int:
@@ -102,7 +102,7 @@ class _Incoming(io.RawIOBase):
         chunk = memoryview(cast("bytes", data))
         if self.position + len(chunk) > self._entry.size:
             text = f"{self._entry.path} is longer than the {self._entry.size:,} bytes of the manifest"
-            raise HashError(f"{text}; nothing was kept; push it again, to an empty place")
+            raise HashError(f"{text}; nothing was kept; push it again, to an empty folder")
         if self._hashed is not None:
             self._hashed.result()
         # A large one is hashed while it is written and the next one is fetched.
@@ -124,5 +124,7 @@ class _Incoming(io.RawIOBase):
                 self._on_its_way = end
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise NoSpaceError("the disk is full; make room and pull again: what has come is kept") from None
-            raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; look at that disk") from None
+                raise NoSpaceError(
+                    "the disk is full; make room and pull again: what has been transferred is kept"
+                ) from None
+            raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; check that disk") from None

@@ -73,11 +73,11 @@ class Manifest:
         if self.kind not in _KINDS:
             raise ManifestError(f"the manifest is of a {self.kind!r:.40}; expected dataset or policy")
         if len(self.files) > MOST_FILES:
-            raise ManifestError(f"the manifest names {len(self.files):,} files; at most {MOST_FILES:,} are taken")
+            raise ManifestError(f"the manifest names {len(self.files):,} files; at most {MOST_FILES:,} are accepted")
         object.__setattr__(self, "files", tuple(sorted(self.files, key=lambda entry: entry.path)))
         check_together([entry.path for entry in self.files])
         if self.size > self.largest:
-            text = f"the manifest names {self.size:,} bytes; at most {self.largest:,} are taken"
+            text = f"the manifest names {self.size:,} bytes; at most {self.largest:,} are accepted"
             raise ManifestError(text)
         for sha256 in self.replaced:
             _check_hash("replaced", "sha256", sha256, _SHA256)
@@ -111,7 +111,7 @@ class Manifest:
         try:
             tree = json.loads(data, object_pairs_hook=_no_twins, parse_constant=_no_number)
         except (ValueError, RecursionError) as error:
-            raise ManifestError(f"the manifest is not the JSON it should be: {str(error)[:200]}") from None
+            raise ManifestError(f"the manifest is not valid JSON: {str(error)[:200]}") from None
         table = _object(tree, "the manifest", {"version", "kind", "files"}, {"replaced"})
         files = _list(table["files"], "files", MOST_FILES)
         replaced = _list(table.get("replaced", []), "replaced", MOST_FILES)
@@ -141,7 +141,7 @@ def _list(value: Any, what: str, most: int) -> list[Any]:
     if not isinstance(value, list):
         raise ManifestError(f"{what} of the manifest is {type(value).__name__}; expected a list")
     if len(value) > most:
-        raise ManifestError(f"the manifest names {len(value):,} files; at most {most:,} are taken")
+        raise ManifestError(f"the manifest names {len(value):,} files; at most {most:,} are accepted")
     return value
 
 
@@ -153,7 +153,7 @@ def _check_hash(path: str, what: str, value: object, pattern: re.Pattern[str]) -
 def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) != len(pairs):
-        raise ValueError("a key is there twice")
+        raise ValueError("a key appears twice")
     return table
 
 

@@ -112,8 +112,8 @@ class ObjectRemote:
         verified = self._upload(again, sources, lambda _: None)
         left = {key: size for key, size in again.items() if key not in verified}
         if left and self.retry(lambda: self.blobs.wrong(left)):
-            text = f"{self.describe()} holds other bytes than were sent, twice; nothing was switched over"
-            raise HashError(f"{text}: have its disk or the network looked at")
+            text = f"{self.describe()} twice did not keep the bytes that were sent; nothing was published"
+            raise HashError(f"{text}: check its disk and the network")
 
     def _switch(
         self, manifest: Manifest, before: Snapshot | None, sizes: Mapping[str, int], sources: Mapping[str, Path]
@@ -151,7 +151,7 @@ class ObjectRemote:
             if doomed - needed:
                 self.blobs.remove(sorted(doomed - needed), token)
         except RemoteError as error:  # readers see the new version already: the push has worked
-            self.blobs.warnings += (f"old files could not be cleared away ({error}); the next push tries again",)
+            self.blobs.warnings += (f"old files could not be removed ({error}); the next push tries again",)
 
 
 class _Sent:

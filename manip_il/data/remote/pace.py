@@ -30,7 +30,7 @@ class Pace:
         if self._bytes < LEAST_SPEED * self._seconds:
             raise RemoteError(
                 f"{self._name} moved {self._bytes:,} bytes in {self._seconds:.0f} s, expected at least {LEAST_SPEED:,} "
-                "bytes a second; try again later, or over another connection: what is there is kept"
+                "bytes a second; try again later, or over another connection: what has been transferred is kept"
             )
         self._seconds, self._bytes = 0.0, 0
 

@@ -22,7 +22,7 @@ _DEVICES = {"con", "prn", "aux", "nul", *(f"{name}{n}" for name in ("com", "lpt"
 def check_path(path: object) -> str:
     """`path` where it is allowed; else raise `ManifestError` with the reason."""
     if not isinstance(path, str):
-        raise ManifestError(f"a manifest names a file {path!r:.80}; expected a text")
+        raise ManifestError(f"a manifest names a file {path!r:.80}; expected a string")
     if reason := _reason(path):
         raise ManifestError(f"the file {path!r:.200} is refused: {reason}")
     return path
@@ -35,14 +35,14 @@ def check_together(paths: Iterable[str]) -> None:
     for path in paths:
         folded = fold(path)
         if folded in files:
-            raise ManifestError(f"the file {path!r:.200} is there twice, as {spelled[folded]!r:.200} too: refused")
+            raise ManifestError(f"the file {path!r:.200} appears twice, also as {spelled[folded]!r:.200}: refused")
         files.add(folded)
         parts = path.split("/")
         for count in range(1, len(parts) + 1):
             part = "/".join(parts[:count])
             if spelled.setdefault(fold(part), part) != part:
                 both = f"{part!r:.200} and {spelled[fold(part)]!r:.200}"
-                raise ManifestError(f"{both} differ only in upper case or in how letters are coded: refused")
+                raise ManifestError(f"{both} differ only in case or in how letters are encoded: refused")
     for path in paths:
         parts = path.split("/")
         for count in range(1, len(parts)):
@@ -64,14 +64,14 @@ def _reason(path: str) -> str:
     if not path or path.startswith("/") or path.endswith("/"):
         return "it is not a relative path of a file"
     if any(unicodedata.category(letter) in _BAD_CATEGORIES for letter in path):
-        return "it holds characters that cannot be seen"
+        return "it has invisible characters"
     if any(letter in path for letter in '\\:*?"<>|'):
-        return "it holds a character that names of files cannot have everywhere"
+        return "it has a character that file names cannot have on every system"
     if len(path.encode()) > LONGEST_PATH or path.count("/") > DEEPEST:
         return f"it is longer than {LONGEST_PATH} bytes or deeper than {DEEPEST} folders"
     for part in path.split("/"):
         if part in ("", ".", ".."):
-            return "it leaves the folder, or may"
+            return "it leads, or could lead, outside the folder"
         if part.startswith("."):
             return "it is hidden"
         if part.endswith((".", " ")) or part.startswith(" ") or part.split(".")[0].casefold() in _DEVICES:

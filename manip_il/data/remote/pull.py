@@ -69,7 +69,7 @@ def pull(
                     raise
                 snapshot = now  # pushed to twice meanwhile: what of it is the same stays
         else:
-            raise NotFoundError(f"{url} is pushed to all the time; pull again when that is over")
+            raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
         _land(stage.tree, target, snapshot.manifest, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
     return Pulled(snapshot.manifest, kept)
@@ -180,7 +180,7 @@ def _check_space(folder: Path, size: int) -> None:
     free = shutil.disk_usage(folder).free
     if size > free:
         text = f"{folder.parent} has {free:,} bytes left, {size:,} are to be pulled"
-        raise NoSpaceError(f"{text}; make room there, or pull to another disk: what has come is kept")
+        raise NoSpaceError(f"{text}; make room there, or pull to another disk: what has been transferred is kept")
 
 
 def _land(tree: Path, target: Path, manifest: Manifest, overwrite: bool) -> None:

@@ -62,12 +62,12 @@ def check_source(source: Path, url: RemoteUrl) -> Kind:
     if url.kind not in (None, kind):
         place = url.place
         right = f"hf://datasets/{place}" if kind == "dataset" else f"hf://{place}"
-        raise UsageError(f"{source} is a {kind}, {url} is the place of a {url.kind}; push it to {right}")
+        raise UsageError(f"{source} is a {kind}, {url} is for a {url.kind}; push it to {right}")
     for dataset in _datasets(source):
         findings = examine_folder(dataset)
         if has_errors(findings):
             first = next(finding for finding in findings if finding.severity is Severity.ERROR)
-            text = f"{dataset} is not whole and was not pushed: {' '.join(str(first).split())}"
+            text = f"{dataset} is damaged and was not pushed: {' '.join(str(first).split())}"
             raise NotWhole(f"{text}; see all with manip-il doctor {dataset}, and repair it with --repair=true")
     return kind
 
@@ -86,7 +86,7 @@ def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
     manifest = scanned.manifest
     if before and before.manifest.kind != manifest.kind:
         there, here = before.manifest.kind, manifest.kind
-        raise UsageError(f"{place} holds a {there}; a {here} cannot take its place: choose another name")
+        raise UsageError(f"{place} holds a {there}; a {here} cannot replace it: choose another name")
     old = before.manifest.by_path if before else {}
     known = before.manifest.keys if before else frozenset[str]()
     new = [entry for entry in manifest.files if not _is_known(entry.path, entry.key, known, before, scanned)]

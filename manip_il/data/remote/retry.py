@@ -34,10 +34,10 @@ class Retry:
             except TransientError as error:
                 if number == self.tries:
                     raise RemoteError(
-                        f"{error}; tried {number} times, try again later: what is there is kept"
+                        f"{error}; tried {number} times, try again later: what has been transferred is kept"
                     ) from None
                 self.sleep(self._wait(number, error))
-        raise RemoteError("no try was allowed; expected at least one")
+        raise RemoteError("no attempts are allowed; expected at least one")
 
     def _wait(self, number: int, error: TransientError) -> float:
         """Seconds to wait after the `number`-th try: what the server asked for, with a little more, or ours."""

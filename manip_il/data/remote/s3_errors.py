@@ -54,7 +54,7 @@ def explained(error: Exception, what: str, bucket: str) -> RemoteError:
     if code in ("NoSuchKey", "404", "NotFound") or status == 404:
         return NotFoundError(f"cannot {what}: nothing is there; check the name")
     if code in ("AccessDenied", "403", "Forbidden", "AllAccessDisabled") or status == 403:
-        text = "this key has no right to it; ask the bucket's owner for it, or set the key of somebody who has"
+        text = "this key has no permission for it; ask the bucket's owner, or use a key that has it"
         return AuthError(f"cannot {what}: {text}")
     if name == "EndpointConnectionError" and "Could not connect" in str(error):
         return TransientError(f"cannot {what}: no answer from {_endpoint(error)}; check AWS_ENDPOINT_URL")

@@ -80,5 +80,5 @@ async def _stay(session: aiohttp.ClientSession, context: SimpleNamespace, params
     before = params.response.url
     after = before.join(URL(params.response.headers.get("Location", "")))
     if after.origin() != before.origin():
-        text = f"{before.origin()} sends on to another address, {after.origin()}, which is not followed"
+        text = f"{before.origin()} redirects to another address, {after.origin()}, which is not followed"
         raise RemoteError(f"{text}; is AWS_ENDPOINT_URL (or the region) right?")

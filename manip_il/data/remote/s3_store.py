@@ -32,7 +32,7 @@ CHUNK = 2**20  # of what is read at a time, at most [bytes]
 MULTIPART = 2**26  # from this size on a file goes in parts [bytes]
 TIMEOUTS = {"connect_timeout": 15, "read_timeout": 60}  # [s]
 _KEY = re.compile(r"[0-9a-f]{64}")
-_IGNORED = "ignores conditional writes: two pushes at once are not kept apart"
+_IGNORED = "ignores conditional writes: two pushes at once can overwrite each other"
 
 Call = Callable[..., Awaitable[Any]]
 
@@ -113,7 +113,7 @@ class S3Blobs:
             body = answer["Body"]
             try:
                 if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
-                    text = f"{self._name}: the store knows no ranges; remove the .pulling folder and pull again"
+                    text = f"{self._name}: the store supports no byte ranges; remove the .pulling folder and pull again"
                     raise RemoteError(text)
                 pace = Pace(self._name)
                 while chunk := await read_paced(body, CHUNK, pace):
@@ -141,9 +141,9 @@ class S3Blobs:
             else:
                 verified = False
         if digest != key:
-            raise RemoteError(f"{source} changed while it was pushed; push again when nobody writes to it")
+            raise RemoteError(f"{source} changed while it was being pushed; push again when nobody writes to it")
         if verified is False:
-            raise TransientError(f"{self._name} has received other bytes than were sent")
+            raise TransientError(f"{self._name} did not receive the bytes that were sent")
         return verified is True
 
     def find(self, keys: Iterable[str]) -> dict[str, Stored]:
@@ -182,7 +182,7 @@ class S3Blobs:
         found = self.manifest()
         if found is None or found[1] != token:
             return
-        doomed, what = [self._at_key(key)["Key"] for key in keys] + self._left, f"clear away in {self._name}"
+        doomed, what = [self._at_key(key)["Key"] for key in keys] + self._left, f"remove old files from {self._name}"
 
         def one(key: str) -> None:
             self._run(lambda client: client.delete_object(Bucket=self._bucket, Key=key), what)

@@ -185,13 +185,13 @@ async def _send(client: Any, place: Mapping[str, str], number: int, data: bytes,
         try:
             answer = await client.upload_part(**place, PartNumber=number, Body=data)
             if (verified := is_as_sent(answer, part)) is False:
-                raise TransientError("the store has received other bytes than were sent")
+                raise TransientError("the store did not receive the bytes that were sent")
             return verified, answer["ETag"]
         except Exception as error:
             if not left or code_of(error) == GONE:
                 raise
             await asyncio.sleep(0.5 * (TRIES - left))
-    raise TransientError("no try was allowed; expected at least one")
+    raise TransientError("no attempts are allowed; expected at least one")
 
 
 def _read(file: BinaryIO, length: int, digest: Any) -> bytes:

@@ -96,7 +96,7 @@ def _files(folder: Path, journals: bool) -> Iterator[Path]:
             continue
         if entry.is_symlink():
             if not _is_last(path):
-                raise ManifestError(f"{path} is a link; nothing is pushed through links: put the file itself there")
+                raise ManifestError(f"{path} is a link; links are not pushed: replace it with the file itself")
         elif entry.is_dir():
             yield from _files(path, journals)
         elif entry.is_file():

@@ -120,16 +120,16 @@ class Connection:
         host, what = self._url.host, f"cannot {what}"
         if isinstance(error, paramiko.BadHostKeyException):
             return AuthError(
-                f"{what}: {host} has another key than ~/.ssh/known_hosts says; make sure that it is {host}"
+                f"{what}: {host} has a different key than in ~/.ssh/known_hosts; make sure that it is {host}"
             )
         if isinstance(error, paramiko.AuthenticationException) or "No authentication methods" in str(error):
-            return AuthError(f"{what}: {host} does not let this user in; {_ASK}")
+            return AuthError(f"{what}: {host} rejected this user's login; {_ASK}")
         if "not found in known_hosts" in str(error):
-            return AuthError(f"{what}: {host} is not in ~/.ssh/known_hosts; run ssh {host} once, and look at its key")
+            return AuthError(f"{what}: {host} is not in ~/.ssh/known_hosts; run ssh {host} once, and check its key")
         if isinstance(error, socket.gaierror):
             return NotFoundError(f"{what}: there is no host {host}; check the name")
         if isinstance(error, PermissionError):
-            return AuthError(f"{what}: this user has no right to it; ask its owner, or choose another folder")
+            return AuthError(f"{what}: this user has no permission for it; ask its owner, or choose another folder")
         if isinstance(error, FileNotFoundError):
             return NotFoundError(f"{what}: the folder is not there; check the name")
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -143,7 +143,7 @@ class Connection:
             return TransientError(f"{what}: the connection was lost")
         text = redact(" ".join(str(error).split())[:200], self._url.password or "")
         if text == "Failure":  # all that SFTP says of a full disk, a quota, a name that is taken
-            return NoSpaceError(f"{what}: the other side says only 'Failure'; most often its disk or quota is full")
+            return NoSpaceError(f"{what}: the server only says 'Failure'; usually its disk or quota is full")
         return RemoteError(f"{what}: {text or type(error).__name__}")
 
 

@@ -33,7 +33,7 @@ def hold(held: Held, name: str, touch: Callable[[], None]) -> Generator[Held]:
         if time.monotonic() - since > LOCK_STALE:
             held.break_open(seen[0])
         if time.monotonic() > last:
-            raise RemoteError(f"another push is switching {name} over; wait, and push again")
+            raise RemoteError(f"another push is updating {name}; wait, and push again")
         time.sleep(0.1)
     done = threading.Event()
     toucher = threading.Thread(target=_keep_touching, args=(touch, done), daemon=True)

@@ -86,7 +86,7 @@ class SftpBlobs:
             self._send(sftp, partial, data)
             if not mine():
                 sftp.remove(partial)
-                raise TransientError(f"another push has taken {self._name} for left alone")
+                raise TransientError(f"another push took over {self._name}, as this one seemed dead")
             sftp.posix_rename(partial, self._at(MANIFEST_FILE))
         return hashlib.sha256(data).hexdigest()
 
@@ -120,7 +120,7 @@ class SftpBlobs:
                     advance(len(chunk))
             if digest.hexdigest() != key or sent != size:
                 sftp.remove(partial)
-                raise RemoteError(f"{source} changed while it was pushed; push again when nobody writes to it")
+                raise RemoteError(f"{source} changed while it was being pushed; push again when nobody writes to it")
             sftp.posix_rename(partial, self._path(key))
         return False
 
@@ -185,7 +185,7 @@ class SftpBlobs:
             out.set_pipelined(True)
             out.write(data)
         if sftp.stat(path).st_size != len(data):
-            raise NoSpaceError(f"{self._name} did not keep all of the manifest; make room there and push again")
+            raise NoSpaceError(f"{self._name} did not store the whole manifest; make room there and push again")
 
     @contextlib.contextmanager
     def _sftp(self, what: str) -> Generator[Sftp]:

@@ -41,15 +41,15 @@ def test_a_token_that_nobody_was_given(hub: Hub, monkeypatch: pytest.MonkeyPatch
 def test_a_token_without_the_right_to_write(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     do_push(SAMPLE)
     monkeypatch.setenv("HF_TOKEN", hub.add_token("hf_ReadOnlyToken", "user", write=False))
-    assert "the right to write" in said(AuthError, lambda: do_push(SAMPLE, "hf://datasets/user/more"))
+    assert "with write permission" in said(AuthError, lambda: do_push(SAMPLE, "hf://datasets/user/more"))
     copy = copy_sample(tmp_path / "demos")
     (copy / "notes.txt").write_text("new")
-    assert "the right to write" in said(AuthError, lambda: do_push(copy))
+    assert "with write permission" in said(AuthError, lambda: do_push(copy))
 
 
 def test_no_such_repository(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
-    assert "(no such dataset, or a private one that this token may not see) holds nothing" in text
+    assert "(no such dataset, or a private one that this token cannot access) holds nothing" in text
     monkeypatch.delenv("HF_TOKEN")
     text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
     assert "or a private one, for which you run `hf auth login`, or set HF_TOKEN)" in text
@@ -71,9 +71,9 @@ def test_a_name_that_is_taken_by_the_other_type(hub: Hub, tmp_path: Path):
 
 
 FULL = {
-    "an upload too large": (Fault("^PUT ", 100, status=413), "takes no files as large as these; ask who runs it"),
-    "a commit too large": (Fault("/commit/", 100, status=413), "takes no files as large as these; ask who runs it"),
-    "a full disk": (Fault("^PUT ", 100, status=507), "has no space left for this account; delete what is old there"),
+    "an upload too large": (Fault("^PUT ", 100, status=413), "does not accept files this large; ask who runs it"),
+    "a commit too large": (Fault("/commit/", 100, status=413), "does not accept files this large; ask who runs it"),
+    "a full disk": (Fault("^PUT ", 100, status=507), "has no space left for this account; delete old files there"),
     "an account that must pay": (Fault("/preupload/", 100, status=402), "has no space left for this account; delete"),
     "a quota": (
         Fault(

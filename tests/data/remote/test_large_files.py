@@ -121,7 +121,7 @@ def test_the_upload_of_a_file_that_changed_is_aborted(bucket: str, client: Any, 
     scanned = scan(run, "policy")
     with (run / "large.safetensors").open("r+b") as file:
         file.write(b"changed")
-    with pytest.raises(RemoteError, match="changed while it was pushed"):
+    with pytest.raises(RemoteError, match="changed while it was being pushed"):
         remote.publish(scanned.local, scanned.manifest, None, lambda _: None)
     assert "Uploads" not in client.list_multipart_uploads(Bucket=bucket)
 

@@ -81,7 +81,7 @@ def test_nothing_is_followed_to_another_address(tmp_path, monkeypatch, capsys) -
     with a_liar(lambda _: answer(b"{}")) as thief:
         place = f"{thief.url}/bucket/x"
         with a_liar(lambda _: answer(b"", "307 Temporary Redirect", Location=place)) as store:
-            assert "sends on to another address" in pulled(store, tmp_path, monkeypatch, capsys)
+            assert "redirects to another address" in pulled(store, tmp_path, monkeypatch, capsys)
         assert TOKEN in store.asked[0]
         assert thief.asked == []
 

@@ -266,7 +266,7 @@ def test_dry_runs_change_nothing(place: str, tmp_path: Path) -> None:
 def test_a_dataset_that_is_not_whole_is_refused(tmp_path: Path, dataset: Path) -> None:
     (dataset / TASKS).unlink()
     url, remote = impatient(f"file://{tmp_path}/store")
-    with pytest.raises(NotWhole, match=r"not whole and was not pushed: .*tasks.parquet.*manip-il doctor"):
+    with pytest.raises(NotWhole, match=r"damaged and was not pushed: .*tasks.parquet.*manip-il doctor"):
         push(dataset, url, remote, silent)
     assert not (tmp_path / "store").exists()
 
@@ -278,14 +278,14 @@ def test_a_run_with_a_dataset_that_is_not_whole_is_refused(tmp_path: Path, datas
     url, remote = impatient(f"file://{tmp_path}/store")
     push(run, url, remote, silent)
     (inside / TASKS).unlink()
-    with pytest.raises(NotWhole, match=r"round_000/dataset is not whole and was not pushed"):
+    with pytest.raises(NotWhole, match=r"round_000/dataset is damaged and was not pushed"):
         push(run, url, remote, silent)
 
 
 def test_another_kind_is_not_pushed_over(place: str, tmp_path: Path, dataset: Path) -> None:
     url, remote = impatient(place)
     push(make_run(tmp_path / "run", 1), url, remote, silent)
-    with pytest.raises(UsageError, match="holds a policy; a dataset cannot take its place: choose another name"):
+    with pytest.raises(UsageError, match="holds a policy; a dataset cannot replace it: choose another name"):
         push(dataset, url, remote, silent)
 
 
