@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from manip_il.errors import UnknownName, UsageError
 
 SCHEDULES = {
-    "constant": "constant:0.0 drives by the learner alone from round 1 on (the paper's parameter-free choice)",
+    "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
     "linear": "linear:5 falls evenly from 1 in round 0 to 0 in round 5",
     "exponential": "exponential:0.5 is 0.5 to the power of the round",
 }
@@ -35,7 +35,7 @@ class BetaSchedule:
         sound = value >= 1 if kind == "linear" else 0 <= value <= 1
         if not sound:
             expected = "at least 1 round" if kind == "linear" else "0 to 1"
-            raise UsageError(f"beta is {text!r}; expected {expected} behind {kind}:")
+            raise UsageError(f"beta is {text!r}; expected {expected} after {kind}:")
         return cls(kind, value)
 
     def at(self, round_: int) -> float:

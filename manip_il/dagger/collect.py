@@ -74,7 +74,7 @@ def collect(
         if seed in shelf.there:
             yield shelf.take(seed)
         else:
-            _LOG.warning("seed %d is left out: it killed its worker again and again", seed)
+            _LOG.warning("seed %d is left out: it repeatedly killed its worker", seed)
 
 
 class _Shelf:

@@ -97,10 +97,14 @@ def check_sight(config: DaggerConfig) -> None:
     """Raise `UsageError` unless what the policy sees is recorded, and nothing is pictured for a blind one."""
     sees = config.fit.sees
     if sees and config.fit.is_mlp:
-        raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={config.fit.observation}; use cnn")
+        raise UsageError(
+            f"--policy.type=mlp does not take images, so not --observation={config.fit.observation}; use cnn"
+        )
     if sees and config.cameras is None:
-        raise UsageError("the policy looks at pictures, but none are made; give --cameras=front,wrist")
+        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,wrist")
     if config.cameras is not None and not sees:
-        raise UsageError("pictures are made, but the policy looks at none; leave out --cameras or --observation=images")
+        raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
     if sees and config.method == "dart":
-        raise UsageError("method 'dart' measures the learner's errors from numbers; it is not for a policy that sees")
+        raise UsageError(
+            "method 'dart' measures the learner's errors from state vectors; it is not for a policy on images"
+        )

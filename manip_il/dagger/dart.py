@@ -32,7 +32,7 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> tuple[tupl
         errors.append((actions - table[ACTION][rows])[table[LABEL_VALID][rows].reshape(-1) != 0])
     off = np.concatenate(errors)
     if not len(off):
-        raise ManipError(f"{root} holds no sound label to compare the policy with")
+        raise ManipError(f"{root} holds no valid label to compare the policy with")
     return tuple(map(tuple, (off.T @ off / len(off)).tolist()))
 
 

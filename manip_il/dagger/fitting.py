@@ -139,8 +139,8 @@ def check_labels(config: DaggerConfig) -> None:
     name = config.fit.policy.get("type", "mlp")
     if config.label == "per_state" and plan > 1 and ask.kind != "every":
         raise UsageError(
-            f"ask={config.ask} with label=per_state leaves single labels, and {name} learns from {plan} in a row; "
-            "take label=branch or label=takeover"
+            f"ask={config.ask} with label=per_state yields single labels, and {name} learns from {plan} in a row; "
+            "use label=branch or label=takeover"
         )
     if config.label == "branch" and branch_steps(config) <= _left_out(config.fit):
         raise UsageError(
@@ -152,7 +152,7 @@ def check_labels(config: DaggerConfig) -> None:
 
         if not config.fit.is_mlp or config.fit.policy.get("loss", "mse") not in LIKELIHOODS:
             raise UsageError(
-                f"ask={config.ask} needs a policy that knows how sure it is: --policy.type=mlp with "
+                f"ask={config.ask} needs a policy with a likelihood: --policy.type=mlp with "
                 f"--policy.loss={' or '.join(LIKELIHOODS)}"
             )
 

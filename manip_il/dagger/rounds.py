@@ -98,7 +98,7 @@ def collect_round(
     try:
         record(episodes, journals, here / DATASET, job, recording)
     except NothingToLearnError:
-        _LOG.warning("round %d: %d rollouts, and in none of them was the expert asked", round_, count)
+        _LOG.warning("round %d: %d rollouts, but the expert was asked in none of them", round_, count)
 
 
 def _round_job(config: DaggerConfig, folder: Path, engine: Engine, round_: int, policy: Path) -> RolloutJob:

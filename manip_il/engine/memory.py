@@ -44,7 +44,7 @@ def check_memory(
     if free >= need:
         return
     fitting = [n for n in range(1, workers) if needed_memory(n, cameras, learned=learned, weights=weights) <= free]
-    fewer = f"take --workers={fitting[-1]}, or " if fitting else ""
+    fewer = f"use --workers={fitting[-1]}, or " if fitting else ""
     raise ManipError(
         f"too little memory: {workers} worker{'s' if workers > 1 else ''} {'with' if cameras else 'without'} cameras "
         f"need about {math.ceil(10 * need / _GB) / 10} GB, {math.floor(10 * free / _GB) / 10} GB are free; "

@@ -68,8 +68,8 @@ def open_source(root: Path) -> Source:
     for kind, name, known in (("robot", spec.robot, ROBOTS), ("task", spec.task, TASKS)):
         if name not in known:
             raise ManipError(
-                f"{root} is about the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
-                "so its states cannot be pictured"
+                f"{root} is for the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
+                "so its states cannot be rendered"
             )
     env = EnvConfig(spec.robot, spec.task)
     size = env_spec(env).sim_state_size

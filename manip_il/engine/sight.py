@@ -35,7 +35,7 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
     try:
         return CameraConfig(names, height, width, Look(**(meta.look or {}) if meta else {}))
     except (UsageError, TypeError) as error:
-        raise ManipError(f"{policy}: its pictures cannot be made ({error}); see its {META_FILE}") from error
+        raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
 
 
 def drawn_cameras(job: RolloutJob) -> CameraConfig | None:

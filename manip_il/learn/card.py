@@ -55,11 +55,11 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)
     return (
         f"# {policy.type} for {meta.robot} {meta.task}\n\n"
-        "Cloned from an inverse-kinematics expert in MuJoCo; no human demonstrated anything.\n\n"
+        "Cloned from an inverse-kinematics expert in MuJoCo; there were no human demonstrations.\n\n"
         f"| | |\n|---|---|\n{table}\n\n"
         "Success on unseen seeds, with its interval:\n\n"
         "```sh\nmanip-il eval --policy.path=FOLDER_OF_THIS_FILE --eval.n_episodes=500 --output_dir=eval\n```\n\n"
-        "The same by LeRobot:\n\n"
+        "The same with LeRobot:\n\n"
         "```sh\nlerobot-eval --policy.path=FOLDER_OF_THIS_FILE \\\n"
         "  --env.discover_packages_path=manip_il.lerobot_plugin \\\n"
         f"  --env.type=manip_il --env.task={_task_id(meta)} --eval.n_episodes=50\n```\n"

@@ -227,7 +227,7 @@ def readable_state(checkpoint: Path) -> Iterator[None]:
     except Exception as error:  # of every kind: files of tensors and JSON, read by others' code
         line = checks.shorten(" ".join(str(error).split()))
         raise ManipError(
-            f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start anew with --overwrite=true"
+            f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start again with --overwrite=true"
         ) from error
 
 

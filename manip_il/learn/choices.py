@@ -65,7 +65,7 @@ def policy_config(settings: Mapping[str, Any], default_type: str = "mlp", *, tru
 
 def _from_checkpoint(path: Path, settings: dict[str, Any], trust: bool) -> PreTrainedConfig:
     if "type" in settings:
-        raise UsageError("give one of --policy.path=DIR and --policy.type=...: a checkpoint knows its type")
+        raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
     saved = read_config(path)
     cls, where = policy_class(saved["type"]), f"--policy.path={path}"
     require_trust(saved | settings, where, trust)

@@ -84,10 +84,12 @@ class FitConfig:
     def mlp(self, seed: int, init_from: Path | None = None) -> TrainConfig:
         """For `manip_il.learn.train.fit`. Raises `UsageError` for what the mlp does not know."""
         if self.observation not in (None, "state"):
-            raise UsageError(f"--policy.type=mlp sees no pictures, so not --observation={self.observation}; use cnn")
+            raise UsageError(
+                f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
+            )
         for name in ("optimizer", "scheduler"):
             if getattr(self, name):
-                raise UsageError(f"--{name} is not for --policy.type=mlp, which has a loop and a schedule of its own")
+                raise UsageError(f"--{name} is not for --policy.type=mlp, which has its own loop and schedule")
         from lerobot.configs.default import WandBConfig
 
         from manip_il.learn.choices import plain, policy_config

@@ -119,7 +119,9 @@ class PolicyTrainer:
         )
         optimizer = config.resolved_optimizer().build(policy.get_optim_params())
         if not isinstance(optimizer, torch.optim.Optimizer):
-            raise UsageError(f"--policy.type={config.policy.type} wants several optimisers; lerobot-train fits it")
+            raise UsageError(
+                f"--policy.type={config.policy.type} needs several optimisers; train it with lerobot-train"
+            )
         schedule = config.resolved_scheduler()
         scheduler = schedule.build(optimizer, config.steps) if schedule is not None else None
         if checkpoint is not None:

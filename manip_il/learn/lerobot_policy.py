@@ -119,7 +119,7 @@ def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str,
         raise ManipError(f"{path}: {error}") from error
     except Exception as error:  # a folder from anywhere, read by the code of any policy: errors of every kind
         if "state_dict" in str(error):
-            raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {_line(error)}") from error
+            raise ManipError(f"{path}: weights and {CONFIG} do not match: {_line(error)}") from error
         raise ManipError(f"{path}: LeRobot cannot load it: {type(error).__name__}: {_line(error)}") from error
 
 

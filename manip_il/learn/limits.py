@@ -72,9 +72,7 @@ class Budget(TorchDispatchMode):
             sizes = [arg for arg in args if isinstance(arg, list | tuple)]
             self._left -= _A_TENSOR + (math.prod(sizes[0]) if sizes and _is_size(sizes[0]) else 0)
             if self._left < 0:
-                raise ManipError(
-                    f"its options ask for a much larger network than its weights are of ({self._weights.name})"
-                )
+                raise ManipError(f"its options describe a much larger network than its weights ({self._weights.name})")
         return func(*args, **(kwargs or {}))
 
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:  # LeRobot takes seconds to import
 OBSERVATIONS = ("state", "images", "both")
 _LACKING = {
     STATE: "every policy needs the measured joints",
-    ENVIRONMENT_STATE: "choose the observation 'images', or record by `manip-il record`",
-    IMAGES: "record with --cameras=front,wrist, add pictures by `manip-il render`, or choose the observation 'state'",
+    ENVIRONMENT_STATE: "choose the observation 'images', or record with `manip-il record`",
+    IMAGES: "record with --cameras=front,wrist, add pictures with `manip-il render`, or choose the observation 'state'",
     ACTION: "there is nothing to learn",
 }
 

@@ -59,7 +59,7 @@ class LearnedPolicy:
 
         The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task: what
         a policy that reads language is told to do. trust: load models and code that the checkpoint names, too. Raises
-        `ManipError` for a folder that is not whole, that holds a pickle, whose files do not belong together, or that
+        `ManipError` for a folder that is not whole, that holds a pickle, whose files do not match, or that
         names code to import or, without `trust`, models to load; `UnknownName` for a type of policy that is not known.
         """
         path = Path(path)
@@ -131,7 +131,7 @@ class LearnedPolicy:
         """Raise `UsageError` unless this is a policy that tells how likely it finds an action, state by state."""
         if not isinstance(self._chooser, _Perceptron) or self._chooser.loss not in LIKELIHOODS:
             raise UsageError(
-                "ask=likelihood needs a policy that knows how sure it is: "
+                "ask=likelihood needs a policy with a likelihood: "
                 f"--policy.type=mlp with --policy.loss={' or '.join(LIKELIHOODS)}"
             )
 
@@ -202,7 +202,7 @@ class _Perceptron:
             self._network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
         except (RuntimeError, SafetensorError) as error:
             line = " ".join(str(error).split())
-            raise ManipError(f"{path}: weights and {CONFIG} do not belong together: {line}") from error
+            raise ManipError(f"{path}: weights and {CONFIG} do not match: {line}") from error
         except ManipError as error:
             raise ManipError(f"{path}: {error}") from error
         self._network.to(device).eval()
@@ -232,7 +232,7 @@ def _shape(config: Mapping[str, Any], path: Path) -> Shape:
     """What an mlp's `config.json` asks for."""
     for field in fields(Shape):
         if field.name not in config:
-            raise ManipError(f"{path} says no {field.name}; it is not of an mlp")
+            raise ManipError(f"{path} has no {field.name}; it is not an mlp's")
     try:
         return Shape(**{field.name: config[field.name] for field in fields(Shape)})
     except ManipError as error:

@@ -145,7 +145,7 @@ def processor_steps(path: Path) -> list[dict[str, Any]]:
 
 def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
     if "registry_name" not in step:
-        raise ManipError(f"it wants to run {checks.shorten(step.get('class'))}; only registered steps are loaded")
+        raise ManipError(f"it asks to run {checks.shorten(step.get('class'))}; only registered steps are loaded")
     known = {
         "registry_name": checks.text("registry_name", step["registry_name"], checks.LONGEST_NAME),
         "config": checks.mapping("config", step.get("config", {})),

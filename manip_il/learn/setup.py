@@ -84,7 +84,7 @@ def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
         if not weights or isinstance(error, FileNotFoundError):
             raise
         raise ManipError(
-            f"cannot download {weights} ({error}): train from scratch by --policy.pretrained_backbone_weights=null, "
+            f"cannot download {weights} ({error}): train from scratch with --policy.pretrained_backbone_weights=null, "
             f"or put the file that torchvision names into {torch.hub.get_dir()}/checkpoints"
         ) from error
     except ImportError as error:
@@ -179,7 +179,7 @@ def _source(
     if frames is None:
         names = ", ".join(map(str, roots))
         _LOG.warning(
-            "the pictures of %s take more than %g GB: LeRobot's loader decodes them as it goes", names, limit / 1e9
+            "the pictures of %s take more than %g GB: LeRobot's loader decodes them on the fly", names, limit / 1e9
         )
         ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
         read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]

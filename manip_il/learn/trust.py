@@ -58,7 +58,7 @@ def require_trust(settings: Mapping[str, Any], where: str, trust: bool, folder: 
     if wanted and not trust:
         raise ManipError(
             f"{where} is a policy of type {kind!r} that would load {'; '.join(wanted)}: this fetches files and may run "
-            "code that comes with them; if you trust where it is from, add --trust=true"
+            "code that comes with them; if you trust its source, add --trust=true"
         )
 
 

@@ -57,7 +57,7 @@ class Windows:
         else:
             samples = samples[valid[samples]]
         if len(samples) == 0:
-            raise ManipError(f"none of {len(valid)} frames has sound labels in its whole window: nothing to learn from")
+            raise ManipError(f"none of {len(valid)} frames has valid labels in its whole window: nothing to learn from")
         return samples
 
 

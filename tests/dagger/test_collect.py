@@ -107,7 +107,7 @@ def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_pat
     paths = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
     assert [read_header(one.path).seed for one in paths] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
     assert [record.getMessage() for record in caplog.records] == [
-        f"seed {SEEDS[2]} is left out: it killed its worker again and again"
+        f"seed {SEEDS[2]} is left out: it repeatedly killed its worker"
     ]
 
 

@@ -36,7 +36,7 @@ def test_options_that_contradict_each_other_are_refused(options, says: str):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"fit": ACT, "ask": "probability:0.1"}, "act learns from 8 in a row; take label=branch or label=takeover"),
+        ({"fit": ACT, "ask": "probability:0.1"}, "act learns from 8 in a row; use label=branch or label=takeover"),
         ({"fit": DIFFUSION, "label": "branch", "branch_steps": 4}, "diffusion leaves out the last 7 frames"),
         ({"ask": "likelihood:-2"}, "--policy.type=mlp with --policy.loss=mixture or categorical"),
         ({"fit": FitConfig({"loss": "gaussian"}), "ask": "likelihood:-2"}, "mixture or categorical"),
@@ -52,10 +52,10 @@ def test_labels_that_the_policy_cannot_use_are_refused(options, says: str):
     ("fit", "cameras", "method", "says"),
     [
         (FitConfig({"type": "cnn"}), (), "dagger", "give --cameras=front,wrist"),
-        (FitConfig(), ("front",), "dagger", "looks at none"),
-        (ACT, ("front",), "dagger", "looks at none"),
-        (FitConfig({"type": "cnn"}), ("front",), "dart", "not for a policy that sees"),
-        (FitConfig(observation="images"), ("front",), "dagger", "mlp sees no pictures"),
+        (FitConfig(), ("front",), "dagger", "the policy takes none"),
+        (ACT, ("front",), "dagger", "the policy takes none"),
+        (FitConfig({"type": "cnn"}), ("front",), "dart", "not for a policy on images"),
+        (FitConfig(observation="images"), ("front",), "dagger", "mlp does not take images"),
     ],
 )
 def test_what_is_pictured_is_what_is_looked_at(fit, cameras, method, says: str):

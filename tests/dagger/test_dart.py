@@ -59,5 +59,5 @@ def test_a_policy_is_asked_in_the_order_of_time(table, monkeypatch):
 
 
 def test_without_a_sound_label_there_is_nothing_to_measure(table, monkeypatch):
-    with pytest.raises(ManipError, match="no sound label"):
+    with pytest.raises(ManipError, match="no valid label"):
         noise(table | {"label_valid": np.zeros(6, np.int64)}, np.zeros((6, 2)), monkeypatch)

@@ -157,7 +157,7 @@ def test_what_a_job_lacks_is_said_before_it_runs(checkpoint: Path):
         RolloutJob(ENV, "mixture", policy=checkpoint, labels="takeover")
     with pytest.raises(UsageError, match="needs its noise"):
         RolloutJob(ENV, "noisy_expert")
-    with pytest.raises(UsageError, match="knows how sure it is"):
+    with pytest.raises(UsageError, match="needs a policy with a likelihood"):
         run(RolloutJob(ENV, "policy", policy=checkpoint, ask=Ask("likelihood", 0.0)))
 
 

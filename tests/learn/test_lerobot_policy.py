@@ -191,7 +191,7 @@ def test_missing_packages_are_named_with_their_extra(act, monkeypatch):
 
 def test_weights_of_another_size_and_weights_that_are_none_are_one_line(act):
     edit_config(act, dim_model=16)
-    with pytest.raises(ManipError, match="do not belong together") as caught:
+    with pytest.raises(ManipError, match="do not match") as caught:
         LearnedPolicy.load(act)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 600

@@ -233,7 +233,7 @@ def header(table: Any, length: int | None = None) -> bytes:
 def test_weights_that_are_broken_or_of_another_network(data, kind, request):
     policy = request.getfixturevalue(kind)
     (policy / "model.safetensors").write_bytes(data)
-    refused(policy, r"model\.safetensors cannot be read|do not belong together")
+    refused(policy, r"model\.safetensors cannot be read|do not match")
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ def test_a_folder_that_is_no_checkpoint_is_named(tmp_path):
 def test_weights_that_do_not_fit_the_config_are_refused(checkpoint):
     config = json.loads((checkpoint / "config.json").read_text())
     (checkpoint / "config.json").write_text(json.dumps(config | {"width": 32}))
-    with pytest.raises(ManipError, match="do not belong together"):
+    with pytest.raises(ManipError, match="do not match"):
         LearnedPolicy.load(checkpoint)
 
 
