@@ -44,7 +44,7 @@ class Case:
     def __post_init__(self) -> None:
         counts = [count for count in (self.steps, self.undisturbed) if count is not None]
         if self.moment < 0 or any(count < 1 for count in counts):
-            raise ManipError(f"certificate of seed {self.seed}: {self} counts steps that cannot be")
+            raise ManipError(f"certificate of seed {self.seed}: {self} has impossible step counts")
 
     def gap(self, horizon: int) -> int | None:
         """Q*(s, a) - V*(s) [control steps]; the whole horizon where the expert did not recover."""

@@ -36,7 +36,7 @@ def align(cells: Sequence[Sequence[str]]) -> list[str]:
 def _recoveries(certificate: Certificate, horizon: str) -> list[str]:
     rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
     rows += certificate.of("learner")
-    head = ["the expert goes on from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out"]
+    head = ["the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out"]
     return align([head, *([row.words, *_success(row)] for row in rows)])
 
 
@@ -83,7 +83,7 @@ def _failures(row: Row) -> str:
     line = f"not solved, {row.words}: seeds {seeds}"
     if not row.without_label:
         return line
-    return f"{line} ({row.without_label} of {len(row.failed_seeds)} ended where the expert has no sound label)"
+    return f"{line} ({row.without_label} of {len(row.failed_seeds)} ended where the expert has no valid label)"
 
 
 def _seconds(steps: float, hz: int) -> str:

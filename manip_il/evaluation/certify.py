@@ -67,7 +67,7 @@ def certify(
     if policy is not None:
         rows.append(run.taken_over(policy, trust))
     if engine.given_up:
-        _LOG.warning("left out, as each killed its worker again and again: seeds %s", engine.given_up)
+        _LOG.warning("left out, as each repeatedly killed its worker: seeds %s", engine.given_up)
     settings = Settings(cases, seed, env.horizon, env.control_hz, env.tolerance, env.success_steps)
     name = None if policy is None else str(policy)
     return Certificate(env.robot, env.task, name, env_fingerprint(env), settings, tuple(rows))

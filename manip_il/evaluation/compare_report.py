@@ -212,7 +212,7 @@ def _curves(comparison: Comparison) -> str:
     if not arms:
         return ""
     return sections.section(
-        "What success cost",
+        "Success against cost",
         curve_sections.arm_curves([(arm_curve(arm), kind) for arm, kind in arms]),
         sections.details("The curves in numbers", sections.pairs(arm_numbers([arm for arm, _ in arms]))),
     )

@@ -32,7 +32,7 @@ def curve(data: LearningCurve) -> str:
     drawn = [(learning_curve(data, cost), curve_axes(data, cost)[0].words) for cost in costs]
     note = f"Validation success; bars are {_confidence(data)} intervals."
     return sections.section(
-        "What the labels bought" if costs == ["labels"] else "What success cost",
+        "Success against labels" if costs == ["labels"] else "Success against cost",
         curve_note(note, curve_axes(data)[1], timed="seconds" in costs),
         f'<ul class="legend">{keys}</ul>',
         plots(drawn),

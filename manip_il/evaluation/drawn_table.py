@@ -23,7 +23,7 @@ def drawn_table(factors: Sequence[Factor]) -> str:
     found = _table(shown) if shown else f'<p class="lead">{sections.prose(_nothing(factors))}</p>'
     folded = f"{len(others)} more that varied, without a difference beyond chance" if shown else "All that varied"
     return sections.section(
-        "What failures go with",
+        "What failures are associated with",
         found,
         sections.details(folded, _table(others)) if others else "",
         f'<p class="note">{sections.prose(_note(factors, count))}</p>',
@@ -32,8 +32,8 @@ def drawn_table(factors: Sequence[Factor]) -> str:
 
 def _nothing(factors: Sequence[Factor]) -> str:
     if len(factors) == 1:
-        return f"Failures do not go with {factors[0].name} by more than chance."
-    return f"Failures go with none of the {len(factors)} numbers that varied by more than chance."
+        return f"Failures are not associated with {factors[0].name} beyond chance."
+    return f"Failures are associated with none of the {len(factors)} numbers that varied, beyond chance."
 
 
 def _note(factors: Sequence[Factor], count: str) -> str:
@@ -42,7 +42,7 @@ def _note(factors: Sequence[Factor], count: str) -> str:
         f"Success with its {confidence} interval (Wilson) in thirds of the episodes by start, goal and what was drawn; "
         "under it, the values of that third; equal values stay together. p: Fisher's exact test of all three, "
         f"corrected (Holm) for the {count}. "
-        "That failures go with a number does not say that it makes them fail."
+        "An association with a number does not show that it causes the failures."
     )
 
 

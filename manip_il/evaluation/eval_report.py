@@ -115,7 +115,8 @@ def _how_measured(result: EvalResult) -> str:
     if result.until_width is not None:
         intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
     return (
-        f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. Success is to be within "
+        f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. "
+        "Success means being within "
         f"{100 * settings.tolerance:g} cm of the goal for {settings.success_steps} control steps in a row{ends}. "
         + intervals
     )
@@ -132,7 +133,7 @@ def _where(report: EvalReport) -> str:
         rows = phase_rows([result.episodes], has_object=has_object(result))
         parts += ["<h3>The phase that they ended in</h3>", phase_chart(rows, ["cloning"], [result.policy])]
         count = "The one failed episode" if failed == 1 else f"The {failed:,} failed episodes"
-        words = f"{count} by where in the task the expert took the last state to be, in the order of the task."
+        words = f"{count} by the phase of the task that the expert assigned to the last state, in task order."
         parts.append(f'<p class="note">{sections.prose(words)}</p>')
     return sections.section("Where it fails", *parts) if any(parts) else ""
 

@@ -76,7 +76,8 @@ def _factor_fact(factors: tuple[Factor, ...]) -> str:
     best = max(first.groups, key=lambda group: group.success.rate)
     names = dict(zip(first.groups, first.group_names, strict=True))
     return (
-        f"What failures go with most: {first.name}. {format_percent(worst.success.rate)} succeed in its {names[worst]} "
+        f"Failures are associated most with {first.name}. "
+        f"{format_percent(worst.success.rate)} succeed in its {names[worst]} "
         f"({worst.low:.3g} to {worst.high:.3g}), {format_percent(best.success.rate)} in its {names[best]}, "
         f"corrected {format_p(first.corrected)}."
     )
@@ -86,7 +87,7 @@ def _end_fact(result: EvalResult) -> str:
     lost = sum(episode.success and not episode.success_at_end for episode in result.episodes)
     if not lost:
         return ""
-    return f"{lost:,} of the episodes that succeeded no longer stood at the goal at their last frame."
+    return f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame."
 
 
 def _named(phase: str) -> str:

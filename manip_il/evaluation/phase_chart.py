@@ -25,8 +25,8 @@ MEANINGS: dict[Phase, tuple[str, str]] = {
         "the hand is at the goal, but did not stay for long enough",
     ),
     Phase.NONE: (
-        "not even the expert can go on: the object is off the table or out of reach",
-        "not even the expert can go on from here",
+        "not even the expert can continue: the object is off the table or out of reach",
+        "not even the expert can continue from here",
     ),
 }
 

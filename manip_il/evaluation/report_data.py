@@ -132,7 +132,7 @@ class Strip:
         for seconds, picture in self.frames:
             if not picture.startswith(PNG_MAGIC):
                 raise ManipError(
-                    f"picture strip of {self.policy}: the frame at {seconds:.2f} s is no PNG (starts {picture[:8]!r})"
+                    f"picture strip of {self.policy}: frame at {seconds:.2f} s is not a PNG (starts {picture[:8]!r})"
                 )
 
 
@@ -151,9 +151,9 @@ class Film:
 
     def __post_init__(self) -> None:
         if self.mp4[4:8] != b"ftyp":
-            raise ManipError(f"film of {self.policy}: no MP4 (starts {self.mp4[:8]!r})")
+            raise ManipError(f"film of {self.policy}: not an MP4 (starts {self.mp4[:8]!r})")
         if self.poster and not self.poster.startswith(JPEG_MAGIC):
-            raise ManipError(f"film of {self.policy}: the poster is no JPEG (starts {self.poster[:8]!r})")
+            raise ManipError(f"film of {self.policy}: the poster is not a JPEG (starts {self.poster[:8]!r})")
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,9 +85,13 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
                 )
             )
         except KeyError as error:
-            raise ManipError(f"{name}: metrics.jsonl is not of manip-il dagger (no {error}, round {number})") from error
+            raise ManipError(
+                f"{name}: metrics.jsonl was not written by manip-il dagger (no {error}, round {number})"
+            ) from error
         except ManipError as error:
-            raise ManipError(f"{name}: metrics.jsonl is not of manip-il dagger (round {number}: {error})") from error
+            raise ManipError(
+                f"{name}: metrics.jsonl was not written by manip-il dagger (round {number}: {error})"
+            ) from error
     return tuple(rounds)
 
 

@@ -57,7 +57,7 @@ def evaluate(
             break
     asked = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
     if lost := [seed for seed in asked if seed not in results]:
-        _LOG.warning("left out of the evaluation, as each killed its worker again and again: seeds %s", lost)
+        _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
     return EvalResult(
         policy=name,
         robot=job.env.robot,

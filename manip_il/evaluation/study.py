@@ -37,7 +37,7 @@ class Study:
             raise UnknownName("baseline", self.baseline, names)
         for arm in self.arms:
             if not all(member.history and member.chosen for member in arm.members):
-                raise ManipError(f"arm {arm.name!r} holds a policy that is of no run")
+                raise ManipError(f"arm {arm.name!r} holds a policy that belongs to no run")
 
     @property
     def training_seeds(self) -> list[int | None]:

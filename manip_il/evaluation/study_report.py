@@ -82,7 +82,7 @@ def _curves(study: Study) -> str:
     kinds = arm_kinds(study)
     arms = [(arm_curve(arm), kinds[arm.name]) for arm in study.arms]
     return sections.section(
-        "What success cost",
+        "Success against cost",
         curve_sections.arm_curves(arms, study.target),
         cells_table(study.target_table(), kinds),
         sections.details("The curves in numbers", sections.pairs(arm_numbers(study.arms))),

@@ -108,7 +108,7 @@ def test_the_tables_show_the_numbers_and_who_was_not_solved():
     assert "75.0 % [30.1, 95.4]" in text
     assert "at least 50 steps (2.5 s), the whole horizon, as 1 of 4 were never solved" in text
     assert "the policy had solved 1 of 4 before" in text
-    assert "not solved, words of a: seeds 3 (1 of 1 ended where the expert has no sound label)" in text
+    assert "not solved, words of a: seeds 3 (1 of 1 ended where the expert has no valid label)" in text
 
 
 def test_columns_are_aligned():

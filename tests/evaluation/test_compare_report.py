@@ -53,7 +53,7 @@ def test_both_maps_and_curves_are_there(page: Page):
     assert sum((a.get("class") or "").startswith("paths map") for _, a in page.tags) == 4
     assert "only this one failed" in page.text
     assert sum(a.get("class") == "curve" for _, a in page.tags) == 3
-    assert "What success cost" in page.text
+    assert "Success against cost" in page.text
 
 
 def test_conditions_are_compared_pair_by_pair():
@@ -81,7 +81,7 @@ def test_without_histories_and_details_the_numbers_alone_are_left():
         for arm in (SELDOM.left, SELDOM.right)
     ]
     page = page_of(replace(REPORT, comparison=Comparison(*bare)))
-    for word in ("Where they fail", "What success cost", "By condition"):
+    for word in ("Where they fail", "Success against cost", "By condition"):
         assert word not in page.text
     assert "Episode by episode" in page.text
 

@@ -58,9 +58,9 @@ def test_the_verdict_is_the_first_sentence(page: Page):
 def test_the_parts_stand_in_the_order_of_what_one_asks():
     assert re.findall(r"<h2>(.*?)</h2>", eval_page(REPORT)) == [
         "Results",
-        "What the labels bought",
+        "Success against labels",
         "Where it fails",
-        "What failures go with",
+        "What failures are associated with",
         "How it looks",
         "How it was made",
     ]
@@ -106,7 +106,7 @@ def test_where_nothing_failed_the_page_says_so():
     )
     assert "No failure in 120 episodes." in page.text
     assert "phase that they ended in" not in page.text
-    assert "What failures go with" not in page.text
+    assert "What failures are associated with" not in page.text
 
 
 def test_where_everything_failed_the_page_says_so():
@@ -115,7 +115,7 @@ def test_where_everything_failed_the_page_says_so():
     assert report.verdict.startswith("runs/a/best fails in all 120 unseen episodes of panda pick_place: 0.0 % [")
     assert "of its 120 failures end in the phase descend" in report.verdict
     assert "120 failed and 0 solved" in page.text
-    assert "What failures go with" not in page.text
+    assert "What failures are associated with" not in page.text
 
 
 def test_the_hardest_condition_is_named_only_where_it_is_harder():
@@ -130,7 +130,7 @@ def test_the_hardest_condition_is_named_only_where_it_is_harder():
 
 def test_a_file_that_tells_nothing_but_success_still_has_its_page():
     page = page_of(EvalReport(without_detail(made_eval()), COMMAND))
-    assert "What failures go with" not in page.text
+    assert "What failures are associated with" not in page.text
     assert "seen from above" not in page.text
     assert "not recorded" in page.text
 

@@ -1,4 +1,4 @@
-"""What failures go with: exact tests, corrected for their number, over the thirds of whatever varied."""
+"""What failures are associated with: exact tests, corrected for their number, over the thirds of whatever varied."""
 
 from dataclasses import replace
 from math import comb

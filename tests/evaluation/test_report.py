@@ -169,11 +169,11 @@ def test_what_cannot_be_shown_is_refused_by_name():
         replace(REPORT, rows=())
     with pytest.raises(ManipError, match="verdict is empty"):
         replace(REPORT, verdict=" ")
-    with pytest.raises(ManipError, match="no PNG"):
+    with pytest.raises(ManipError, match="not a PNG"):
         Strip("p", ((0.0, b"GIF89a"),))
     with pytest.raises(ManipError, match="no MP4"):
         Film("p", b"")
-    with pytest.raises(ManipError, match="the poster is no JPEG"):
+    with pytest.raises(ManipError, match="the poster is not a JPEG"):
         Film("p", MP4, poster=PNG)
     with pytest.raises(ManipError, match=r"\(4, 3\).*\(5, 3\)"):
         Paths("p", np.zeros((4, 3)), np.zeros((5, 3)), np.zeros(3))
@@ -241,7 +241,7 @@ def test_a_curve_that_knows_its_costs_is_drawn_over_each_of_them():
         assert words in page.text
     labels_only = Page(render_report(REPORT))
     assert sum(attributes.get("class") == "curve" for _, attributes in labels_only.tags) == 1
-    assert "What the labels bought" in labels_only.text
+    assert "Success against labels" in labels_only.text
 
 
 def test_a_cost_below_nothing_is_refused():
