@@ -37,7 +37,7 @@ class VisitorGroup:
     """`--policy.*` of who visits the states that the expert goes on from."""
 
     path: Path | None = field(
-        default=None, metadata={"help": "a checkpoint or a run: the expert takes over from it, too"}
+        default=None, metadata={"help": "a checkpoint or a run: also let the expert take over from it"}
     )
 
 

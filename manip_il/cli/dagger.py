@@ -47,8 +47,8 @@ class SamplingGroup:
     """`--sampling.*`: how often frames are learnt from, relative to each other."""
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
-    corrections: float = option(1.0, "of a later frame where the expert drove or would have acted differently")
-    rollouts: float = option(1.0, "of the other later frames")
+    corrections: float = option(1.0, "weight of a later frame where the expert drove or would have acted differently")
+    rollouts: float = option(1.0, "weight of the other later frames")
 
 
 @dataclass
@@ -70,34 +70,34 @@ class DaggerOptions:
     )
     demonstrations: int = option(50, "successful expert episodes of round 0")
     rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more")
-    episodes_per_round: int = option(50, "rollouts a round; with --method=cloning successful ones")
+    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
     label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
-    disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
+    disturbed_share: float = option(
+        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
+    )
     beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
     label: Literal["per_state", "takeover", "branch"] = option(
         "per_state",
-        "what the expert gives where it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
+        "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
     ask: str | None = option(
         None,
-        "when: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; by default every, for "
-        "takeover one, for branch probability:1/STEPS",
+        "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
+        "by default every, for takeover one, for branch probability:1/STEPS",
     )
     branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
     ensemble: int = option(1, "policies fitted a round, of which the first drives; for --ask=ensemble:BOUND")
     sampling: SamplingGroup = field(default_factory=SamplingGroup)
     policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy sees besides its joints; by default images if it is cnn, else state"
+        None, "what the policy observes besides its joints; by default images if it is cnn, else state"
     )
-    cameras: list[str] = field(
-        default_factory=list, metadata={"help": "front, wrist or both, for a policy on pictures"}
-    )
+    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both, for a policy on images"})
     image: ImageGroup = field(default_factory=ImageGroup)
     refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
-    steps: int | None = option(None, f"gradient steps a round; by default {MLP_STEPS:,} for mlp, else 20,000")
-    refit_steps: int | None = option(None, "of the rounds after the first, with --refit=warm; by default as many")
-    batch_size: int | None = option(None, f"frames a step; by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}")
+    steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
+    refit_steps: int | None = option(None, "gradient steps in later rounds, with --refit=warm; by default as many")
+    batch_size: int | None = option(None, f"frames per step; by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}")
     lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
     optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
     scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
@@ -259,7 +259,7 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
     if comparison.significant and comparison.difference > 0:
         return f"{names[best.round]} is the best of {len(results)}: {found}."
     return (
-        f"{names[best.round]} is taken of {len(results)}, with {found}; "
+        f"{names[best.round]} is chosen of {len(results)}, with {found}; "
         f"no difference from {names[other.round]} is shown."
     )
 

@@ -88,7 +88,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     from manip_il.sim.task import TASKS
 
     if spec.robot not in ROBOTS or spec.task not in TASKS:
-        yield warning(OURS, f"is about {spec.robot} {spec.task}, which is not known here")
+        yield warning(OURS, f"is for {spec.robot} {spec.task}, which is not known here")
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps)
     here = env_spec(env)

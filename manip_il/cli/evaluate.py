@@ -52,7 +52,7 @@ class WhoGroup:
     """`--policy.*` of what is measured."""
 
     path: Path | None = field(default=None, metadata={"help": "a checkpoint or a run"})
-    type: Literal["expert", "random"] | None = option(None, "in place of a checkpoint")
+    type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
 
 
 @dataclass
@@ -64,8 +64,8 @@ class EvalGroup:
     )
     first: int = option(0, "index of the first seed in the stream, for one part of a larger evaluation")
     hold: int | None = option(10, "control steps after success at which an episode ends; null: at the horizon")
-    batch_size: int = option(25, "episodes in lockstep that share a call of the policy; changes no outcome")
-    stream: Literal["test", "validation"] = option("test", "seeds; nothing was chosen on those of test")
+    batch_size: int = option(25, "episodes in lockstep that share a call of the policy; no result depends on it")
+    stream: Literal["test", "validation"] = option("test", "which seeds; those of test were used for no choice")
     films: int = option(2, "number of failures to film, and of successes")
 
 
@@ -204,7 +204,7 @@ class EvalOptions:
         except OSError as error:
             raise ManipError(
                 f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
-                'container run as the user whose folder it is: docker run --user "$(id -u):$(id -g)"'
+                'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
             ) from error
 
     def _evaluate(

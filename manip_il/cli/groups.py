@@ -24,13 +24,13 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
 CONFIG_FILE = "config.yaml"
 POLICY_TYPES = ("mlp",)
 DEFAULT_ROBOT, DEFAULT_TASK, DEFAULT_HZ = "panda", "pick_place", 20
-ENGINE_HELP = "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one of its own here)"
-WORKERS_HELP = "processes, or tasks at once on Ray; by default one a core"
+ENGINE_HELP = "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one started here)"
+WORKERS_HELP = "processes, or tasks at once on Ray; by default one per core"
 WHERE_POLICIES_LIE = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
 NEWEST_LIES = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
 TRUST_HELP = (
     "load models, and run code, that a checkpoint names (smolvla, pi0, groot, ...): only for sources that you trust; "
-    "no file may set it"
+    "only on the command line"
 )
 
 
@@ -79,7 +79,7 @@ class EnvGroup:
     tolerance: float = option(0.02, "distance to the goal that counts as success [m]")
     horizon: int = option(100, "control steps in an episode")
     control_hz: int | None = option(None, f"control steps a second; by default the policy's, else {DEFAULT_HZ}")
-    success_steps: int = option(5, "control steps in a row within the tolerance that make a success")
+    success_steps: int = option(5, "consecutive control steps within the tolerance that count as success")
 
     def config(self, robot: str, task: str, control_hz: int = DEFAULT_HZ) -> EnvConfig:
         """The environment; `UnknownName` for a robot or task, `UsageError` for a value."""
@@ -111,7 +111,7 @@ class ImageGroup:
 class LookGroup:
     """`--look.*`: the light that pictures are made in. Defaults are `Look`'s."""
 
-    shadows: bool = option(False, "cast shadows; a picture then takes two to six times as long")
+    shadows: bool = option(False, "cast shadows; rendering then takes two to six times as long")
     brightness: float = option(1.0, "factor on every lamp, 0.1 to 2")
     light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
 
@@ -126,16 +126,16 @@ class LookGroup:
 class PolicyGroup:
     """`--policy.*` of what is fitted."""
 
-    type: str = option("mlp", "the policy; `manip-il train` fits every other one of LeRobot's")
+    type: str = option("mlp", "the policy; `manip-il train` trains every other LeRobot policy")
     loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
-    width: int = option(256, "units a layer")
+    width: int = option(256, "units per layer")
     depth: int = option(3, "hidden layers")
 
     def settings(self) -> dict[str, Any]:
         """As `--policy.*` of `manip-il train` has them; `UsageError` for another type."""
         if self.type not in POLICY_TYPES:
             raise UsageError(
-                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) learn by "
+                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) are trained by "
                 "manip-il train and manip-il dagger, with --policy.type=..."
             )
         return to_plain(self)
@@ -238,7 +238,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.sim.task import TASKS
 
     if spec.robot not in ROBOTS or spec.task not in TASKS:
-        warn([f"{root} is about {spec.robot} {spec.task}, which is not known here"])
+        warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps)
     check_same_spec(str(root), spec, "this program", env_spec(env))

@@ -66,7 +66,7 @@ def check_temporary_folder() -> None:
             file.write(b"x")
     except OSError as error:
         raise ManipError(
-            f"no temporary file can be made ({error.strerror}); make /tmp writable (docker run --tmpfs /tmp), "
+            f"cannot create a temporary file ({error.strerror}); make /tmp writable (docker run --tmpfs /tmp), "
             "or set TMPDIR"
         ) from error
     home = Path(tempfile.gettempdir())

@@ -45,24 +45,22 @@ COMMANDS = {
     ),
     "build": Command("manip_il.cli.build:BuildOptions", "rebuild a dataset from its journals"),
     "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
-    "dagger": Command("manip_il.cli.dagger:DaggerOptions", "roll out, label, aggregate, refit, and repeat"),
+    "dagger": Command("manip_il.cli.dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
     "replay": Command("manip_il.cli.replay:ReplayOptions", "run one episode of an evaluation again, and film it"),
     "merge": Command("manip_il.cli.merge:MergeOptions", "merge parts of an evaluation from several machines"),
     "compare": Command("manip_il.cli.compare:CompareOptions", "compare two policies or runs on the same seeds"),
     "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
-    "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from where the expert recovers"),
+    "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command("manip_il.cli.push:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
     "pull": Command("manip_il.cli.pull:PullOptions", "download a dataset or policy, every file verified"),
-    "export": Command("manip_il.cli.export:ExportOptions", "write a policy as ONNX or TorchScript, for a robot"),
-    "mcap export": Command(
-        "manip_il.cli.mcap:McapExportOptions", "write a dataset as MCAP files, for Foxglove and others"
-    ),
-    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "write MCAP files as a dataset, by a mapping file"),
+    "export": Command("manip_il.cli.export:ExportOptions", "export a policy as ONNX or TorchScript"),
+    "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
+    "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
     "quickstart": Command(
-        "manip_il.cli.quickstart:QuickstartOptions", "a small complete run: record, clone, DAgger, report"
+        "manip_il.cli.quickstart:QuickstartOptions", "run a small example: record, clone, DAgger, report"
     ),
 }
 

@@ -107,7 +107,9 @@ def measure(
         result = evaluate(engine, trial.job(policy), trial.seeds, name, stages.episode, suite=trial.suite)
         stages.close()
         if len(result.episodes) < len(trial.seeds):
-            raise ManipError(f"{name} has {len(result.episodes)} of {len(trial.seeds)} test episodes, as workers died")
+            raise ManipError(
+                f"{name} has {len(result.episodes)} of {len(trial.seeds)} test episodes, because workers died"
+            )
         result.write(file)
     return replace(EvalResult.read(file), policy=name), file
 

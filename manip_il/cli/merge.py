@@ -31,7 +31,7 @@ class MergeOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         if len(self.files) < 2:
-            raise UsageError(f"{self.files[0]} alone; expected two or more evaluations to merge")
+            raise UsageError(f"{self.files[0]} is the only one; expected two or more evaluations to merge")
         for path in self.files:
             if self.files.count(path) > 1:
                 raise UsageError(f"{path} is given twice; expected every evaluation once")

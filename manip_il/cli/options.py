@@ -243,7 +243,7 @@ def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefi
             arguments[field.name] = before | _inside(name, given)
         elif name in given:
             if field.metadata.get("command_line_only") and not given[name].is_word:
-                raise UsageError(f"{given[name].where}: only the command line may say this; give --{name}=...")
+                raise UsageError(f"{given[name].where}: this can only be set on the command line; give --{name}=...")
             arguments[field.name] = _decode_given(field_type, given[name])
         elif default is MISSING:
             label = name.upper() if field.metadata.get("positional") else f"--{name}"

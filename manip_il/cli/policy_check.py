@@ -50,7 +50,7 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
 
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
-        return [*lines, f"nor in what light its pictures were made: {cameras.look} is assumed"] if cameras else lines
+        return [*lines, f"nor how its pictures were lit: {cameras.look} is assumed"] if cameras else lines
     if meta.task != env.task:  # and with it the model and all that is hashed of it
         return [f"task differs: {path} has {meta.task}, the environment has {env.task}"]
     theirs = dict(meta.fingerprint)
@@ -83,4 +83,4 @@ def looks(cameras: CameraConfig, path: Path) -> str:
     observation = observation_of(read_interface(path).columns)
     lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
     size = f"{cameras.height} x {cameras.width} pixels"
-    return f"observation {observation!r}: the policy looks at {', '.join(cameras.names)}, {size}, {lights}"
+    return f"observation {observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"

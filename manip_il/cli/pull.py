@@ -59,7 +59,7 @@ class PullOptions:
             for entry in manifest.files:
                 say(f"pull     {entry.path} ({bytes_text(entry.size)})")
         size = f"a {manifest.kind} of {len(manifest.files)} files, {bytes_text(manifest.size)}"
-        kept = f", of which {bytes_text(pulled.kept)} had come before" if pulled.kept else ""
+        kept = f", of which {bytes_text(pulled.kept)} had been transferred before" if pulled.kept else ""
         say(f"{url}: {size}; nothing was done" if self.dry_run else f"{self.target}: {size}, all verified{kept}")
         if not self.dry_run and manifest.kind == "dataset":
             say(f"next: manip-il doctor {self.target}")
@@ -71,7 +71,7 @@ class PullOptions:
         if self.revision is None:
             return url
         if url.scheme != "hf":
-            raise UsageError(f"--revision={self.revision} is of the Hub alone; {url} holds one version")
+            raise UsageError(f"--revision={self.revision} is only for the Hub; {url} holds one version")
         if url.revision not in (None, self.revision):
             raise UsageError(f"{url} and --revision={self.revision} differ; give one of them")
         return RemoteUrl.parse(f"{replace(url, revision=None)}@{self.revision}")

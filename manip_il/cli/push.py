@@ -69,7 +69,9 @@ def _say_plan(plan: Plan, url: object) -> None:
     for path in plan.remove:
         say(f"remove   {path}")
     kept = len(plan.manifest.files) - len(plan.upload)
-    counts = f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload; {len(plan.remove)} to remove; {kept} stay"
+    counts = (
+        f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload; {len(plan.remove)} to remove; {kept} unchanged"
+    )
     say(f"{url}: {counts}; nothing was done")
 
 
@@ -77,4 +79,4 @@ def _summary(published: Published, url: object) -> str:
     if not published.uploaded and not published.removed:
         return f"{url}: {published.kept} files, all there already"
     counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
-    return f"{url}: {counts}; {published.removed} removed; {published.kept} were there"
+    return f"{url}: {counts}; {published.removed} removed; {published.kept} unchanged"

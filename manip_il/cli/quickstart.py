@@ -59,11 +59,13 @@ class QuickstartOptions:
     env: EnvGroup = field(default_factory=EnvGroup)
     demonstrations: int = option(100, "successful expert episodes to begin with")
     rounds: int = option(3, "of DAgger")
-    episodes_per_round: int = option(50, "rollouts a round")
-    disturbed_share: float = option(0.5, "of a round's rollouts, disturbed: the object is knocked, actions are noisy")
+    episodes_per_round: int = option(50, "rollouts per round")
+    disturbed_share: float = option(
+        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
+    )
     policy: PolicyGroup = field(default_factory=PolicyGroup)
-    steps: int = option(3_000, "gradient steps a fit")
-    batch_size: int = option(512, "frames a step")
+    steps: int = option(3_000, "gradient steps per fit")
+    batch_size: int = option(512, "frames per step")
     validation_episodes: int = option(100, "unseen episodes that choose the best round")
     test_episodes: int = option(200, "unseen test episodes, used for no choice")
     disturbed_episodes: int = option(100, "the first of them again, disturbed")
@@ -211,7 +213,7 @@ class _Story:
             facts=(
                 *compare(nominal, pairs, "Undisturbed"),
                 *compare(disturbed, pairs, "Disturbed"),
-                f"{self.config.disturbed_share:.0%} of DAgger's rollouts ran disturbed, no demonstration did.",
+                f"{self.config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
             ),
             curve=replace(curve, cloning=(points,)),
             films=pictures.films,

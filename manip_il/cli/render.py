@@ -23,7 +23,7 @@ class RenderOptions:
     cameras: list[str] = field(default_factory=lambda: ["front", "wrist"], metadata={"help": "front, wrist or both"})
     image: ImageGroup = field(default_factory=ImageGroup)
     look: LookGroup = field(default_factory=LookGroup)
-    workers: int | None = option(None, "processes; by default one a core")
+    workers: int | None = option(None, "processes; by default one per core")
     overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:

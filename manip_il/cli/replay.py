@@ -23,7 +23,7 @@ NO_FILES = ("expert", "random")
 class PlaceGroup:
     """`--policy.*` of what is replayed."""
 
-    path: Path | None = field(default=None, metadata={"help": "its present path; by default the one in eval.json"})
+    path: Path | None = field(default=None, metadata={"help": "its current path; by default the one in eval.json"})
 
 
 @dataclass
@@ -71,7 +71,7 @@ class ReplayOptions:
         differences = _differences(before, after)
         if differences:
             raise ManipError(
-                f"episode {self.episode} came out otherwise than in {self.file}: {'; '.join(differences)}; across "
+                f"episode {self.episode} differs from {self.file}: {'; '.join(differences)}; across "
                 "machines and versions success rates can be compared, single episodes cannot"
             )
         say(f"the same as in {self.file}")
@@ -107,7 +107,7 @@ class ReplayOptions:
             return find_policy(Path(result.policy))
         except UsageError:
             raise UsageError(
-                f"{self.file} is about {result.policy}, which is not here (paths are as seen from where eval ran); "
+                f"{self.file} is of {result.policy}, which is not here (paths are relative to where eval ran); "
                 "give --policy.path=DIR"
             ) from None
 

@@ -45,7 +45,7 @@ class StudyFile:
     checkpoint: Literal["best", "last"] = "best"
     at: str = "end"
     baseline: str | None = option(None, "the arm that others are compared with; by default the first")
-    target: float = option(0.95, "validation success of which the cost is told")
+    target: float = option(0.95, "validation success whose cost is reported")
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
     asked = [_read(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
     if not left:
-        blind = "" if sees else " and a policy that looks at no camera"
+        blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
     return tuple(left)
 

@@ -60,10 +60,10 @@ class TrainOptions:
     dataset: SourceGroup
     policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
     observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy sees besides its joints; by default images if the policy is cnn, else state"
+        None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
     steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
-    batch_size: int | None = option(None, f"frames a step (and process); by default {MLP_BATCH_SIZE} for mlp, else 8")
+    batch_size: int | None = option(None, f"frames per step (and process); by default {MLP_BATCH_SIZE} for mlp, else 8")
     lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
     optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
     scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
@@ -71,7 +71,7 @@ class TrainOptions:
     image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
     num_workers: int = option(4, "processes of LeRobot's loader")
     output_dir: Path = field(default=Path("runs/train"), metadata={"help": "folder of the run"})
-    seed: int = option(0, "of weights and batches, 0 to 1000")
+    seed: int = option(0, "seed of weights and batches, 0 to 1000")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     save_freq: int | None = option(None, "steps between checkpoints; by default 1,000 for mlp, else 20,000")
     log_freq: int = option(200, "steps between metrics")

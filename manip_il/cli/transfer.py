@@ -41,4 +41,4 @@ def going_on() -> Generator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise Interrupted("what has come so far", "the same command") from None
+        raise Interrupted("what has been transferred so far", "the same command") from None

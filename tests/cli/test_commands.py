@@ -182,7 +182,7 @@ def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
         (["dagger", "--ask=evry"], "did you mean 'every'?"),
         (["dagger", "--label_budget=0"], "label_budget is 0"),
         (["dagger", "--ask=ensemble:0.1"], "give ensemble=2 or more"),
-        (["dagger", "--policy.type=act", "--ask=one"], "take label=branch or label=takeover"),
+        (["dagger", "--policy.type=act", "--ask=one"], "use label=branch or label=takeover"),
         (["dagger", "--policy.type=cnn"], "give --cameras=front,wrist"),
         (["dagger", "--policy.lr=1"], "unknown option of --policy.type=mlp: 'lr'"),
         (["eval", "--policy.type=exprt"], "did you mean 'expert'?"),

@@ -98,7 +98,7 @@ def test_a_robot_that_is_not_known_is_said(root: Path, capsys: pytest.CaptureFix
         (data["spec"] if name == layout.OURS else data)[key] = "so100"
         (root / name).write_text(json.dumps(data))
     assert main(["doctor", str(root)]) == 0
-    assert "is about so100 reach, which is not known here" in capsys.readouterr().out
+    assert "is for so100 reach, which is not known here" in capsys.readouterr().out
 
 
 def test_the_current_folder(root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,7 +119,7 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys):
         ("mas: 1", "did you mean 'mass'?"),
         ("- 1", "holds list; expected a mapping of names to ranges"),
         ("mass: [", "is not YAML"),
-        ("brightness: [0.5, 2]", "changes nothing for pick_place and a policy that looks at no camera"),
+        ("brightness: [0.5, 2]", "changes nothing for pick_place and a policy without cameras"),
     ):
         Path("heavy.yaml").write_text(text)
         assert evaluate("f", *words, "--suite=heavy.yaml") == 2
@@ -280,7 +280,7 @@ def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, caps
     act.rename(here / "moved")
     capsys.readouterr()
     assert main(["replay", "e", "--episode=0"]) == 2
-    assert "e is about act, which is not here" in error(capsys)
+    assert "e is of act, which is not here" in error(capsys)
     assert main(["replay", "e", "--episode=0", "--policy.path=moved"]) == 0
     assert "files differ" not in capsys.readouterr().err
     other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)

@@ -58,7 +58,7 @@ def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, 
     assert evaluate(act, tmp_path / "e") == 0
     out, err = capsys.readouterr()
     assert "warning" not in err
-    assert "looks at" not in out
+    assert "the policy uses" not in out
     result = EvalResult.read(tmp_path / "e")
     assert (result.robot, result.task, [episode.steps for episode in result.episodes]) == ("panda", "reach", [8, 8])
 
@@ -68,7 +68,7 @@ def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
     assert evaluate(seeing, tmp_path / "e") == 0
     out, err = capsys.readouterr()
     assert "warning" not in err
-    [line] = [line for line in out.splitlines() if "looks at" in line]
+    [line] = [line for line in out.splitlines() if "the policy uses" in line]
     assert "'images'" in line
     assert "front, 32 x 32 pixels, shadows False, brightness 0.5" in line
     assert EvalResult.read(tmp_path / "e").fingerprint == env_fingerprint(ENV, DIM)

@@ -86,7 +86,7 @@ def test_nowhere_to_write_is_said(undrawn, monkeypatch, capsys):
 
     monkeypatch.setattr(tempfile, "TemporaryFile", fail)
     assert main(["health"]) == 1
-    assert "no temporary file can be made (No usable temporary directory found); make /tmp writable" in error(capsys)
+    assert "cannot create a temporary file (No usable temporary directory found); make /tmp writable" in error(capsys)
 
 
 def test_temporary_files_that_end_up_in_the_current_folder_are_said(tmp_path, monkeypatch):

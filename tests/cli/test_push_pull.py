@@ -92,11 +92,11 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(
         (
             ["push", "RUN", "hf://datasets/me/x"],
             2,
-            "hf://datasets/me/x is the place of a dataset; push it",
+            "hf://datasets/me/x is for a dataset; push it",
         ),
         (["push", "RUN"], 2, "REMOTE is missing"),
         (["pull", "URL", "got"], 1, "holds nothing that can be pulled"),
-        (["pull", "URL", "got", "--revision=main"], 2, "--revision=main is of the Hub alone"),
+        (["pull", "URL", "got", "--revision=main"], 2, "--revision=main is only for the Hub"),
         (["pull", "hf://me/x@a", "got", "--revision=b"], 2, "hf://me/x@a and --revision=b differ"),
     ],
 )
@@ -181,7 +181,7 @@ def test_ctrl_c_says_how_to_go_on(
 
     monkeypatch.setattr("manip_il.data.remote.push.push", interrupted)
     assert main(["push", str(run), url]) == 130
-    assert "kept: what has come so far; continue with: the same command" in capsys.readouterr().err
+    assert "kept: what has been transferred so far; continue with: the same command" in capsys.readouterr().err
 
 
 def test_bytes_as_people_read_them() -> None:
