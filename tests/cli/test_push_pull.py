@@ -31,7 +31,7 @@ def test_there_and_back(run: Path, url: str, tmp_path: Path, capsys: pytest.Capt
     assert main(["push", str(run), url]) == 0
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
-        f"{url}: 2 files, 1.51 kB, uploaded; 0 removed; 0 were there",
+        f"{url}: 2 files, 1.51 kB, uploaded; 0 removed; 0 unchanged",
         f"next: manip-il pull {url} FOLDER",
     ]
     assert "push: 1.51 kB/1.51 kB (" in captured.err
@@ -56,7 +56,7 @@ def test_dry_runs_only_say(run: Path, url: str, tmp_path: Path, capsys: pytest.C
     assert capsys.readouterr().out.splitlines() == [
         "upload   config.yaml (11 B)",
         "upload   metrics.jsonl (1.5 kB)",
-        f"{url}: 2 files, 1.51 kB, to upload; 0 to remove; 0 stay; nothing was done",
+        f"{url}: 2 files, 1.51 kB, to upload; 0 to remove; 0 unchanged; nothing was done",
     ]
     assert not (tmp_path / "store").exists()
     main(["push", str(run), url])
@@ -120,11 +120,11 @@ def test_a_hub_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
 
     with a_hub(tmp_path / "hub") as hub:
         assert said("push", SAMPLE, DATASET, "--dry-run")[-1] == (
-            f"{DATASET}: 8 files, 573 kB, to upload; 0 to remove; 0 stay; nothing was done"
+            f"{DATASET}: 8 files, 573 kB, to upload; 0 to remove; 0 unchanged; nothing was done"
         )
         assert not hub.repos
         assert said("push", SAMPLE, DATASET, "--private") == [
-            f"{DATASET}: 8 files, 573 kB, uploaded; 0 removed; 0 were there",
+            f"{DATASET}: 8 files, 573 kB, uploaded; 0 removed; 0 unchanged",
             f"next: manip-il pull {DATASET} FOLDER",
         ]
         assert hub.repo("datasets/user/demos").private

@@ -24,7 +24,7 @@ def rounds(*successes: int, n: int) -> list[Any]:
 
 def test_the_best_round_of_few_episodes_is_taken_and_not_shown_to_be_better():
     said = best_verdict(NAMES, rounds(0, 0, n=4))
-    assert said.startswith("DAgger, round 1 is taken of 2, with 0.0 %")
+    assert said.startswith("DAgger, round 1 is chosen of 2, with 0.0 %")
     assert said.endswith("on 4 validation episodes; no difference from cloning (round 0) is shown.")
     assert "no difference from DAgger, round 1 is shown" in best_verdict(NAMES, rounds(2, 1, n=4))
     assert "no difference" in best_verdict(NAMES, rounds(0, 2, n=4))

@@ -92,7 +92,7 @@ def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_pat
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
-    with pytest.raises(ManipError, match="only 0 of 9 demonstrations succeeded; 3 were asked for"):
+    with pytest.raises(ManipError, match="only 0 of 9 demonstrations succeeded; 3 are needed"):
         list(collect_successes(Recorded(SEEDS), JOB, SEEDS[:9], 3, tmp_path))
 
 

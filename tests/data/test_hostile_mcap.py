@@ -153,7 +153,7 @@ def test_chunks_together_may_unpack_to_so_much(
         ("'<U0'", "(1000000000000,)", "expected numbers"),
         ("'|O'", "(8,)", "expected numbers"),
         ("'<f8'", "'x'", "shape"),
-        ("['" + "x" * 100 + "']", "(1,)", "not a whole episode"),
+        ("['" + "x" * 100 + "']", "(1,)", "not a complete episode"),
     ],
 )
 def test_a_column_is_not_allocated_on_its_word(

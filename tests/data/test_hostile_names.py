@@ -243,7 +243,7 @@ def test_a_repair_writes_and_moves_nothing_through_a_link(victim: Path, tmp_path
     before = digests(outside)
     said = list(repair(Dataset(victim), findings(victim)))
     assert digests(outside) == before
-    assert any("lies outside the dataset" in line for line in said)
+    assert any("is outside the dataset" in line for line in said)
     assert any(line.startswith("not moved, as it is outside the dataset") for line in said)
 
 

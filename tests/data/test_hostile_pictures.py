@@ -71,7 +71,7 @@ def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def pictured(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
-    """A dataset with a column of pictures whose first one is no PNG."""
+    """A dataset with a column of pictures whose first one is not a PNG."""
     root = tmp_path / "lift"
     write_dataset(episodes, root, spec, repo_id="a/lift", fingerprint={})
     path = next(root.glob(layout.DATA_FILES))

@@ -120,7 +120,7 @@ def test_a_changed_byte_anywhere_is_refused_by_name(path: Path, tmp_path: Path) 
 def test_another_mcap_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     other = tmp_path / "episode-000000000001.mcap"
     other.write_bytes(b"something else")
-    with pytest.raises(ManipError, match="not a whole episode"):
+    with pytest.raises(ManipError, match="not a complete episode"):
         journal.read_episode(other)
     with pytest.raises(ManipError, match="no such episode file"):
         journal.read_header(tmp_path / "episode-000000000002.mcap")

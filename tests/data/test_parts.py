@@ -100,6 +100,6 @@ def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(
 def test_rollouts_without_a_label_make_no_dataset(make_episode, spec, tmp_path):
     episode = make_episode(7)
     unasked = replace(episode, columns=episode.columns | {s.LABEL_VALID: np.zeros((len(episode), 1), np.int64)})
-    with pytest.raises(NothingToLearnError, match="nobody asked the expert"):
+    with pytest.raises(NothingToLearnError, match="the expert was never queried"):
         recorded([unasked], spec, tmp_path, Recording("local/d", only_labelled=True))
     assert not (tmp_path / "d").exists()

@@ -171,7 +171,7 @@ def test_what_cannot_be_shown_is_refused_by_name():
         replace(REPORT, verdict=" ")
     with pytest.raises(ManipError, match="not a PNG"):
         Strip("p", ((0.0, b"GIF89a"),))
-    with pytest.raises(ManipError, match="no MP4"):
+    with pytest.raises(ManipError, match="not an MP4"):
         Film("p", b"")
     with pytest.raises(ManipError, match="the poster is not a JPEG"):
         Film("p", MP4, poster=PNG)

@@ -77,7 +77,7 @@ def test_an_mlps_config_that_lacks_something(mlp):
     values = json.loads((mlp / "config.json").read_text())
     del values["width"]
     (mlp / "config.json").write_text(json.dumps(values))
-    refused(mlp, r"config\.json says no width")
+    refused(mlp, r"config\.json has no width")
 
 
 @pytest.mark.parametrize(

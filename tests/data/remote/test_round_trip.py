@@ -194,7 +194,7 @@ def test_two_pushes_at_once_one_wins(place: str, tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     (winner,) = [number for number, outcome in outcomes.items() if outcome == "won"]
-    assert "was changed by another push meanwhile" in outcomes[1 - winner]
+    assert "was changed by another push in the meantime" in outcomes[1 - winner]
     assert remote.warnings == ()
     pull(url, remote, tmp_path / "got", silent)
     assert content(tmp_path / "got") == content(runs[winner])
