@@ -7,6 +7,7 @@ headers are what pyarrow allocates and decodes by; they are read first (parquet-
 from __future__ import annotations
 
 import mmap
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -55,7 +56,8 @@ class _Page:
 def check_parquet(paths: Iterable[Path], columns: Sequence[str] | None = None, least: int = LARGEST_FILE) -> None:
     """Raise `ValueError` where columns (all by default) unpack to more than `least` and 100 times the files' size.
 
-    Also for a page that does, and for what is not a parquet file; `OSError` and pyarrow's errors for an unreadable one.
+    Also for a page that does, for two columns of one name and for what is not a parquet file; `OSError` and pyarrow's
+    errors for an unreadable one.
     """
     size = taken = 0
     names = None if columns is None else tuple(columns)
@@ -79,6 +81,7 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
             leaves = [_Leaf.of(schema.column(i)) for i in range(len(schema.names))]
             if len(leaves) > MOST_COLUMNS:
                 raise ValueError(f"it has {len(leaves):,} columns; expected at most {MOST_COLUMNS:,}")
+            _check_names(schema.to_arrow_schema().names)
             try:
                 return sum(
                     _column_size(data, chunk, leaves[number])
@@ -87,6 +90,12 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
                 )
             except IndexError as error:
                 raise ValueError("its footer is damaged") from error
+
+
+def _check_names(names: Sequence[str]) -> None:
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in Counter(names).items() if count > 1)
+        raise ValueError(f"it has more than one column {twice[:100]!r}; expected different names")
 
 
 @dataclass(frozen=True)

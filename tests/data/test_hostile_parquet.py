@@ -218,6 +218,20 @@ def test_every_reader_refuses_a_dataset_of_billions_of_rows(root: Path, tmp_path
     assert any("unpack to" in line for line in lines(root))
 
 
+def test_every_reader_refuses_two_columns_of_one_name(root: Path, tmp_path: Path) -> None:
+    table = pq.read_table(root / DATA)
+    pq.write_table(table.append_column(s.STATE, table[s.ACTION]), root / DATA)
+    for read in (
+        read_table,
+        check_dataset,
+        lambda root: list(read_episodes(root)),
+        lambda root: list(export_dataset(open_source(root), tmp_path)),
+    ):
+        with pytest.raises(ManipError, match=r"cannot read .*more than one column 'observation\.state'"):
+            read(root)
+    assert any("more than one column 'observation.state'" in line for line in lines(root))
+
+
 @pytest.mark.parametrize("name", [EPISODES, layout.TASKS])
 def test_what_stands_once_a_dataset_is_checked_too(root: Path, name: str) -> None:
     repeated_text(root / name)
