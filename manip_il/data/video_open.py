@@ -31,13 +31,15 @@ _ELSEWHERE = re.compile(rb"moof|mvex|cmov")  # fragments and a packed index: wha
 def open_video(path: Path) -> InputContainer:
     """Open an MP4 file for reading; its pictures are not decoded yet.
 
-    Raises `ValueError` for an index or pictures beyond the limits, and for fragmented files, which no LeRobot dataset
-    has; `OSError` and `av.FFmpegError` for what is no MP4 file or cannot be read.
+    Raises `ValueError` for an index or pictures beyond the limits, for a codec without a decoder, and for fragmented
+    files, which no LeRobot dataset has; `OSError` and `av.FFmpegError` for what is no MP4 file or cannot be read.
     """
     _check_index(path)
     container = av.open(f"file:{path}", format="mp4", options=_OPTIONS)
     try:
         for stream in container.streams.video:
+            if not stream.codec_context:  # PyAV's types do not say so
+                raise ValueError("its pictures are of a codec that no decoder is known for; write it as AV1 or H.264")
             stream.codec_context.options = {"max_pixels": _OPTIONS["max_pixels"]}
             if stream.width * stream.height > MOST_PIXELS:
                 size = f"{stream.width} x {stream.height}"

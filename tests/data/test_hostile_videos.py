@@ -76,6 +76,12 @@ def test_a_name_is_a_path_and_no_address(tmp_path: Path, monkeypatch: pytest.Mon
     assert count_frames(Path(name)) == FRAMES
 
 
+def test_a_codec_without_a_decoder_is_refused(tmp_path: Path) -> None:
+    path = film(tmp_path / "film.mp4", SIZE)
+    path.write_bytes(path.read_bytes().replace(b"mp4v", b"zzzz").replace(b"esds", b"zzzz"))
+    refuse(path, "no decoder is known")
+
+
 def test_a_playlist_opens_no_other_file(tmp_path: Path) -> None:
     film(tmp_path / "secret.mp4", SIZE)
     path = tmp_path / "file-000.mp4"
