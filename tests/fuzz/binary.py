@@ -95,11 +95,15 @@ def mutate_safetensors(rng: Random, data: bytes) -> bytes:
 def mutate_npy(rng: Random, data: bytes) -> bytes:
     """An array whose header lies, or another array."""
     choice = rng.randrange(5)
-    if choice == 0:
+    if choice == 0 or len(data) < 10:
         return damaged(rng, data)
-    stream = io.BytesIO()
     if choice == 1:
-        np.save(stream, _other_array(rng, np.load(io.BytesIO(data))))
+        stream = io.BytesIO()
+        try:
+            with np.errstate(all="ignore"):
+                np.save(stream, _other_array(rng, np.load(io.BytesIO(data))))
+        except Exception:  # it was mutated before, so that reading it may fail in any way
+            return damaged(rng, data)
         return stream.getvalue()
     size = struct.unpack("<H", data[8:10])[0]
     shape = rng.choice(("()", "(0,)", "(-1,)", "(2**40,)", "(1099511627776,)", "(9, 9, 9)", "(1,) * 99", "None"))
@@ -147,7 +151,8 @@ def mutate_mcap(rng: Random, data: bytes) -> bytes:
     return _packed(rng, records)
 
 
-def _metadata(rng: Random, record: Metadata) -> Metadata:
+def change_metadata(rng: Random, record: Metadata) -> Metadata:
+    """Another name, or texts that say something else."""
     from .trees import mutate_json, mutate_tree
 
     values: dict[str, Any] = dict(record.metadata)
@@ -155,7 +160,7 @@ def _metadata(rng: Random, record: Metadata) -> Metadata:
     try:
         json.loads(values[key])
         values[key] = mutate_json(rng, values[key].encode()).decode(errors="replace")
-    except (ValueError, KeyError):
+    except (ValueError, KeyError, RecursionError):  # no JSON, or none any more
         values = mutate_tree(rng, values)
     flat = values if isinstance(values, dict) else {"x": str(values)[:1_000]}
     name = record.name if rng.random() < 0.95 else rng.choice(("", "x", record.name * 2))
@@ -185,7 +190,10 @@ def _message(rng: Random, record: Message) -> Message:
 
     is_json = record.data[:1] == b"{"
     time = record.log_time if rng.random() < 0.7 else rng.choice((0, 1, 2**63, 2**64 - 1))
-    content = mutate_json(rng, record.data) if is_json else damaged(rng, record.data)
+    try:
+        content = mutate_json(rng, record.data) if is_json else damaged(rng, record.data)
+    except (ValueError, RecursionError):  # it is no JSON any more
+        content = damaged(rng, record.data)
     return Message(
         channel_id=record.channel_id,
         log_time=time,
@@ -212,7 +220,7 @@ def _channel(rng: Random, record: Channel) -> Channel:
 
 
 _CHANGED: dict[type, Callable[[Random, Any], Any]] = {
-    Metadata: _metadata,
+    Metadata: change_metadata,
     Attachment: _attachment,
     Message: _message,
     Schema: _schema,
@@ -327,7 +335,7 @@ def _footer(rng: Random, table: pa.Table) -> pa.Table:
     key = rng.choice(list(metadata))
     try:
         metadata[key] = mutate_json(rng, metadata[key])
-    except ValueError:
+    except (ValueError, RecursionError):
         metadata[key] = damaged(rng, metadata[key])
     return table.replace_schema_metadata(metadata)
 

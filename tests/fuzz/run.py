@@ -10,12 +10,13 @@ import queue
 import shutil
 import tempfile
 import threading
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from .target import Attempt, Target, bench
+from .target import Attempt, Bench, Target, bench
 
 LONGEST = 30.0  # one input [s]: what takes longer hangs
 STARTING = 900.0  # until a target's valid files are made and the first input is read [s]
@@ -58,9 +59,18 @@ def work(pipe: Connection, folder: Path) -> None:
         with bench(targets[name], folder / str(task)) as made:
             for number in numbers:
                 pipe.send((number, None))
-                pipe.send((number, made.attempt(made.mutated(seed, number), number)))
+                pipe.send((number, try_input(made, seed, number)))
         shutil.rmtree(folder / str(task), ignore_errors=True)
         pipe.send(None)
+
+
+def try_input(made: Bench, seed: int, number: int) -> Attempt:
+    """Make an input and read it; where it cannot be made, that is the fuzz's own mistake, and no death."""
+    try:
+        data = made.mutated(seed, number)
+    except Exception as error:
+        return Attempt(False, "-", 0.0, 0.0, f"its input could not be made: {error!r}\n{traceback.format_exc()}")
+    return made.attempt(data, number)
 
 
 def _settle(folder: Path) -> None:

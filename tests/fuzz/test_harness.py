@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import sys
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pytest
+from mcap.records import Metadata
 
 from manip_il.errors import ManipError
 
+from .binary import change_metadata, mutate_npy
+from .run import try_input
 from .table import TARGETS
 from .target import LARGEST, Bench, Target
 from .trees import mutate_json, mutate_yaml
@@ -63,6 +69,23 @@ def test_every_valid_tree_can_be_mutated() -> None:
         mutate_json(Random(number), b'{"a": [1, 2.5, null, true, "x", {"b": {}}], "c": []}')
     for number in range(300):
         mutate_yaml(Random(number), b"# head\na: [1, 2.5, null, true, x]\nb: {c: d}\n")
+
+
+def test_what_was_mutated_before_can_be_mutated_again() -> None:
+    for number in range(150):
+        stream, rng = io.BytesIO(), Random(number)
+        np.save(stream, np.arange(12.0).reshape(4, 3))
+        array, record = stream.getvalue(), Metadata("x", {"info": '{"a": [1, 2.5, null, true, "x", {"b": {}}]}'})
+        for _ in range(4):
+            array = mutate_npy(rng, array)
+            record = change_metadata(rng, record)
+
+
+def test_an_input_that_cannot_be_made_is_told_from_a_death(tmp_path: Path) -> None:
+    made = _bench(tmp_path, lambda folder: None)
+    broken = replace(made.target, mutate=lambda rng, data: data + {}["x"])
+    tried = try_input(Bench(broken, made.base, made.work), 0, 0)
+    assert tried.problem.startswith("its input could not be made: KeyError('x')")
 
 
 def test_targets_have_names_of_their_own() -> None:
