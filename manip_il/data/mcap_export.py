@@ -170,7 +170,7 @@ def _labels(key: str, feature: dict[str, Any], width: int) -> list[str]:
     names = feature.get("names")
     if isinstance(names, dict):  # {"motors": [...]}
         names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
-    if isinstance(names, list) and len(set(map(str, names))) == width:
+    if isinstance(names, list) and len(set(map(str, names))) == len(names) == width:
         return list(map(str, names))
     return [key] if width == 1 else [f"{key}_{number}" for number in range(width)]
 
