@@ -137,7 +137,7 @@ class TrainOptions:
     def _stages(self, save_freq: int) -> Stages:
         from manip_il.cli.stages import Stages
 
-        return Stages(kept=f"the last checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
+        return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
 
     def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
         from manip_il.dagger.fitting import LEARNING_COLUMNS

@@ -1,4 +1,4 @@
-"""What a disk can do to who writes to it (full, read-only, a quota), as one error that names the path."""
+"""Turn what a disk refuses (no space, read-only, a quota) into one error that names the path."""
 
 from __future__ import annotations
 
