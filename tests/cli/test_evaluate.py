@@ -83,7 +83,7 @@ def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tm
         assert fingerprint["cameras_sha256"][:12] in line
     (seeing / META_FILE).unlink()
     assert evaluate(seeing, tmp_path / "e", "--robot.type=panda", "--task.type=reach", "--overwrite=true") == 0
-    assert "in what light" in capsys.readouterr().err
+    assert "how its pictures were lit" in capsys.readouterr().err
 
 
 def test_a_policy_of_pictures_does_not_mind_another_tasks_poses(seeing, tmp_path, capsys, monkeypatch):
