@@ -105,7 +105,7 @@ def test_a_killed_recorder_that_had_resumed_a_whole_dataset(recorded: Path, tmp_
     record(root, "state", episodes=11, end="resume")
     story = lines(root)[0]
     assert "the rows of 11 episodes are lost" in story
-    assert "the first 4 episodes, 66 frames are whole" in story
+    assert "the first 4 episodes, 66 frames are intact" in story
     for name in ("data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-001.parquet"):
         assert name in story
         (root / name).unlink()

@@ -101,7 +101,7 @@ def test_study_json_holds_every_round_of_every_run():
 def test_what_is_no_study_is_refused():
     with pytest.raises(UnknownName, match="did you mean 'cloning'"):
         Study(arms(), "clonig", 0.9, Rule())
-    with pytest.raises(ManipError, match="of no run"):
+    with pytest.raises(ManipError, match="belongs to no run"):
         Study((Arm("a", (measured(HARD, 0),)),), "a", 0.9, Rule())
 
 

@@ -194,7 +194,7 @@ def test_a_branch_is_made_and_leaves_main_and_its_tag_alone(hub: Hub, tmp_path: 
     do_pull(tmp_path / "old", f"{DATASET}@{first.token}")
     assert (tmp_path / "trial" / "meta" / "info.json").read_bytes() == (other / "meta" / "info.json").read_bytes()
     assert (tmp_path / "old" / "meta" / "info.json").read_bytes() == (SAMPLE / "meta" / "info.json").read_bytes()
-    with pytest.raises(UsageError, match="no branch"):
+    with pytest.raises(UsageError, match="not a branch"):
         do_push(SAMPLE, f"{DATASET}@v3.0")
 
 
