@@ -174,7 +174,8 @@ ENDLESS = {
 @pytest.mark.parametrize(("script", "says"), ENDLESS.values(), ids=ENDLESS)
 def test_what_has_no_end_ends_in_one_line(script, says, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(hub_client, "LARGEST_ANSWER", 200_000)
-    monkeypatch.setattr(pace, "WINDOW", 0.2)
+    if "a second" in says:  # the others may take as long as a busy machine needs
+        monkeypatch.setattr(pace, "WINDOW", 0.2)
     with a_liar(script) as hub:
         assert says in pulled(hub, tmp_path, monkeypatch, capsys)
 
