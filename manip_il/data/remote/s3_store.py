@@ -91,18 +91,19 @@ class S3Blobs:
                 return None
             condition = {}
 
-        async def put(client: Any) -> Any:
+        async def put(client: Any) -> str | None:
             try:
-                return await client.put_object(
-                    **self._at(MANIFEST_FILE), Body=data, ContentType="application/json", **condition
-                )
+                place = self._at(MANIFEST_FILE)
+                answer = await client.put_object(**place, Body=data, ContentType="application/json", **condition)
             except Exception as error:
                 if _is_refused(error) or (before and code_of(error) == "NoSuchKey"):
                     return None
                 raise
+            if "ETag" not in answer:
+                raise RemoteError(f"{self._name}: the store's answer has no ETag; what it stored cannot be told")
+            return str(answer["ETag"])
 
-        answer = self._run(put, f"write to {self._name}")
-        return None if answer is None else str(answer["ETag"])
+        return self._run(put, f"write to {self._name}")
 
     def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
         """One GET, from `offset` on."""

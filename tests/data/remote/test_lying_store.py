@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import pytest
 
@@ -118,3 +120,15 @@ def test_a_wrong_list_is_one_line(script, says, monkeypatch) -> None:
             S3Blobs(RemoteUrl.parse("s3://bucket/demos")).list()
         assert len(str(caught.value)) < 1000
         assert len(store.asked) <= 20
+
+
+def test_a_store_that_does_not_say_what_it_stored_is_one_line(monkeypatch) -> None:
+    class Client:
+        async def put_object(self, **_: Any) -> dict[str, Any]:
+            return {}
+
+    blobs = S3Blobs(RemoteUrl.parse("s3://bucket/demos"))
+    monkeypatch.setattr(blobs, "_honours", True)  # conditions, as a push has found out by then
+    monkeypatch.setattr(blobs, "_run", lambda work, _: asyncio.run(work(Client())))
+    with pytest.raises(RemoteError, match="answer has no ETag"):
+        blobs.swap(b"{}", None, {})
