@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from manip_il.data.remote.pull import pull
 
 from .trees import content, impatient, make_run, unwatched
 
-KILLS = 10  # in each direction, on each kind of store
+KILLS = int(os.environ.get("MANIP_IL_KILLS", "4"))  # in each direction, on each kind of store
 
 
 class Killer:
