@@ -6,12 +6,17 @@ line comes in, `{"words", "folder", "out", "err"}`, the words those of a shell; 
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
 import json
 import os
 import runpy
 import sys
+import threading
+import traceback
 from importlib.metadata import entry_points
+from typing import NoReturn
 
 LEROBOT = (
     "accelerate",
@@ -20,11 +25,30 @@ LEROBOT = (
     "lerobot.scripts.lerobot_edit_dataset",
     "lerobot.scripts.lerobot_eval",
     "lerobot.scripts.lerobot_train",
+    "torchcodec.decoders",
 )
 
 
+def become(words: list[str], folder: str, out: str, err: str) -> NoReturn:
+    """Run the command and end as Python does, but for taking everything apart, which takes longer than to start."""
+    code = 1
+    try:
+        work(words, folder, out, err)
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+    threading._shutdown()  # pyright: ignore[reportAttributeAccessIssue]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 def work(words: list[str], folder: str, out: str, err: str) -> None:
-    """Become the command."""
     os.chdir(folder)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     for number, path in ((1, out), (2, err)):
@@ -44,11 +68,11 @@ def work(words: list[str], folder: str, out: str, err: str) -> None:
 def main() -> None:
     for name in (*LEROBOT, *sys.argv[1:]):
         importlib.import_module(name)
+    gc.freeze()  # else every fork's first collection copies all that was imported
     for line in sys.stdin:
         pid = os.fork()
         if pid == 0:
-            work(**json.loads(line))  # ends as Python does: with what is to be done at the exit, or a traceback
-            return
+            become(**json.loads(line))
         print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 
 
