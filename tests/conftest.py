@@ -43,7 +43,28 @@ forkserver.set_forkserver_preload(_IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
-_LONG = ("docs/test_commands.py",)
+_LONG = (
+    "docs/test_commands.py",
+    "evaluation/test_certificate.py",
+    "learn/test_fit_policy.py",
+    "data/remote/test_kills.py",
+    "lerobot_commands/test_policies.py",
+    "data/remote/test_round_trip.py",
+    "data/remote/test_hub_programs.py",
+    "data/remote/test_hub_faults.py",
+    "data/test_doctor_lerobot.py",
+    "cli/test_commands.py",
+    "faults/test_kills.py",
+    "faults/test_kills_learning.py",
+    "lerobot_commands/test_datasets.py",
+    "engine/test_cluster.py",
+    "data/remote/test_faults.py",
+    "lerobot_commands/test_pictures.py",
+    "learn/test_plugin.py",
+    "evaluation/test_runner.py",
+    "learn/test_train.py",
+    "data/remote/test_large_files.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
