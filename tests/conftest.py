@@ -22,7 +22,7 @@ settings.load_profile("manip_il")
 # Rollout workers, and commands that are to be killed, are forked from one server a process, and what it imports when it
 # starts decides for all: without this the first test to need it decides, and every later worker that drives a policy
 # imports torch and LeRobot anew, six seconds each.
-_IMPORTED_ONCE = [
+IMPORTED_ONCE = [
     "manip_il.cli.record",
     "manip_il.cli.stages",
     "manip_il.cli.dagger",
@@ -39,11 +39,11 @@ _IMPORTED_ONCE = [
     "lerobot.policies.act.modeling_act",
     "pyarrow.parquet",
 ]
-forkserver.set_forkserver_preload(_IMPORTED_ONCE)
+forkserver.set_forkserver_preload(IMPORTED_ONCE)
 forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
 
 # The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
-_LONG = (
+LONG = (
     "docs/test_commands.py",
     "evaluation/test_certificate.py",
     "learn/test_fit_policy.py",
@@ -70,7 +70,7 @@ _LONG = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files come first, everything else as it was."""
     here = Path(__file__).parent
-    places = {here / name: place for place, name in enumerate(_LONG)}
+    places = {here / name: place for place, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
