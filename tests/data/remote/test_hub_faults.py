@@ -199,7 +199,7 @@ def test_kills_at_random_moments_leave_one_version_and_the_next_try_is_whole(tmp
             took = child.seconds("push", source)
             versions.append(_files(hub))
         push, pull = Kills(child, "push", took), Kills(child, "pull", child.seconds("pull", tmp_path / "first"))
-        for number in range(5 * KILLS):
+        for number in range(30 + 5 * KILLS):
             if min(push.count, pull.count) == KILLS:
                 break
             source, target = sources[number % 2], tmp_path / f"pulled_{number}"
