@@ -34,12 +34,14 @@ demo: setup  ## the whole story, small: runs/quickstart/report.html
 	$(BIN)/manip-il quickstart --output_dir=runs/quickstart $(DEMO)
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
+# A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
+TWO := -n 2 --dist loadfile --no-loadscope-reorder
 test: setup  ## every test
 	@.ci/system browser sshd
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO)
 
 test-fast: setup  ## the tests that take seconds and need no OpenGL
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 -m "not slow and not gl"
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO) -m "not slow and not gl"
 
 FUZZ ?= 20000
 fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line

@@ -1,7 +1,95 @@
 """Settings for every test."""
 
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+
+import pytest
 from hypothesis import HealthCheck, settings
+
+from .faults.child import run_command
+from .warm import Warm
 
 # How long an example takes says something about the machine, nothing about the program.
 settings.register_profile("manip_il", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("manip_il")
+
+# Rollout workers, and commands that are to be killed, are forked from one server a process, and what it imports when it
+# starts decides for all: without this the first test to need it decides, and every later worker that drives a policy
+# imports torch and LeRobot anew, six seconds each.
+IMPORTED_ONCE = [
+    "manip_il.cli.record",
+    "manip_il.cli.stages",
+    "manip_il.cli.dagger",
+    "manip_il.cli.evaluate",
+    "manip_il.cli.shown",
+    "manip_il.cli.study",
+    "manip_il.dagger.loop",
+    "manip_il.dagger.collect",
+    "manip_il.engine.jobs",
+    "manip_il.engine.local",
+    "manip_il.evaluation.eval_report",
+    "manip_il.learn.policy",
+    "manip_il.learn.train",
+    "lerobot.policies.act.modeling_act",
+    "pyarrow.parquet",
+]
+forkserver.set_forkserver_preload(IMPORTED_ONCE)
+forkserver.set_forkserver_preload = lambda modules_names: None  # pyright: ignore[reportAttributeAccessIssue]
+
+# The files that take longest (`pytest --durations=0`), longest first: begun late, one of them is what all wait for.
+LONG = (
+    "docs/test_commands.py",
+    "evaluation/test_certificate.py",
+    "learn/test_fit_policy.py",
+    "data/remote/test_kills.py",
+    "lerobot_commands/test_policies.py",
+    "data/remote/test_round_trip.py",
+    "data/remote/test_hub_programs.py",
+    "data/remote/test_hub_faults.py",
+    "data/test_doctor_lerobot.py",
+    "cli/test_commands.py",
+    "faults/test_kills.py",
+    "faults/test_kills_learning.py",
+    "lerobot_commands/test_datasets.py",
+    "engine/test_cluster.py",
+    "data/remote/test_faults.py",
+    "lerobot_commands/test_pictures.py",
+    "learn/test_plugin.py",
+    "evaluation/test_runner.py",
+    "learn/test_train.py",
+    "data/remote/test_large_files.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files come first, everything else as it was."""
+    here = Path(__file__).parent
+    places = {here / name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., ForkServerProcess]:
+    """Starts a command in a process of its own within milliseconds: what it imports is loaded once."""
+    context = multiprocessing.get_context("forkserver")
+
+    def begin(*words: str, log: Path, warm: bool = False) -> ForkServerProcess:
+        process = context.Process(target=run_command, args=(words, str(log), warm))
+        process.start()
+        return process
+
+    return begin
+
+
+@pytest.fixture(scope="session")
+def warm_lerobot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Warm]:
+    """Runs LeRobot's commands, and scripts that use it, without network and with a home of its own."""
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "SVT_LOG": "1"}
+    with Warm(environment, tmp_path_factory.mktemp("home")) as warm:
+        yield warm

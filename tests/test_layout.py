@@ -6,9 +6,12 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from .conftest import IMPORTED_ONCE, LONG
 
 ROOT = Path(__file__).resolve().parents[1]
 BIN = Path(sys.executable).parent
@@ -117,3 +120,10 @@ def test_the_lock_holds_every_direct_dependency():
 def test_datasets_is_no_package():
     """A package of that name at the root would shadow Hugging Face's `datasets`."""
     assert not (ROOT / "datasets" / "__init__.py").exists()
+
+
+def test_what_the_settings_of_the_tests_name_is_there():
+    """A module or file that was moved would cost time alone, and be missed by nobody."""
+    ours = [name for name in IMPORTED_ONCE if name.startswith("manip_il.")]
+    assert [name for name in ours if find_spec(name) is None] == []
+    assert [name for name in LONG if not (ROOT / "tests" / name).is_file()] == []

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import MISSING
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from manip_il.cli import groups
+from manip_il.cli import groups, story
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
 from manip_il.cli.options import from_yaml, options_of, parse
@@ -67,14 +68,19 @@ def one_error(capsys) -> str:
     return lines[0]
 
 
-def killed(words: list[str], is_time: Path) -> None:
-    """Start a command and kill it, hard, as soon as a file matches `is_time`."""
-    process = subprocess.Popen([sys.executable, "-m", "manip_il.cli.main", *words], stderr=subprocess.DEVNULL)
-    while not list(is_time.parent.glob(is_time.name)):
-        assert process.poll() is None, "it ended before it was killed"
-        time.sleep(0.002)
-    process.kill()
-    process.wait()
+@pytest.fixture
+def killed(start, tmp_path) -> Callable[[list[str], Path], None]:
+    """Starts a command and kills it, hard, as soon as a file matches."""
+
+    def run(words: list[str], is_time: Path) -> None:
+        process = start(*words, log=tmp_path / "log")
+        while not list(is_time.parent.glob(is_time.name)):
+            assert process.is_alive(), "it ended before it was killed"
+            time.sleep(0.002)
+        process.kill()
+        process.join()
+
+    return run
 
 
 def test_option_defaults_are_those_of_the_environment():
@@ -122,7 +128,7 @@ def test_a_recorded_dataset_opens_in_lerobot(demos):
 
 
 @pytest.mark.slow
-def test_a_killed_recording_resumes_to_the_same_bytes(tmp_path):
+def test_a_killed_recording_resumes_to_the_same_bytes(killed, tmp_path):
     killed(record(tmp_path / "cut", 6), tmp_path / "cut.journals" / "episode-*.mcap")
     assert not (tmp_path / "cut").exists()
     assert main(record(tmp_path / "cut", 6, "--resume=true")) == 0
@@ -248,7 +254,7 @@ def metrics(folder: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_a_killed_dagger_run_resumes_to_the_same_metrics(tmp_path, capsys):
+def test_a_killed_dagger_run_resumes_to_the_same_metrics(killed, tmp_path, capsys):
     words = ["dagger", *TINY_DAGGER]
     killed([*words, f"--output_dir={tmp_path / 'cut'}"], tmp_path / "cut" / "metrics.jsonl")
     assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
@@ -268,7 +274,8 @@ def test_a_killed_dagger_run_resumes_to_the_same_metrics(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys):
+def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(story, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
     words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0

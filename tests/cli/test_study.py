@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -201,16 +199,15 @@ def test_the_baseline_is_the_first_arm_unless_named(here):
 
 
 @pytest.mark.slow
-def test_a_killed_study_goes_on_to_the_same_answer(tmp_path, capsys):
+def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys):
     (tmp_path / "x.yaml").write_text(TINY)
     words = ["study", str(tmp_path / "x.yaml"), "--workers=1"]
-    command = [sys.executable, "-m", "manip_il.cli.main", *words, f"--output_dir={tmp_path / 'cut'}"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
     while not (tmp_path / "cut" / "dagger" / "seed_0" / "metrics.jsonl").is_file():
-        assert process.poll() is None, "it ended before it was killed"
+        assert process.is_alive(), "it ended before it was killed"
         time.sleep(0.005)
     process.kill()
-    process.wait()
+    process.join()
     done = (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes()
     assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
     assert (tmp_path / "cut" / "cloning" / "seed_0" / "metrics.jsonl").read_bytes() == done

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.doctor.dataset import Dataset
 from manip_il.data.doctor.repair import repair
 
+from ..warm import Warm
 from .damage import DATA, EPISODES, cut, edit_json, edit_table, findings, lines
 
 pytestmark = pytest.mark.slow
@@ -25,23 +24,27 @@ KINDS = ("state", "video", "image")
 MATRIX = "matrix"
 
 
+Record = Callable[..., None]
+
+
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def record(warm_lerobot: Warm) -> Record:
+    """In a process of its own, which may be killed."""
+
+    def run(root: Path, kind: str, *, episodes: int, end: str = "finalize") -> None:
+        done = warm_lerobot.run("python", HERE / "record_lerobot.py", root, kind, episodes, end)
+        assert done.returncode == (0 if end == "finalize" else -9), done.stderr
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def recorded(record: Record, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One dataset a way of storing cameras, with several tasks, texts, and names in a dictionary; one with a matrix."""
     folder = tmp_path_factory.mktemp("theirs")
     for kind in (*KINDS, MATRIX):
         record(folder / kind, kind, episodes=4)
     return folder
-
-
-def record(root: Path, kind: str, *, episodes: int, end: str = "finalize") -> None:
-    """In a process of its own, which may be killed."""
-    words = [str(root), kind, str(episodes), end]
-    environment = os.environ | {"SVT_LOG": "1"}
-    result = subprocess.run(
-        [sys.executable, str(HERE / "record_lerobot.py"), *words], env=environment, capture_output=True, text=True
-    )
-    assert result.returncode == (0 if end == "finalize" else -9), result.stderr
 
 
 def load(root: Path) -> Any:
@@ -72,7 +75,7 @@ def test_what_lerobots_tools_make_of_it_has_no_errors(recorded: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_recorder_killed_before_finalize_is_told_in_plain_words(tmp_path: Path, kind: str) -> None:
+def test_a_recorder_killed_before_finalize_is_told_in_plain_words(record: Record, tmp_path: Path, kind: str) -> None:
     record(tmp_path / "dead", kind, episodes=12, end="kill")
     found = lines(tmp_path / "dead")
     story = found[0]
@@ -87,18 +90,18 @@ def test_a_recorder_killed_before_finalize_is_told_in_plain_words(tmp_path: Path
     assert any("8 pictures that LeRobot's recorder" in line for line in found) == (kind != "state")
 
 
-def test_a_recorder_killed_before_its_list_of_episodes_was_begun(tmp_path: Path) -> None:
+def test_a_recorder_killed_before_its_list_of_episodes_was_begun(record: Record, tmp_path: Path) -> None:
     record(tmp_path / "dead", "state", episodes=3, end="kill")
     assert "had saved 3 episodes, 48 frames, but the rows of 3 episodes are lost" in lines(tmp_path / "dead")[0]
 
 
-def test_a_recorder_killed_in_its_first_episode(tmp_path: Path) -> None:
+def test_a_recorder_killed_in_its_first_episode(record: Record, tmp_path: Path) -> None:
     record(tmp_path / "dead", "video", episodes=0, end="kill")
     story = lines(tmp_path / "dead")[0]
     assert "a recorder was started here, but no episode was saved; pictures of episode-000000" in story
 
 
-def test_a_killed_recorder_that_had_resumed_a_whole_dataset(recorded: Path, tmp_path: Path) -> None:
+def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record: Record, recorded: Path, tmp_path: Path) -> None:
     """What the advice says makes a dataset of it again."""
     root = tmp_path / "resumed"
     shutil.copytree(recorded / "state", root)

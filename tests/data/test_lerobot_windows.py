@@ -102,7 +102,9 @@ def test_a_loader_with_processes_of_its_own(roots: dict[str, Path], tmp_path: Pa
     import torch
 
     root = roots["video"]
-    loader = torch.utils.data.DataLoader(windows(root), batch_size=8, num_workers=1, multiprocessing_context="spawn")
+    loader = torch.utils.data.DataLoader(
+        windows(root), batch_size=8, num_workers=1, multiprocessing_context="forkserver"
+    )
     pictures = torch.cat([batch[WRIST] for batch in loader])
     np.testing.assert_array_equal(pictures.numpy(), cached(root, tmp_path)[WRIST])
 

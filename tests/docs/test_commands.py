@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,12 +11,14 @@ import boto3
 import pytest
 from huggingface_hub import constants
 
+from manip_il.cli import story
 from manip_il.cli.main import load
 from manip_il.cli.options import parse
 
 from ..data.remote.hub_server import Hub, clean_environment, hub_server
 from ..data.remote.hub_use import TOKEN
 from ..data.remote.s3 import KEY, SECRET, running_moto, variables
+from ..warm import Warm
 from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
 from .sizes import shrink_study
 from .stock import Stock
@@ -52,31 +51,18 @@ def bucket() -> Iterator[dict[str, str]]:
 
 @pytest.fixture(scope="session")
 def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LeRobot]:
-    """Runs one of LeRobot's commands in a folder; the Hub of the tests is the only one that it knows."""
+    """Runs a command of LeRobot's, or a script, in a folder; the Hub of the tests is the only one that it knows."""
     home = tmp_path_factory.mktemp("home")
     clean = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
     clean |= clean_environment(running_hub, home / "hf", TOKEN)
-    clean |= {"HOME": str(home), "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
-    started: list[subprocess.Popen[str]] = []
+    clean |= {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT)}
+    with Warm(clean, home, ["manip_il.lerobot_plugin"]) as warm:
 
-    def run(words: list[str], folder: Path) -> None:
-        if not started:
-            child = [sys.executable, str(Path(__file__).with_name("lerobot_child.py"))]
-            pipe = subprocess.PIPE
-            started.append(subprocess.Popen(child, env=clean, stdin=pipe, stdout=pipe, text=True, cwd=ROOT))
-        (process,) = started
-        assert process.stdin is not None
-        assert process.stdout is not None
-        log = home / "log"
-        print(json.dumps({"words": words, "folder": str(folder), "log": str(log)}), file=process.stdin, flush=True)
-        answer = process.stdout.readline()
-        assert answer == "0\n", f"{words} ended with {answer}{log.read_text(encoding='utf-8')[-4000:]}"
+        def run(words: list[str], folder: Path) -> None:
+            done = warm.run(*words, folder=folder)
+            assert done.returncode == 0, f"{words} ended with {done.returncode}: {(done.stdout + done.stderr)[-4000:]}"
 
-    yield run
-    for process in started:
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait(60)
+        yield run
 
 
 @pytest.fixture
@@ -98,6 +84,7 @@ def workplace(
     for name, value in (servers | {"HF_TOKEN": TOKEN, "HF_ENDPOINT": running_hub.url}).items():
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(story, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the quickstart's time
     monkeypatch.setattr(constants, "ENDPOINT", running_hub.url)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "no_token"))

@@ -108,12 +108,7 @@ class Workplace:
             parse(load(name), own)
 
     def _python(self, line: Line) -> None:
-        script = ROOT / line.words[1]
-        done = subprocess.run(
-            [sys.executable, str(script), *line.words[2:], "--quick"],
-            capture_output=True, text=True, cwd=self.folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, f"{line}: {(done.stdout + done.stderr)[-3000:]}"
+        self.lerobot(["python", str(ROOT / line.words[1]), *line.words[2:], "--quick"], self.folder)
 
     def _mkdir(self, line: Line) -> None:
         subprocess.run(line.words, cwd=self.folder, check=True)

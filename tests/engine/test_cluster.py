@@ -47,7 +47,9 @@ def cluster() -> Iterator[Cluster]:
     """Two nodes of one core each on this machine, whose workers find `kept`."""
     patch = pytest.MonkeyPatch()
     patch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    two = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    quick = {"health_check_initial_delay_ms": 500, "health_check_period_ms": 500}  # a dead node is missed five times
+    head = {"num_cpus": 1, "include_dashboard": False, "_system_config": quick}
+    two = Cluster(initialize_head=True, head_node_args=head)
     two.add_node(num_cpus=1)
     two.wait_for_nodes()
     ray.init(address=two.address, log_to_driver=False, logging_level=logging.ERROR)

@@ -56,11 +56,11 @@ def job_of(policy, **changes) -> RolloutJob:
 def test_outcomes_depend_on_no_batch_and_no_worker(kind, request):
     policy = request.getfixturevalue(kind)
     job = replace(job_of(policy, conditions=ALL), env=replace(ENV, horizon=20))
-    seeds = stream_seeds("test", 52)
+    seeds = stream_seeds("test", 28)
     expected = evaluate(Engine(1), replace(job, batch=1), seeds, "it")
-    assert len({episode.detail["end"]["hand"][0] for episode in expected.episodes}) > 40
+    assert len({episode.detail["end"]["hand"][0] for episode in expected.episodes}) > 20
     with Engine(2) as two:
-        for batch in (8, 50):
+        for batch in (8, 25):
             for engine in (Engine(1), two):
                 assert evaluate(engine, replace(job, batch=batch), seeds, "it") == expected
     backwards = evaluate(Engine(1), job, seeds[::-1], "it")

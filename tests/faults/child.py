@@ -1,4 +1,4 @@
-"""What runs in the children of the fault tests; imported by name there."""
+"""What runs in the children of tests."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from manip_il.engine.jobs import RolloutJob
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
-CUTS = 50
+CUTS = 20
 JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=1)
 SEEDS = stream_seeds("demonstrations", 3)
 

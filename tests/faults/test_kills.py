@@ -19,7 +19,7 @@ from manip_il.data.journal import list_episodes, read_episode
 pytestmark = pytest.mark.slow
 
 EPISODES = 8
-KILLS = int(os.environ.get("MANIP_IL_KILLS", "6"))  # for each number of workers
+KILLS = int(os.environ.get("MANIP_IL_KILLS", "4"))  # for each number of workers
 PATIENCE = 600.0  # for a recorder that is not killed [s]
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from child import living
+
+from .child import living
 
 pytestmark = pytest.mark.slow
 

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -138,9 +136,10 @@ print(*(acts(Path(path)).hex() for path in sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(demos, tmp_path) -> None:
+def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, demos, tmp_path) -> None:
     paths = [fit(demos, tmp_path / settings["type"], settings) for settings in (ACT, DIFFUSION)]
-    done = subprocess.run([sys.executable, "-c", ACTS, *paths], capture_output=True, text=True, check=True)
+    done = warm_lerobot.run("python", "-c", ACTS, *paths)
+    assert done.returncode == 0, done.stderr
     fresh = [bytes.fromhex(word) for word in done.stdout.splitlines()[-1].split()]
     assert fresh == [acts(path) for path in paths]
     # Diffusion draws: in a rollout alone its generator is seeded by the episode.
@@ -380,8 +379,19 @@ def test_a_policy_starts_from_a_checkpoints_weights(demos, tmp_path) -> None:
     assert all(torch.allclose(before[name], after[name], atol=1e-6) for name in before)
 
 
+# `torchrun --standalone --nproc_per_node=2`, with processes that need not import torch again
+LAUNCH = """
+import sys
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+from manip_il.cli.main import main
+place = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0"}
+config = LaunchConfig(min_nodes=1, max_nodes=1, nproc_per_node=2, run_id="two", start_method="fork", **place)
+sys.exit(max(elastic_launch(config, main)(sys.argv[1:]).values()))
+"""
+
+
 @pytest.mark.slow
-def test_two_processes_learn_what_one_learns_from_both_shares(demos, tmp_path) -> None:
+def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, demos, tmp_path) -> None:
     """Every process takes its share of the batch; the gradients are averaged."""
     words = [
         "train",
@@ -394,13 +404,8 @@ def test_two_processes_learn_what_one_learns_from_both_shares(demos, tmp_path) -
     words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
     # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.
     words += ["--policy.use_vae=false", "--policy.dropout=0.0", "--policy.chunk_size=1", "--policy.n_action_steps=1"]
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    launch += ["-m", "manip_il.cli.main", *words]
     two = tmp_path / "two"
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "HF_HOME": str(tmp_path / "hf")}
-    done = subprocess.run(
-        [*launch, "--batch_size=4", f"--output_dir={two}"], env=environment, capture_output=True, text=True
-    )
+    done = warm_lerobot.run("python", "-c", LAUNCH, *words, "--batch_size=4", f"--output_dir={two}")
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("checkpoint:") == 1
     assert done.stderr.count("3/3") == 1
@@ -412,12 +417,10 @@ def test_two_processes_learn_what_one_learns_from_both_shares(demos, tmp_path) -
 
 
 @pytest.mark.slow
-def test_lerobot_train_goes_on_with_our_run(demos, tmp_path) -> None:
+def test_lerobot_train_goes_on_with_our_run(warm_lerobot, demos, tmp_path) -> None:
     path = fit(demos, tmp_path / "r")
-    script = Path(sys.executable).parent / "lerobot-train"
     words = [f"--config_path={path / 'train_config.json'}", "--resume=true", "--steps=6", "--num_workers=0"]
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "HF_HOME": str(tmp_path / "hf")}
-    done = subprocess.run([script, *words], env=environment, capture_output=True, text=True)
+    done = warm_lerobot.run("lerobot-train", *words)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / "r/checkpoints/last").resolve().name == "000006"
     assert LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model").widths["observation.state"] == 8

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +81,7 @@ def test_an_episode_does_not_feel_its_neighbours_nor_when_it_begins(checkpoint):
 
 
 @pytest.mark.slow
-def test_a_fresh_process_acts_bit_equal(spec, tmp_path):
+def test_a_fresh_process_acts_bit_equal(warm_lerobot, spec, tmp_path):
     checkpoint = write_checkpoint(tmp_path / "policy", "diffusion", spec)
     states, environments = observations(3)
     np.savez(tmp_path / "in.npz", states=states, environments=environments)
@@ -93,9 +91,8 @@ def test_a_fresh_process_acts_bit_equal(spec, tmp_path):
         "a = [p.act(s[None], e[None], None, [3])[0] for s, e in zip(z['states'], z['environments'])];"
         "np.save(sys.argv[3], a)"
     )
-    arguments = [str(checkpoint), str(tmp_path / "in.npz"), str(tmp_path / "out.npy")]
-    run = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
-    assert run.stdout == ""
+    run = warm_lerobot.run("python", "-c", code, checkpoint, tmp_path / "in.npz", tmp_path / "out.npy")
+    assert (run.returncode, run.stdout) == (0, ""), run.stderr
     assert np.array_equal(np.load(tmp_path / "out.npy"), actions(LearnedPolicy.load(checkpoint), {3: 0})[3])
 
 

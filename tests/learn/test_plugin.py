@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -84,13 +81,9 @@ def test_features_that_do_not_fit_are_refused(dataset):
 
 
 @pytest.mark.slow
-def test_lerobot_train_gives_a_policy_that_acts_and_resumes(dataset, table, tmp_path):
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-
+def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, dataset, table, tmp_path):
     def lerobot_train(*options: str) -> None:
-        command = [sys.executable, "-m", "lerobot.scripts.lerobot_train", *options]
-        plugin = "--policy.discover_packages_path=manip_il.learn.mlp"
-        run = subprocess.run([*command, plugin], capture_output=True, text=True, env=environment)
+        run = warm_lerobot.run("lerobot-train", *options, "--policy.discover_packages_path=manip_il.learn.mlp")
         assert run.returncode == 0, run.stderr[-3000:]
 
     lerobot_train(

@@ -1,11 +1,8 @@
-"""LeRobot's commands as processes of their own: each takes seconds to start, so tests make much of every run."""
+"""LeRobot's commands as processes of their own, forked from one that has imported LeRobot and nothing of ours."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,21 +20,17 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import CameraConfig
 
-BIN = Path(sys.executable).parent
+from ..warm import Warm
+
 PLUGIN = "manip_il.lerobot_plugin"
 
 
 @pytest.fixture(scope="session")
-def command(tmp_path_factory) -> Callable[..., str]:
-    """Runs a command as a user would, without network and with a home of its own; returns what it said."""
-    home = tmp_path_factory.mktemp("home")
-    folders = {"HOME": home, "HF_HOME": home / "hf", "HF_LEROBOT_HOME": home / "hf/lerobot"}
-    settings = {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-    environment = os.environ | {name: str(path) for name, path in folders.items()} | settings
+def command(warm_lerobot: Warm) -> Callable[..., str]:
+    """Runs a command as a user would; returns what it said."""
 
     def run(name: str, *words: object, code: int = 0) -> str:
-        line = [str(word) for word in (BIN / name, *words)]
-        done = subprocess.run(line, capture_output=True, text=True, env=environment, cwd=home, check=False)
+        done = warm_lerobot.run(name, *words)
         said = done.stdout + done.stderr
         assert done.returncode == code, said[-4000:]
         return said

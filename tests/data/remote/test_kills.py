@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from manip_il.data.remote.pull import pull
 
 from .trees import content, impatient, make_run, unwatched
 
-KILLS = 10  # in each direction, on each kind of store
+KILLS = int(os.environ.get("MANIP_IL_KILLS", "4"))  # in each direction, on each kind of store
 
 
 class Killer:
@@ -49,7 +50,7 @@ def test_pushes(place: str, killer: Killer, tmp_path: Path) -> None:
     assert killer("push", place, runs[0])["ended"] == 0
     usual = killer("push", place, runs[1])["seconds"]
     rng, killed, now, read = np.random.default_rng(7), 0, 1, Reader(place)
-    for number in range(5 * KILLS):
+    for number in range(30 + 5 * KILLS):
         if killed == KILLS:
             break
         new = (now + 1) % 3
@@ -68,7 +69,7 @@ def test_pulls(place: str, killer: Killer, tmp_path: Path) -> None:
     assert killer("push", place, run)["ended"] == 0
     usual = killer("pull", place, tmp_path / "first")["seconds"]
     rng, killed = np.random.default_rng(8), 0
-    for number in range(5 * KILLS):
+    for number in range(30 + 5 * KILLS):
         if killed == KILLS:
             break
         target = tmp_path / f"got{number}"

@@ -19,6 +19,7 @@ from manip_il.data.remote.retry import Retry
 
 from .hub_use import DATASET, TOKEN
 from .liar import Liar, a_liar, answer, head
+from .trees import wait_little
 
 COMMIT = "c" * 40
 INFO = {"_id": "0", "id": "user/demos", "sha": COMMIT, "private": False, "tags": [], "siblings": []}
@@ -27,8 +28,7 @@ FILE = {"type": "file", "path": "README.md", "oid": hashlib.sha1(b"blob 3\0abc")
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(Retry, "first", 0.01)
-    monkeypatch.setattr(Retry, "tries", 2)
+    wait_little(monkeypatch, tries=2)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
     monkeypatch.setenv("HF_TOKEN", TOKEN)

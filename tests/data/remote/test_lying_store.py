@@ -14,11 +14,11 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.data.remote import pace, s3_session
 from manip_il.data.remote.errors import RemoteError
-from manip_il.data.remote.retry import Retry
 from manip_il.data.remote.s3_store import S3Blobs
 from manip_il.data.remote.url import RemoteUrl
 
 from .liar import Liar, a_liar, answer, head
+from .trees import wait_little
 
 TOKEN = "TheTokenOfASessionIsASecretToo"
 KEY = "0" * 64
@@ -26,8 +26,7 @@ KEY = "0" * 64
 
 @pytest.fixture(autouse=True)
 def _somebody(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Retry, "first", 0.01)
-    monkeypatch.setattr(Retry, "tries", 2)
+    wait_little(monkeypatch, tries=2)
     given = {"ACCESS_KEY_ID": "somebody", "SECRET_ACCESS_KEY": "a-secret-access-key", "SESSION_TOKEN": TOKEN}
     for name, value in (given | {"DEFAULT_REGION": "us-east-1"}).items():
         monkeypatch.setenv(f"AWS_{name}", value)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from huggingface_hub.utils import _http as hub_http
 
 from manip_il.data.remote.object_store import ObjectRemote
 from manip_il.data.remote.retry import Retry
@@ -66,6 +70,17 @@ def impatient(url: str, waits: list[float] | None = None) -> tuple[RemoteUrl, Ob
     assert isinstance(remote, ObjectRemote)
     remote.retry = no_wait(waits)
     return parsed, remote
+
+
+def wait_little(patch: pytest.MonkeyPatch, tries: int = 6) -> None:
+    """Every `Retry` that the program makes, and huggingface_hub's own tries, follow each other almost at once.
+
+    A dataclass keeps its defaults in its constructor: to set them on the class would change nothing.
+    """
+    usual = Retry.__init__.__defaults__
+    assert usual is not None
+    patch.setattr(Retry.__init__, "__defaults__", (tries, 0.01, *usual[2:]))
+    patch.setattr(hub_http, "time", SimpleNamespace(sleep=lambda seconds: time.sleep(min(seconds, 0.01))))
 
 
 def no_wait(waits: list[float] | None = None) -> Retry:
