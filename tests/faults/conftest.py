@@ -18,11 +18,11 @@ _PRELOAD = [
     "manip_il.cli.dagger",
     "manip_il.cli.evaluate",
     "manip_il.cli.shown",
-    "manip_il.dagger.loop",
+    "manip_il.algorithms.run",
     "manip_il.evaluation.eval_report",
     "manip_il.learn.policy",
     "manip_il.learn.train",
-    "manip_il.dagger.collect",
+    "manip_il.recording",
     "manip_il.engine.local",
     "pyarrow.parquet",
 ]
