@@ -17,9 +17,10 @@ from pathlib import Path
 
 from _machine import describe_machine
 
-from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.loop import RoundResult, run_dagger
-from manip_il.dagger.rounds import DATASET, round_folder
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.rounds import RoundResult
+from manip_il.algorithms.run import DATASET, round_folder
+from manip_il.algorithms.table import run_algorithm
 from manip_il.data.lerobot_io import read_table
 from manip_il.engine.engine import Engine, default_workers
 from manip_il.expert.expert import Expert
@@ -36,7 +37,7 @@ def main() -> int:
     parser.add_argument("--validation", type=int, default=200, help="episodes")
     parser.add_argument("--quick", action="store_true", help="one tiny round: shows that it runs, measures nothing")
     options = parser.parse_args()
-    config = DaggerConfig(
+    config = RunConfig(
         demonstrations=4 if options.quick else 50,
         rounds=1 if options.quick else 3,
         episodes_per_round=4 if options.quick else 50,
@@ -49,12 +50,12 @@ def main() -> int:
     workers = default_workers()
     print(describe_machine())
     with tempfile.TemporaryDirectory() as name, Engine(workers) as engine:
-        for result in run_dagger(config, Path(name), engine):
+        for result in run_algorithm(config, Path(name), engine):
             report(result, Path(name), config, workers)
     return 0
 
 
-def report(result: RoundResult, folder: Path, config: DaggerConfig, workers: int) -> None:
+def report(result: RoundResult, folder: Path, config: RunConfig, workers: int) -> None:
     """One line a round."""
     whole = sum(result.seconds.values())
     stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in result.seconds.items())
@@ -65,7 +66,7 @@ def report(result: RoundResult, folder: Path, config: DaggerConfig, workers: int
     print(f"{line}; success {result.validation.success}", flush=True)
 
 
-def seconds_to_label(root: Path, config: DaggerConfig) -> float:
+def seconds_to_label(root: Path, config: RunConfig) -> float:
     """What one core takes to ask the expert in every state of a dataset."""
     expert = Expert(build_scene(config.env.robot, config.env.task))
     states = [State.from_vector(vector) for vector in read_table(root, ("sim_state",))["sim_state"]]

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 import manip_il.engine.jobs as jobs
 import manip_il.expert.expert as expert
 import manip_il.learn.train as train
-from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.loop import run_dagger
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.table import run_algorithm
 from manip_il.engine.engine import Engine
 from manip_il.expert.ik import ArmIK
 from manip_il.learn.fit_config import FitConfig
@@ -94,7 +94,7 @@ def main() -> int:
 
 def validation(seed: int, rounds: int, quick: bool) -> list[float]:
     """Validation success of every round of one run."""
-    config = DaggerConfig(
+    config = RunConfig(
         demonstrations=4 if quick else 50,
         rounds=1 if quick else rounds,
         episodes_per_round=2 if quick else 50,
@@ -104,7 +104,7 @@ def validation(seed: int, rounds: int, quick: bool) -> list[float]:
     )
     # In this process alone: what is patched here is not patched in others.
     with tempfile.TemporaryDirectory() as folder, Engine(1) as engine:
-        return [result.validation.success.rate for result in run_dagger(config, Path(folder), engine)]
+        return [result.validation.success.rate for result in run_algorithm(config, Path(folder), engine)]
 
 
 def fall(rates: list[float]) -> float:

@@ -69,7 +69,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
     """Control steps a second on one core, ours and raw, over the same episodes."""
-    job = RolloutJob(EnvConfig(robot, TASK), "policy", policy=policy, labels="last")
+    job = RolloutJob(EnvConfig(robot, TASK), "policy", policy=policy, label="last")
     started = time.perf_counter()
     found = list(run_job(job, stream_seeds("test", episodes)))
     ours = time.perf_counter() - started

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from _machine import describe_machine
 
-from manip_il.dagger.collect import collect, provenance, record
 from manip_il.data.build import Recording
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
+from manip_il.recording import collect, provenance, record
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 

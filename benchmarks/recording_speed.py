@@ -27,12 +27,12 @@ from _machine import describe_machine
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
 
-from manip_il.dagger.collect import collect, provenance
 from manip_il.data.build import Builder, Recording
 from manip_il.data.journal import list_episodes, read_episode
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
+from manip_il.recording import collect, provenance
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from _machine import describe_machine
 
-from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.loop import run_dagger
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.table import run_algorithm
 from manip_il.engine.engine import Engine, default_workers
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.env import EnvConfig
@@ -31,7 +31,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=6)
     parser.add_argument("--quick", action="store_true", help="one small round: shows that it runs, measures nothing")
     options = parser.parse_args()
-    config = DaggerConfig(
+    config = RunConfig(
         env=EnvConfig("fetch", "pick_place", tolerance=0.05),
         demonstrations=4 if options.quick else 100,
         rounds=1 if options.quick else options.rounds,
@@ -44,7 +44,7 @@ def main() -> int:
     print("round  labels  success (200 validation seeds)  seconds without evaluation")
     started, evaluation = time.monotonic(), 0.0
     with tempfile.TemporaryDirectory() as folder, Engine(default_workers()) as engine:
-        for result in run_dagger(config, Path(folder), engine):
+        for result in run_algorithm(config, Path(folder), engine):
             evaluation += result.seconds["validate"]
             spent = time.monotonic() - started - evaluation
             print(f"{result.round:5d}  {result.labels:6d}  {result.validation.success!s:30s}  {spent:6.1f}", flush=True)

@@ -98,15 +98,15 @@ class Turn:
 
 @dataclass(frozen=True)
 class Rules:
-    """How long an episode runs and when the expert is asked.
+    """How long an episode runs and when the expert is queried.
 
     horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
-    labels: asked for in every state, in the last one only, or only where the driver asks.
+    query: in every state, in the last one only, or only where the driver asks.
     """
 
     horizon: int
     hold: int | None = None
-    labels: Literal["all", "last", "driver"] = "all"
+    query: Literal["every", "last", "driver"] = "every"
 
 
 @dataclass(slots=True)
@@ -165,7 +165,7 @@ def _look(slot: _Slot, rules: Rules, labeller: Labeller | None) -> None:
         slot.intruder.before(slot.step)
     slot.turn = Turn(slot.seed, slot.step, slot.env.observe(), slot.env.get_state(), labeller)
     last = slot.step == rules.horizon - 1
-    if labeller is not None and (rules.labels == "all" or (rules.labels == "last" and last)):
+    if labeller is not None and (rules.query == "every" or (rules.query == "last" and last)):
         slot.turn.ask()
 
 

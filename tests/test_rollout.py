@@ -145,10 +145,10 @@ def test_an_episode_goes_on_to_its_end_where_success_is_lost_again():
     assert [frame.success for frame in frames] == [False, False, True, True, False, False]
 
 
-@pytest.mark.parametrize(("labels", "asked"), [("all", [0, 1, 2, 3]), ("last", [3]), ("driver", [])])
-def test_the_expert_is_asked_where_the_rules_say(labels, asked: list[int]):
+@pytest.mark.parametrize(("query", "asked"), [("every", [0, 1, 2, 3]), ("last", [3]), ("driver", [])])
+def test_the_expert_is_asked_where_the_rules_say(query, asked: list[int]):
     expert = Ones()
-    frames = episodes(rollout([Counter()], [0], Halves(), Rules(4, labels=labels), expert))[0]
+    frames = episodes(rollout([Counter()], [0], Halves(), Rules(4, query=query), expert))[0]
     assert expert.asked == asked
     assert [frame.step for frame in frames if frame.label is not None] == asked
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
+from manip_il.algorithms.table import ALGORITHMS, Method, run_algorithm
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
 from manip_il.cli.groups import (
     ENGINE_HELP,
@@ -31,14 +32,14 @@ from manip_il.cli.progress import say
 from manip_il.learn.fit_config import BATCH_SIZE, MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, FitConfig
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.config import RunConfig
+    from manip_il.algorithms.rounds import RoundResult
     from manip_il.cli.stages import Stages
-    from manip_il.dagger.config import DaggerConfig
-    from manip_il.dagger.loop import RoundResult
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report_data import LearningCurve, Report
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
-METHOD_NAMES = {"dagger": "DAgger", "cloning": "Cloning", "dart": "DART"}
+METHOD_HELP = f"who drives after round 0: {', '.join(one.who for one in ALGORITHMS.values())}"
 FREE = ("workers", "engine", "output_dir", "trust")
 
 
@@ -64,10 +65,7 @@ class DaggerOptions:
     robot: RobotGroup = field(default_factory=RobotGroup)
     task: TaskGroup = field(default_factory=TaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
-    method: Literal["dagger", "cloning", "dart"] = option(
-        "dagger",
-        "who drives after round 0: the learner, the expert, or the expert with noise like the learner's errors",
-    )
+    method: Method = field(default="dagger", metadata={"help": METHOD_HELP})
     demonstrations: int = option(50, "successful expert episodes of round 0")
     rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more")
     episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
@@ -80,13 +78,13 @@ class DaggerOptions:
         "per_state",
         "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
-    ask: str | None = option(
+    query: str | None = option(
         None,
         "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
     branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
-    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --ask=ensemble:BOUND")
+    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND")
     sampling: SamplingGroup = field(default_factory=SamplingGroup)
     policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
     observation: Literal["state", "images", "both"] | None = option(
@@ -125,7 +123,7 @@ class DaggerOptions:
         with exclusive(self.output_dir):
             self._run(config)
 
-    def _run(self, config: DaggerConfig) -> None:
+    def _run(self, config: RunConfig) -> None:
         prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
             check_same_options(self.output_dir, self, FREE, may_grow="rounds")
@@ -145,28 +143,32 @@ class DaggerOptions:
         say(f"report: {self.output_dir / REPORT_FILE}")
         say(f"next: manip-il eval --policy.path={best} --output_dir={self.output_dir}/test")
 
-    def config(self) -> DaggerConfig:
-        """What `run_dagger` takes. Raises `UsageError` for what does not go together."""
+    def config(self) -> RunConfig:
+        """What `run_algorithm` takes. Raises `UsageError` for what does not go together."""
         config = self._draft()
-        from manip_il.dagger.fitting import check_fit, check_labels
+        from manip_il.algorithms.config import check_labels
 
-        check_fit(config)
         check_labels(config)
         return config
 
-    def _draft(self) -> DaggerConfig:
+    def _draft(self) -> RunConfig:
         """The same, before the policy's own configuration has been made, which takes seconds to import."""
         env = self.env.config(self.robot.type, self.task.type)
         cameras = self.image.config(self.cameras)
-        from manip_il.dagger.config import DaggerConfig, check_sight
-        from manip_il.dagger.sampling import Sampling
+        from manip_il.algorithms.beta import BetaSchedule
+        from manip_il.algorithms.config import RunConfig, check_sight
+        from manip_il.algorithms.sampling import Sampling
+        from manip_il.engine.query import QueryRule
 
-        own = {one.name for one in fields(DaggerConfig)} - {"env", "fit", "sampling", "cameras"}
-        config = DaggerConfig(
+        made = {"env", "fit", "sampling", "cameras", "beta", "query_rule"}
+        own = {one.name for one in fields(RunConfig)} - made
+        config = RunConfig(
             env=env,
             fit=self._fit(),
             sampling=Sampling(**to_plain(self.sampling)),
             cameras=cameras,
+            beta=BetaSchedule.parse(self.beta),
+            query_rule=None if self.query is None else QueryRule.parse(self.query),
             **{name: getattr(self, name) for name in own},
         )
         check_sight(config)
@@ -182,15 +184,14 @@ class DaggerOptions:
         return policy_help(words)
 
 
-def run_rounds(config: DaggerConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
+def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
-    from manip_il.dagger.loop import run_dagger
     from manip_il.engine.describe import env_fingerprint
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     atomic_write(folder / FINGERPRINT_FILE, json.dumps(fingerprint, indent=1) + "\n")
     results: list[RoundResult] = []
-    for result in run_dagger(config, folder, engine, stages.watch()):
+    for result in run_algorithm(config, folder, engine, stages.watch()):
         stages.close()
         _add_metrics(folder / METRICS_FILE, result)
         results.append(result)
@@ -213,13 +214,13 @@ def _line(result: RoundResult) -> str:
     )
 
 
-def _report(options: DaggerOptions, config: DaggerConfig, results: list[RoundResult]) -> Report:
-    from manip_il.dagger.loop import best_round
+def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> Report:
+    from manip_il.algorithms.rounds import best_round
     from manip_il.evaluation.report_data import PolicyRow, Report
     from manip_il.evaluation.results import compare_results
 
     best = best_round(results)
-    kind = METHOD_NAMES[config.method]
+    kind = ALGORITHMS[config.method].title
     names = ["cloning (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
     rows = [
         PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
@@ -247,7 +248,7 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
     Where round 0 is the best itself, the last round takes its place. names: of the rounds.
     """
-    from manip_il.dagger.loop import best_round
+    from manip_il.algorithms.rounds import best_round
     from manip_il.evaluation.results import compare_results
 
     best = best_round(list(results))

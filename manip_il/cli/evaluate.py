@@ -163,7 +163,7 @@ class EvalOptions:
             if cameras is not None:
                 say(looks(cameras, path))
         conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
-        job = RolloutJob(env, driver or "random", policy=path, labels="last", conditions=conditions)
+        job = RolloutJob(env, driver or "random", policy=path, label="last", conditions=conditions)
         return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:

@@ -53,7 +53,7 @@ class Trial:
         from manip_il.engine.jobs import RolloutJob
         from manip_il.evaluation.runner import HOLD
 
-        job = RolloutJob(self.env, "policy", policy=policy, hold=HOLD, labels="last", conditions=self.conditions)
+        job = RolloutJob(self.env, "policy", policy=policy, hold=HOLD, label="last", conditions=self.conditions)
         return replace(job, trust=self.trust)
 
     def file(self, folder: Path, policy: Path) -> Path:

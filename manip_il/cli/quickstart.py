@@ -32,10 +32,10 @@ from manip_il.cli.progress import say
 from manip_il.errors import UsageError
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.config import RunConfig
+    from manip_il.algorithms.rounds import RoundResult
     from manip_il.cli.stages import Stages
     from manip_il.cli.story import Contestant, Pictures
-    from manip_il.dagger.config import DaggerConfig
-    from manip_il.dagger.loop import RoundResult
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report_data import PolicyRow, Report
     from manip_il.evaluation.results import EvalResult
@@ -93,7 +93,7 @@ class QuickstartOptions:
         with exclusive(self.output_dir):
             self._run(config, started)
 
-    def _run(self, config: DaggerConfig, started: float) -> None:
+    def _run(self, config: RunConfig, started: float) -> None:
         prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
             check_same_options(self.output_dir, self, FREE)
@@ -119,7 +119,7 @@ class QuickstartOptions:
 class _Story:
     """One run of the quickstart, chapter by chapter."""
 
-    def __init__(self, options: QuickstartOptions, config: DaggerConfig, engine: Engine, stages: Stages) -> None:
+    def __init__(self, options: QuickstartOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
         self.folder = options.output_dir
         path = self.folder / TIMINGS_FILE
@@ -151,9 +151,9 @@ class _Story:
         self._close(dagger)
 
     def _contestants(self, results: list[RoundResult]) -> tuple[Contestant, ...]:
+        from manip_il.algorithms.rounds import best_round
+        from manip_il.algorithms.run import round_folder
         from manip_il.cli.story import Contestant, clone_with_labels
-        from manip_il.dagger.loop import best_round
-        from manip_il.dagger.rounds import round_folder
 
         first, best = results[0], best_round(results)
         round_0 = round_folder(self.folder / "dagger", 0)

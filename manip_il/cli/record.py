@@ -134,9 +134,9 @@ class RecordOptions:
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
         from manip_il.cli.stages import Stages
-        from manip_il.dagger.collect import MAX_TRIES, check_journals, collect_successes, provenance, record
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
+        from manip_il.recording import MAX_TRIES, check_journals, collect_successes, provenance, record
         from manip_il.seeding import stream_seeds
 
         count = self.dataset.num_episodes

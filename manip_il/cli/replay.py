@@ -88,13 +88,13 @@ class ReplayOptions:
         conditions, hold = result.settings.conditions, result.settings.hold
         if result.policy in NO_FILES and not result.policy_sha256 and self.policy.path is None:
             cameras = None
-            job = RolloutJob(env, result.policy, hold=hold, labels="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
+            job = RolloutJob(env, result.policy, hold=hold, label="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
         else:
             path = self._find(result)
             cameras = check_policy(path, read_meta(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn([f"{path} is not the policy of {self.file}: its files differ"])
-            job = RolloutJob(env, "policy", policy=path, hold=hold, labels="last", conditions=conditions)
+            job = RolloutJob(env, "policy", policy=path, hold=hold, label="last", conditions=conditions)
             job = replace(job, trust=self.trust)
         here = env_fingerprint(env, cameras)
         warn(compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))

@@ -14,7 +14,7 @@ from manip_il.cli.groups import save_options
 ROUND_0 = "round_000"
 # What round 0 does not depend on, which is demonstrations and the first fit
 _LATER = (
-    *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "ask", "branch_steps"),
+    *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "query", "branch_steps"),
     *("refit", "refit_steps", "output_dir", "resume", "overwrite", "workers", "engine"),
 )
 

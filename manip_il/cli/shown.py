@@ -38,7 +38,7 @@ def show(job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages, co
     if not seeds:
         return Shown()
     stages.start("films", len(seeds))
-    episodes = {episode.seed: episode for episode in engine.run(replace(job, labels="last"), seeds)}
+    episodes = {episode.seed: episode for episode in engine.run(replace(job, label="last"), seeds)}
     try:
         films: list[Film] = []
         for seed in seeds:
@@ -81,7 +81,8 @@ def caption(job: RolloutJob, episode: Episode) -> str:
 
 def run_curve(policy: Path | None) -> LearningCurve | None:
     """The learning curve of the DAgger run that a policy lies in; None where it lies in none."""
-    from manip_il.cli.dagger import METHOD_NAMES, METRICS_FILE, DaggerOptions, learning_curve
+    from manip_il.algorithms.table import ALGORITHMS
+    from manip_il.cli.dagger import METRICS_FILE, DaggerOptions, learning_curve
     from manip_il.cli.groups import CONFIG_FILE
     from manip_il.cli.options import from_yaml
 
@@ -89,7 +90,7 @@ def run_curve(policy: Path | None) -> LearningCurve | None:
     for folder in places:
         if (folder / METRICS_FILE).is_file():
             try:
-                return learning_curve(folder, METHOD_NAMES[from_yaml(folder / CONFIG_FILE, DaggerOptions).method])
+                return learning_curve(folder, ALGORITHMS[from_yaml(folder / CONFIG_FILE, DaggerOptions).method].title)
             except (ManipError, KeyError):  # of another command, which counts no labels
                 return None
     return None

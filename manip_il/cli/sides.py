@@ -153,7 +153,7 @@ def run_history(folder: Path) -> History:
 
 def round_policy(folder: Path, round_: int) -> Path:
     """The `pretrained_model` folder of a run's round."""
-    from manip_il.dagger.rounds import round_folder
+    from manip_il.algorithms.run import round_folder
 
     return find_policy(round_folder(folder, round_) / "policy")
 

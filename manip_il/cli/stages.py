@@ -11,7 +11,7 @@ from manip_il.cli.progress import Progress, progress
 from manip_il.errors import ManipError, UsageError
 
 if TYPE_CHECKING:
-    from manip_il.dagger.loop import Watch
+    from manip_il.algorithms.run import Watch
 
 
 class Ended(Protocol):
@@ -90,8 +90,8 @@ class Stages:
             raise Interrupted(self.kept)
 
     def watch(self) -> Watch:
-        """What `run_dagger` reports to."""
-        from manip_il.dagger.loop import Watch
+        """What a run reports to."""
+        from manip_il.algorithms.run import Watch
 
         return Watch(
             on_stage=lambda stage, round_, total: self.start(f"round {round_}, {stage}", total),

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from manip_il.algorithms.fitting import fit_table, round_fit
 from manip_il.cli.suites import suite_conditions
-from manip_il.dagger.collect import MAX_TRIES, collect_successes, provenance, record
-from manip_il.dagger.fitting import LEARNING_COLUMNS, fit_table, round_fit
 from manip_il.data import schema
 from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
@@ -25,11 +24,13 @@ from manip_il.evaluation.film import film, make_film, paths, run_states, strip
 from manip_il.evaluation.report_data import Film, Kind, Paths, Strip
 from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.learn.columns import LEARNING_COLUMNS
+from manip_il.recording import MAX_TRIES, collect_successes, provenance, record
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.config import RunConfig
     from manip_il.cli.stages import Stages
-    from manip_il.dagger.config import DaggerConfig
     from manip_il.engine.engine import Engine
     from manip_il.mdp import Episode
     from manip_il.sim.env import EnvConfig
@@ -52,11 +53,11 @@ class Contestant:
         """Its rollouts."""
         driver: Literal["expert", "policy"] = "expert" if self.policy is None else "policy"
         conditions = suite_conditions(suite, env.task, sees=False)
-        return RolloutJob(env, driver, policy=self.policy, hold=HOLD, labels="last", conditions=conditions)
+        return RolloutJob(env, driver, policy=self.policy, hold=HOLD, label="last", conditions=conditions)
 
 
 def clone_with_labels(
-    config: DaggerConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages
+    config: RunConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages
 ) -> tuple[Path, int]:
     """Fit a policy as every round's is fitted, to `labels` labels of demonstrations alone.
 
@@ -147,9 +148,7 @@ def _caption(episode: Episode) -> str:
     return f"{'success' if episode.success else 'failure'}, seed {episode.seed}"
 
 
-def _demonstrate(
-    config: DaggerConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages
-) -> None:
+def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages) -> None:
     """Record until the demonstrations hold `labels` frames; those of round 0 count."""
     journals = folder / "journals"
     journals.mkdir(parents=True, exist_ok=True)

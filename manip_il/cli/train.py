@@ -140,8 +140,8 @@ class TrainOptions:
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
 
     def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
-        from manip_il.dagger.fitting import LEARNING_COLUMNS
         from manip_il.data.lerobot_io import read_table
+        from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
         table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))

@@ -14,7 +14,7 @@ class Brancher:
     """Runs the expert for `steps` control steps from any state of one scene."""
 
     def __init__(self, env: ManipEnv, expert: Labeller, steps: int):
-        self._env, self._expert, self._rules = env, expert, Rules(steps, labels="all")
+        self._env, self._expert, self._rules = env, expert, Rules(steps)
 
     def from_labelled(self, frames: Iterable[Transition]) -> Iterator[Transition]:
         """The branches of all frames that have a sound label, one after the other; each ends with `done`."""

@@ -1,4 +1,4 @@
-"""Who drives a rollout job, and who decides when the expert is asked."""
+"""Who drives a rollout job, and who decides when the expert is queried."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from manip_il.engine.ask import AtDrawnStep, ByChance, Everywhere, Gate, WhereDisputed, WhereUnsafe, WhereUnsure
+from manip_il.engine import query
 from manip_il.engine.describe import env_spec
 from manip_il.engine.drivers import (
-    AskingDriver,
     ExpertDriver,
     LearnerDriver,
     MixtureDriver,
     NoisyExpertDriver,
+    QueryingDriver,
     RandomDriver,
     TakeoverDriver,
 )
@@ -41,10 +41,10 @@ def choose_driver(job: RolloutJob, env: ManipEnv) -> Driver:
     assert job.policy is not None
     policy = _load(job, job.policy, env)
     driver = LearnerDriver(policy) if job.driver == "policy" else MixtureDriver(policy, job.beta)
-    if job.labels == "takeover":
+    if job.label == "takeover":
         return TakeoverDriver(driver, _gate(job, policy, env))
-    by_rules = job.ask.kind == "one" or (job.labels == "per_state" and job.ask.kind == "every")
-    return driver if job.labels == "last" or by_rules else AskingDriver(driver, _gate(job, policy, env))
+    by_rules = job.query.kind == "one" or (job.label == "per_state" and job.query.kind == "every")
+    return driver if job.label == "last" or by_rules else QueryingDriver(driver, _gate(job, policy, env))
 
 
 def step_scale(robot: Robot) -> np.ndarray:
@@ -54,20 +54,20 @@ def step_scale(robot: Robot) -> np.ndarray:
     return scale
 
 
-def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> Gate:
-    kind, bound, scale = job.ask.kind, job.ask.bound, step_scale(env.scene.robot)
+def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> query.Gate:
+    kind, bound, scale = job.query.kind, job.query.bound, step_scale(env.scene.robot)
     if kind == "one":
-        return AtDrawnStep(job.env.horizon)
+        return query.at_drawn_step(job.env.horizon)
     if kind == "probability":
-        return ByChance(bound)
+        return query.by_chance(bound)
     if kind == "safety":
-        return WhereUnsafe(bound, scale)
+        return query.where_unsafe(bound, scale)
     if kind == "ensemble":
-        return WhereDisputed(bound, [_load(job, path, env) for path in job.ensemble], policy.cameras, scale)
+        return query.where_disputed(bound, [_load(job, path, env) for path in job.ensemble], policy.cameras, scale)
     if kind == "likelihood":
         policy.require_likelihood()
-        return WhereUnsure(bound, policy)
-    return Everywhere()
+        return query.where_unsure(bound, policy)
+    return query.everywhere
 
 
 def _load(job: RolloutJob, path: Path, env: ManipEnv) -> LearnedPolicy:

@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.engine.ask import Gate, seen
+from manip_il.engine.query import Gate, seen
 from manip_il.mdp import Actor
+from manip_il.policy import Policy
 from manip_il.rollout import Driver, Turn
 from manip_il.seeding import rng_for
 
 F64 = NDArray[np.float64]
-
-
-class Policy(Protocol):
-    """A learner: (B, n) joint states, (B, k) environment states and pictures to (B, n) absolute actions."""
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """Whose pictures it looks at."""
-        ...
-
-    def act(
-        self,
-        states: NDArray[np.float32],
-        environment_states: NDArray[np.float32],
-        images: Mapping[str, NDArray[np.uint8]],
-        episodes: Sequence[int],
-    ) -> F64:
-        """One action a row. images: camera -> (B, H, W, 3); episodes: whose row each is."""
-        ...
-
-    def reset(self, episodes: Sequence[int]) -> None:
-        """Forget the past of episodes that begin."""
-        ...
 
 
 class ExpertDriver:
@@ -94,7 +71,7 @@ class MixtureDriver:
         return chosen
 
 
-class AskingDriver:
+class QueryingDriver:
     """Another driver, and a label where its gate wants one."""
 
     def __init__(self, driver: Driver, gate: Gate):
@@ -103,7 +80,7 @@ class AskingDriver:
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
         """What the other driver does."""
         chosen = self._driver.act(turns)
-        for turn, wanted in zip(turns, self._gate.wants(turns, [action for action, _ in chosen]), strict=True):
+        for turn, wanted in zip(turns, self._gate(turns, [action for action, _ in chosen]), strict=True):
             if wanted:
                 turn.ask()
         return chosen
@@ -120,7 +97,7 @@ class TakeoverDriver:
         """The learner's action, or the expert's in episodes that it has taken over."""
         rolling = [turn for turn in turns if turn.seed not in self._taken]
         chosen = dict(zip([turn.seed for turn in rolling], self._learner.act(rolling), strict=True)) if rolling else {}
-        wanted = self._gate.wants(rolling, [chosen[turn.seed][0] for turn in rolling]) if rolling else []
+        wanted = self._gate(rolling, [chosen[turn.seed][0] for turn in rolling]) if rolling else []
         self._taken.update(turn.seed for turn, wants in zip(rolling, wanted, strict=True) if wants)
         return [(turn.ask().action, Actor.EXPERT) if turn.seed in self._taken else chosen[turn.seed] for turn in turns]
 

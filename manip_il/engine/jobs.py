@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Literal, cast
 
 from manip_il.data.episodes import group_rollouts, to_episode
-from manip_il.engine.ask import Ask, drawn_step
 from manip_il.engine.branches import Brancher
 from manip_il.engine.choose import choose_driver
+from manip_il.engine.query import LabelMode, QueryRule, drawn_step
 from manip_il.engine.sight import drawn_cameras
 from manip_il.errors import UsageError
 from manip_il.expert.expert import Expert
@@ -25,7 +25,6 @@ from manip_il.sim.perturb import Perturbation, Perturber
 from manip_il.sim.scene import build_scene
 from manip_il.sim.varied import VariedEnv
 
-Labels = Literal["per_state", "takeover", "branch", "last"]
 LOCKSTEP = 25  # environments that share one call of the policy
 OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 26 MB for the Panda
 
@@ -35,11 +34,11 @@ class RolloutJob:
     """Who drives in which environment, for how long, and what is kept.
 
     policy: a checkpoint's `pretrained_model` folder, needed where a learner drives; ensemble: others that answer with
-    it where `ask` wants their disagreement. beta: the share of steps that the expert drives (`mixture`). noise: the
+    it where `query` wants their disagreement. beta: the share of steps that the expert drives (`mixture`). noise: the
     covariance (n, n) of a noisy expert's actions. hold: end an episode this many steps after success; None: at the
     horizon.
 
-    labels: what becomes of the states in which `ask` wants the expert. `per_state`: its label. `takeover`: from the
+    label: what the expert gives in the states that `query` selects. `per_state`: its label. `takeover`: from the
     first one on it drives to the end, for which it has a horizon of its own. `branch`: in a copy of the simulator it
     drives `branch_steps` ahead. `last`: none of this, but the label of the last state, for its phase.
 
@@ -60,8 +59,8 @@ class RolloutJob:
     beta: float = 0.0
     noise: tuple[tuple[float, ...], ...] = ()
     hold: int | None = None
-    labels: Labels = "per_state"
-    ask: Ask = field(default_factory=Ask)
+    label: LabelMode = "per_state"
+    query: QueryRule = field(default_factory=QueryRule)
     branch_steps: int = 1
     disturbance: Disturbance = field(default_factory=Disturbance)
     perturbation: Perturbation | None = None
@@ -76,10 +75,10 @@ class RolloutJob:
             raise UsageError(f"a rollout driven by {self.driver!r} needs a policy's folder")
         if self.driver == "noisy_expert" and not self.noise:
             raise UsageError("a rollout driven by 'noisy_expert' needs its noise")
-        if self.labels == "takeover" and self.driver != "policy":
+        if self.label == "takeover" and self.driver != "policy":
             raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver!r}")
-        if self.ask.kind == "ensemble" and not self.ensemble:
-            raise UsageError("ask=ensemble needs other policies to disagree with")
+        if self.query.kind == "ensemble" and not self.ensemble:
+            raise UsageError("query=ensemble needs other policies to disagree with")
         if self.perturbation is not None and self.disturbance != Disturbance():
             raise UsageError("a rollout has a disturbance or a perturbation, not both")
         if self.conditions and (self.perturbation is not None or self.disturbance != Disturbance()):
@@ -101,9 +100,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     transitions = rollout(envs, seeds, driver, _rules(job), expert, _intrude(job))
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
-    brancher = (
-        Brancher(_environment(job.env, job.cameras), expert, job.branch_steps) if job.labels == "branch" else None
-    )
+    brancher = Brancher(_environment(job.env, job.cameras), expert, job.branch_steps) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
         yield _finish(job, frames, expert, brancher)
 
@@ -117,20 +114,20 @@ def side_by_side(job: RolloutJob) -> int:
 
 
 def _rules(job: RolloutJob) -> Rules:
-    if job.labels == "last":
+    if job.label == "last":
         return Rules(job.env.horizon, job.hold, "last")
-    twice = 2 if job.labels == "takeover" else 1  # a horizon for the learner, and one for the expert
-    everywhere = job.labels == "per_state" and job.ask.kind == "every"
-    return Rules(twice * job.env.horizon, job.hold, "all" if everywhere else "driver")
+    twice = 2 if job.label == "takeover" else 1  # a horizon for the learner, and one for the expert
+    everywhere = job.label == "per_state" and job.query.kind == "every"
+    return Rules(twice * job.env.horizon, job.hold, "every" if everywhere else "driver")
 
 
 def _finish(job: RolloutJob, frames: list[Transition], expert: Expert, brancher: Brancher | None) -> Episode:
-    if job.labels == "last":
+    if job.label == "last":
         return to_episode(frames, job.round, job.beta, labelled=False)
-    if job.ask.kind == "one" and job.labels != "takeover":
+    if job.query.kind == "one" and job.label != "takeover":
         chosen = drawn_step(frames[0].seed, len(frames))
         frames[chosen] = replace(frames[chosen], label=expert.label(frames[chosen].state))
-    if job.labels == "takeover":
+    if job.label == "takeover":
         return to_episode(_cut_at_takeover(frames, job.env.horizon), job.round, job.beta)
     if brancher is None:
         return to_episode(frames, job.round, job.beta)

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
-from manip_il.engine.ask import Ask
 from manip_il.engine.describe import env_fingerprint
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.query import QueryRule
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
 from manip_il.mdp import Actor, Episode
@@ -122,8 +122,8 @@ class _Run:
 
     def taken_over(self, policy: Path, trust: bool) -> Row:
         """From states that a learner visits: at a drawn step of a horizon the expert takes over."""
-        ask = Ask("one")
-        job = RolloutJob(self._env, "policy", policy=policy, hold=0, labels="takeover", ask=ask, trust=trust)
+        once = QueryRule("one")
+        job = RolloutJob(self._env, "policy", policy=policy, hold=0, label="takeover", query=once, trust=trust)
         cases: list[Case] = []
         for episode in self._episodes(job, self._seeds):
             taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)

@@ -32,7 +32,7 @@ Frames = Sequence[NDArray[np.uint8]]
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
     """The episode of one seed, with its states: the same that an evaluation of `job` saw."""
-    return next(iter(run_job(replace(job, labels="last"), [seed])))
+    return next(iter(run_job(replace(job, label="last"), [seed])))
 
 
 def film(

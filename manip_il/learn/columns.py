@@ -17,6 +17,7 @@ from manip_il.errors import ManipError, MismatchError, NotFiniteError
 EPISODE_INDEX = "episode_index"  # LeRobot's own columns
 FRAME_INDEX = "frame_index"
 INDEX = "index"
+LEARNING_COLUMNS = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX)
 
 Table = Mapping[str, NDArray[Any]]
 

@@ -61,6 +61,10 @@ class FitConfig:
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
         check_names(self.policy, MLP)
+        if self.is_mlp and self.observation not in (None, "state"):
+            raise UsageError(
+                f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
+            )
 
     @property
     def is_mlp(self) -> bool:
@@ -71,7 +75,7 @@ class FitConfig:
     def sees(self) -> bool:
         """Whether the policy looks at pictures; `ManipError` where that is for the checkpoint in `path` to say."""
         if self.is_mlp or self.observation is not None:
-            return self.observation not in (None, "state")
+            return not self.is_mlp and self.observation != "state"
         path = self.policy.get("path")
         kind = read_json(Path(path) / "config.json", "a policy's").get("type") if path else self.policy["type"]
         return kind == "cnn"
@@ -81,12 +85,19 @@ class FitConfig:
         """Gradient steps."""
         return self.steps if self.steps is not None else MLP_STEPS if self.is_mlp else STEPS
 
+    @property
+    def plan_length(self) -> int:
+        """Actions that the policy plans at once: 1 for one that maps a state to an action."""
+        indices = None if self.is_mlp else self.other(0).policy.action_delta_indices
+        return len(indices) if indices else 1
+
+    @property
+    def dropped_frames(self) -> int:
+        """Frames at an episode's end that the policy does not learn from."""
+        return 0 if self.is_mlp else getattr(self.other(0).policy, "drop_n_last_frames", 0)
+
     def mlp(self, seed: int, init_from: Path | None = None) -> TrainConfig:
         """For `manip_il.learn.train.fit`. Raises `UsageError` for what the mlp does not know."""
-        if self.observation not in (None, "state"):
-            raise UsageError(
-                f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
-            )
         for name in ("optimizer", "scheduler"):
             if getattr(self, name):
                 raise UsageError(f"--{name} is not for --policy.type=mlp, which has its own loop and schedule")

@@ -1,4 +1,7 @@
-"""Behaviour cloning with any policy of LeRobot's: its optimiser, its processors, its checkpoints, our data paths."""
+"""Behaviour cloning with any policy of LeRobot's: its optimiser, its processors, its checkpoints, our data paths.
+
+The mlp has a loop of its own, in `manip_il.learn.train`, which says why.
+"""
 
 from __future__ import annotations
 

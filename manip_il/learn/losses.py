@@ -5,7 +5,8 @@ fit(D) = argmin over policies of the mean over D of -log pi(a* | s): empirical r
 Ross, Gordon and Bagnell, AISTATS 2011, section 2). A head says what family pi(. | s) is taken
 from. The network gives `params` (B, size) for a row; targets (B, n) are in normalised units.
 
-Acting is deterministic: one action for a state.
+Acting is deterministic: one action for a state. A head whose spread is learnt can be drawn from, too (`Distribution`);
+`mse` and `l1` say nothing about spread.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import override
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from manip_il.errors import UnknownName
 
 LOSSES = ("mse", "l1", "gaussian", "mixture", "categorical")
+DISTRIBUTIONS = ("gaussian", "mixture", "categorical")  # whose spread is learnt
 
 # A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
 # floor, 2 % of a target's own standard deviation, keeps the gradients finite.
@@ -44,6 +48,22 @@ class Head(ABC):
     @abstractmethod
     def action(self, params: Tensor) -> Tensor:
         """The action of each row, (B, n)."""
+
+
+class Distribution(Head):
+    """A head whose spread is learnt. A draw is a function of `params` and numbers that do not depend on them."""
+
+    @abstractmethod
+    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """What one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
+
+    @abstractmethod
+    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
+        """One sample a row, (B, n), from params (B, size) and `draw` of each row (B, m)."""
+
+    def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
+        """Log-density of each row's target (B, n), of `categorical` log-probability [nats], (B,)."""
+        return -self.nll(params, target)
 
 
 @dataclass(frozen=True)
@@ -75,7 +95,7 @@ class L1Head(MSEHead):
         return (params - target).abs().mean(-1)
 
 
-class GaussianHead(Head, nn.Module):
+class GaussianHead(Distribution, nn.Module):
     """Diagonal Gaussian: the network gives the mean; one learned log-deviation a dimension. Acts with the mean.
 
     The deviation does not depend on the state: where it does, easy states outweigh hard ones by
@@ -102,9 +122,17 @@ class GaussianHead(Head, nn.Module):
     def action(self, params: Tensor) -> Tensor:
         return params
 
+    @override
+    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        return rng.standard_normal(self.n)
+
+    @override
+    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
+        return params + floored_log_std(self.raw_log_std).exp() * draws.to(params.dtype)
+
 
 @dataclass(frozen=True)
-class MixtureHead(Head):
+class MixtureHead(Distribution):
     """Mixture of `components` diagonal Gaussians (Bishop, Mixture density networks, 1994).
 
     Acts with the mean of the heaviest component: the mixture's own mean may lie between two ways
@@ -135,19 +163,32 @@ class MixtureHead(Head):
     @override
     def action(self, params: Tensor) -> Tensor:
         log_weights, means, _ = self.split(params)
-        heaviest = log_weights.argmax(-1)[..., None, None].expand(*means.shape[:-2], 1, self.n)
-        return means.gather(-2, heaviest).squeeze(-2)
+        return self._of(means, log_weights.argmax(-1, keepdim=True))
+
+    @override
+    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        return np.append(rng.random(), rng.standard_normal(self.n))
+
+    @override
+    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
+        log_weights, means, log_std = self.split(params)
+        component = _inverse_cdf(log_weights, draws[:, :1])
+        return self._of(means, component) + self._of(log_std, component).exp() * draws[:, 1:].to(params.dtype)
+
+    def _of(self, values: Tensor, component: Tensor) -> Tensor:
+        """The component's (B, 1) part of values (B, K, n), (B, n)."""
+        return values.gather(-2, component.unsqueeze(-1).expand(*values.shape[:-2], 1, self.n)).squeeze(-2)
 
 
 @dataclass(frozen=True)
-class CategoricalHead(Head):
+class CategoricalHead(Distribution):
     """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
 
     A target between two bin centres is shared out between them in proportion (two-hot, as in
     Schrittwieser et al., MuZero, 2020, appendix F), so that the centres' expectation is the target
     itself and not its bin's centre. Acts with the expectation over the likeliest bin and its two
     neighbours: exact within a bin, unlike the argmax, and never between two modes, unlike the
-    expectation over all bins.
+    expectation over all bins. A sample is a bin's centre.
     """
 
     n: int
@@ -176,8 +217,19 @@ class CategoricalHead(Head):
         inside = (near >= 0) & (near < self.bins)
         near = near.clamp(0, self.bins - 1)
         weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
-        centres = near.to(params.dtype) * (2.0 / (self.bins - 1)) - 1.0
-        return (weights * centres).sum(-1)
+        return (weights * self._centres(near, params)).sum(-1)
+
+    @override
+    def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        return rng.random(self.n)
+
+    @override
+    def sample(self, params: Tensor, draws: Tensor) -> Tensor:
+        drawn = _inverse_cdf(self._logits(params).log_softmax(-1), draws.unsqueeze(-1))
+        return self._centres(drawn, params).squeeze(-1)
+
+    def _centres(self, bins: Tensor, params: Tensor) -> Tensor:
+        return bins.to(params.dtype) * (2.0 / (self.bins - 1)) - 1.0
 
     def _logits(self, params: Tensor) -> Tensor:
         return params.reshape(*params.shape[:-1], self.n, self.bins)
@@ -200,6 +252,12 @@ def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
 def floored_log_std(raw: Tensor) -> Tensor:
     """Log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
+
+
+def _inverse_cdf(log_weights: Tensor, uniform: Tensor) -> Tensor:
+    """The option (..., 1) of those weighed by exp(log_weights) (..., K) that a number (..., 1) in [0, 1) falls on."""
+    cdf = log_weights.double().exp().cumsum(-1)
+    return torch.searchsorted(cdf, uniform * cdf[..., -1:], right=True).clamp(max=log_weights.shape[-1] - 1)
 
 
 def _normal_log_prob(value: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:

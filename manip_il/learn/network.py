@@ -6,14 +6,15 @@ not spend seconds on importing LeRobot.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.errors import ManipError, UnknownName
-from manip_il.learn.losses import LOSSES, make_head
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.learn.losses import DISTRIBUTIONS, LOSSES, Distribution, make_head
 from manip_il.learn.normalise import Statistics, identity_statistics, scale_targets
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
@@ -67,7 +68,7 @@ class MLPNetwork(nn.Module):
 
     def __init__(self, inputs: int, n: int, shape: Shape) -> None:
         super().__init__()
-        self.n, self.clamp = n, shape.clamp
+        self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins)
         self.layers = _perceptron(inputs, self.head.size, shape)
         for name, tensor in identity_statistics(inputs, n).items():
@@ -93,17 +94,52 @@ class MLPNetwork(nn.Module):
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
         """Absolute actions, (B, n), each the same bits whatever the other rows are."""
-        rows = len(inputs)
-        padded = inputs.new_zeros((max(1, -(-rows // ROWS)) * ROWS, inputs.shape[1]))
-        padded[:rows] = inputs
-        return torch.cat([self.actions(chunk) for chunk in padded.split(ROWS)])[:rows]
+        return _in_blocks(self.actions, inputs)
+
+    def distribution(self) -> Distribution:  # no property: TorchScript would compile it
+        """Return the head. Raises `UsageError` for one whose spread is not learnt."""
+        if not isinstance(self.head, Distribution):
+            raise UsageError(f"loss {self.loss!r} learns no spread of actions; expected {', '.join(DISTRIBUTIONS)}")
+        return self.head
+
+    @torch.no_grad()
+    def sample(self, inputs: Tensor, draws: Tensor) -> Tensor:
+        """Absolute actions, (B, n), from what the distribution's `draw` gave for each row (B, m); bits as in `act`."""
+
+        def samples(inputs: Tensor, draws: Tensor) -> Tensor:
+            drawn = self.distribution().sample(self.layers(self.encode(inputs)), draws)
+            return self._absolute(inputs, drawn * self.target_scale + self.target_mean)
+
+        return _in_blocks(samples, inputs, draws)
+
+    @torch.no_grad()
+    def log_prob(self, inputs: Tensor, actions: Tensor) -> Tensor:
+        """What the distribution says of absolute actions (B, n), in normalised units, (B,); bits as in `act`."""
+
+        def log_probs(inputs: Tensor, actions: Tensor) -> Tensor:
+            targets = torch.cat([actions[:, :-1] - inputs[:, : self.n - 1], actions[:, -1:]], dim=1)
+            return self.distribution().log_prob(self.layers(self.encode(inputs)), self.encode_targets(targets))
+
+        return _in_blocks(log_probs, inputs, actions)
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """The same of all rows in one product, whose last bits depend on their number."""
+        """The same as `act` of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so neither shall the learner's, wherever it is.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
-        return torch.cat([inputs[:, : self.n - 1] + target[:, :-1], target[:, -1:]], dim=1)
+        return self._absolute(inputs, target)
+
+    def _absolute(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        return torch.cat([inputs[:, : self.n - 1] + targets[:, :-1], targets[:, -1:]], dim=1)
+
+
+def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
+    """Apply a function to `ROWS` rows of the columns (B, ...) at a time, the last ones filled up with zeros."""
+    rows = len(columns[0])
+    padded = [column.new_zeros((max(1, -(-rows // ROWS)) * ROWS, column.shape[1])) for column in columns]
+    for blocks, column in zip(padded, columns, strict=True):
+        blocks[:rows] = column
+    return torch.cat([function(*blocks) for blocks in zip(*(one.split(ROWS) for one in padded), strict=True)])[:rows]
 
 
 def _perceptron(inputs: int, outputs: int, shape: Shape) -> nn.Sequential:

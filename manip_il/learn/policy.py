@@ -17,13 +17,19 @@ from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, read_meta
 from manip_il.learn.limits import Budget
+from manip_il.learn.losses import DISTRIBUTIONS
 from manip_il.learn.network import MLPNetwork, Shape
 from manip_il.learn.observation import observation_of
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
 from manip_il.learn.threads import threads
+from manip_il.policy import F32, F64, Images
 
 Batch = dict[str, torch.Tensor]
 LIKELIHOODS = ("mixture", "categorical")  # losses whose spread depends on the state
+NO_LIKELIHOOD = (
+    "query=likelihood needs a policy with a likelihood: --policy.type=mlp with "
+    f"--policy.loss={' or '.join(LIKELIHOODS)}"
+)
 
 
 class Chooser(Protocol):
@@ -95,12 +101,8 @@ class LearnedPolicy:
 
     @torch.inference_mode()
     def act(
-        self,
-        states: NDArray[np.float32],
-        environment_states: NDArray[np.float32],
-        images: Mapping[str, NDArray[np.uint8]] | None = None,
-        episodes: Sequence[int] | None = None,
-    ) -> NDArray[np.float64]:
+        self, states: F32, environment_states: F32, images: Images | None = None, episodes: Sequence[int] | None = None
+    ) -> F64:
         """Absolute actions, (B, n): joint targets [rad], gripper command [m].
 
         states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row,
@@ -127,32 +129,51 @@ class LearnedPolicy:
         """Forget the past of episodes that begin."""
         self._chooser.forget(episodes)
 
-    def require_likelihood(self) -> None:
-        """Raise `UsageError` unless this is a policy that tells how likely it finds an action, state by state."""
-        if not isinstance(self._chooser, _Perceptron) or self._chooser.loss not in LIKELIHOODS:
-            raise UsageError(
-                "ask=likelihood needs a policy with a likelihood: "
-                f"--policy.type=mlp with --policy.loss={' or '.join(LIKELIHOODS)}"
-            )
+    @torch.inference_mode()
+    def sample(self, states: F32, environment_states: F32, images: Images, rngs: Sequence[np.random.Generator]) -> F64:
+        """Draw absolute actions, (B, n), each row's from its own generator, whatever the other rows are.
+
+        Not clipped to the range of the data, as `act` is. Raises `UsageError` for a policy whose loss learns no spread,
+        and what `act` raises.
+        """
+        perceptron = self._with_spread()
+        if len(rngs) != len(states):
+            raise MismatchError("rows", "the states", len(states), "the generators", len(rngs))
+        batch = self._numbers(states, environment_states)
+        if not len(states):
+            return np.empty((0, self.interface.action))
+        with threads(1):
+            actions = perceptron.sample(batch, rngs).numpy().astype(np.float64)
+        _require_finite_rows("the policy's sample", actions)
+        return actions
 
     @torch.inference_mode()
-    def log_likelihood(
-        self,
-        states: NDArray[np.float32],
-        environment_states: NDArray[np.float32],
-        actions: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """How likely the policy finds an action (B, n) in a state: nats a dimension, in normalised units, (B,).
+    def log_prob(self, states: F32, environment_states: F32, images: Images, actions: F64) -> F64:
+        """Return how likely the policy finds absolute actions (B, n), (B,): nats, in normalised units.
 
-        Raises `UsageError` as `require_likelihood` does.
+        Raises `UsageError` for a policy whose loss learns no spread.
         """
-        self.require_likelihood()
-        assert isinstance(self._chooser, _Perceptron)
+        perceptron = self._with_spread()
         batch = self._numbers(states, environment_states)
         with threads(1):
-            return self._chooser.log_likelihood(batch, torch.from_numpy(actions)).numpy().astype(np.float64)
+            return perceptron.log_prob(batch, torch.from_numpy(actions)).numpy().astype(np.float64)
 
-    def _numbers(self, states: NDArray[np.float32], environment_states: NDArray[np.float32]) -> Batch:
+    def require_likelihood(self) -> None:
+        """Raise `UsageError` unless the policy tells how likely it finds an action, state by state."""
+        if not isinstance(self._chooser, _Perceptron) or self._chooser.loss not in LIKELIHOODS:
+            raise UsageError(NO_LIKELIHOOD)
+
+    def _with_spread(self) -> _Perceptron:
+        """The mlp; `UsageError` for any other policy, and for an mlp whose loss learns no spread."""
+        if not isinstance(self._chooser, _Perceptron):
+            expected = f"expected an mlp with loss {', '.join(DISTRIBUTIONS)}"
+            raise UsageError(
+                f"a policy of type {self.interface.type!r} has no distribution of actions here; {expected}"
+            )
+        self._chooser.module.distribution()
+        return self._chooser
+
+    def _numbers(self, states: F32, environment_states: F32) -> Batch:
         batch = {}
         for key, values in ((STATE, states), (ENVIRONMENT_STATE, environment_states)):
             if key not in self.interface.numbers:
@@ -165,7 +186,7 @@ class LearnedPolicy:
             batch[key] = torch.from_numpy(values)
         return batch
 
-    def _pictures(self, rows: int, images: Mapping[str, NDArray[np.uint8]]) -> Batch:
+    def _pictures(self, rows: int, images: Images) -> Batch:
         """As LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
         if missing := set(self.cameras) - set(images):
             raise MismatchError(
@@ -214,18 +235,23 @@ class _Perceptron:
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """One action a row. The mlp's processors are the identity (see MLPConfig), so there is nothing else to do."""
-        return self._network.act(torch.cat([batch[key] for key in self._keys], dim=1).to(self._device))
+        return self._network.act(self._inputs(batch))
 
-    def log_likelihood(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
-        """Of absolute actions (B, n), a dimension, (B,)."""
-        inputs = torch.cat([batch[key] for key in self._keys], dim=1)
-        targets = actions.to(torch.float32)
-        targets[:, :-1] -= inputs[:, : self._network.n - 1]
-        x, y = self._network.encode(inputs.to(self._device)), self._network.encode_targets(targets.to(self._device))
-        return -self._network.row_losses(x, y).cpu() / self._network.n
+    def sample(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
+        """Absolute actions (B, n), each row's from its own generator."""
+        head = self._network.distribution()
+        draws = torch.from_numpy(np.stack([head.draw(rng) for rng in rngs]))
+        return self._network.sample(self._inputs(batch), draws.to(self._device)).cpu()
+
+    def log_prob(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
+        """Of absolute actions (B, n), (B,)."""
+        return self._network.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Do nothing: there is nothing to forget."""
+
+    def _inputs(self, batch: Batch) -> torch.Tensor:
+        return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
 
 
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:

@@ -1,4 +1,9 @@
-"""Training in memory: the whole table is a tensor, a batch is one `index_select`."""
+"""Training in memory: the whole table is a tensor, a batch is one `index_select`.
+
+A loop of its own beside `fit_policy`'s: with LeRobot's processors, prefetching and accelerator around each step the mlp
+takes a quarter fewer samples a second (32,000 for 42,000 in batches of 512, one busy core), and initialisation, order
+of updates and schedule are others, so that runs begun here would not resume to the same bits.
+"""
 
 from __future__ import annotations
 

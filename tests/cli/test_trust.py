@@ -76,7 +76,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, tmp
 
 @pytest.mark.slow
 def test_a_worker_trusts_only_what_its_job_does(hostile):
-    job = RolloutJob(ENV, "policy", policy=hostile, labels="last", batch=1)
+    job = RolloutJob(ENV, "policy", policy=hostile, label="last", batch=1)
     with Engine(2) as engine, pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         list(engine.run(job, [0, 1]))
 

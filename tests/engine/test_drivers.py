@@ -155,4 +155,4 @@ def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras
 @pytest.mark.parametrize("driver", [ExpertDriver(), MixtureDriver(Wave(), 1.0)])
 def test_an_expert_that_drives_must_be_there_to_ask(driver):
     with pytest.raises(ManipError, match=rf"episode {SEEDS[0]}: nobody to ask for a label at step 0"):
-        list(rollout([ManipEnv("panda", "reach")], SEEDS[:1], driver, Rules(horizon=6, labels="driver")))
+        list(rollout([ManipEnv("panda", "reach")], SEEDS[:1], driver, Rules(horizon=6, query="driver")))

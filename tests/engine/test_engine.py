@@ -90,7 +90,7 @@ def test_a_seed_that_kills_its_worker_three_times_is_left_out_and_named(tmp_path
 
 @pytest.mark.slow
 def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tmp_path):
-    job = RolloutJob(EnvConfig(horizon=10), "policy", policy=checkpoint, labels="per_state")
+    job = RolloutJob(EnvConfig(horizon=10), "policy", policy=checkpoint, label="per_state")
     (tmp_path / "deaths").mkdir()
     keep = DeadlyKeep(journal(tmp_path / "journals", job), tmp_path / "deaths", (SEEDS[0],), times=1000)
     with Engine(2) as engine:

@@ -83,8 +83,8 @@ def test_a_learner_needs_its_folder(driver):
 
 
 def test_labels_of_the_last_step_alone_tell_the_phase_at_the_end():
-    job = replace(EXPERT, driver="random", labels="last", env=EnvConfig("fetch", horizon=8))
-    labelled = {e.seed: e for e in run_job(replace(job, labels="per_state"), SEEDS[:2])}
+    job = replace(EXPERT, driver="random", label="last", env=EnvConfig("fetch", horizon=8))
+    labelled = {e.seed: e for e in run_job(replace(job, label="per_state"), SEEDS[:2])}
     for episode in run_job(job, SEEDS[:2]):
         assert "action" not in episode.columns
         assert episode.columns["expert_phase"][-1] == labelled[episode.seed].columns["expert_phase"][-1]

@@ -10,9 +10,9 @@ import pytest
 
 from manip_il.data.episodes import parts
 from manip_il.data.schema import fitted_columns
-from manip_il.engine.ask import Ask
 from manip_il.engine.describe import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.query import QueryRule
 from manip_il.errors import UsageError
 from manip_il.expert.expert import Expert
 from manip_il.mdp import Actor, Episode, Phase, State
@@ -53,10 +53,10 @@ def is_the_experts(episode: Episode) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"ask": Ask("probability", 0.3)},
-        {"labels": "takeover", "ask": Ask("one")},
-        {"labels": "branch", "ask": Ask("one"), "branch_steps": 4},
-        {"labels": "branch", "ask": Ask("probability", 0.2), "branch_steps": 3},
+        {"query": QueryRule("probability", 0.3)},
+        {"label": "takeover", "query": QueryRule("one")},
+        {"label": "branch", "query": QueryRule("one"), "branch_steps": 4},
+        {"label": "branch", "query": QueryRule("probability", 0.2), "branch_steps": 3},
     ],
 )
 def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: RolloutJob, changes):
@@ -70,7 +70,7 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
 
 
 def test_where_nobody_asked_the_label_is_not_to_be_learnt_from(job: RolloutJob):
-    for episode in run(replace(job, ask=Ask("probability", 0.3))).values():
+    for episode in run(replace(job, query=QueryRule("probability", 0.3))).values():
         asked = labelled(episode)
         assert 0 < asked.sum() < len(episode)
         columns = episode.columns
@@ -79,14 +79,14 @@ def test_where_nobody_asked_the_label_is_not_to_be_learnt_from(job: RolloutJob):
 
 
 def test_one_question_an_episode_is_one_label(job: RolloutJob):
-    asked = [labelled(episode) for episode in run(replace(job, ask=Ask("one"))).values()]
+    asked = [labelled(episode) for episode in run(replace(job, query=QueryRule("one"))).values()]
     assert [one.sum() for one in asked] == [1] * len(SEEDS)
     assert len({int(np.argmax(one)) for one in asked}) > 1
 
 
 def test_gates_do_not_change_what_the_learner_does(job: RolloutJob):
     free = run(job)
-    for episode in run(replace(job, ask=Ask("safety", 0.5))).values():
+    for episode in run(replace(job, query=QueryRule("safety", 0.5))).values():
         alone = free[episode.seed].columns
         np.testing.assert_array_equal(episode.columns["executed_action"], alone["executed_action"])
         gap = np.abs(np.subtract(alone["action"], alone["executed_action"])) / [*[0.25] * 7, 0.08]
@@ -95,8 +95,8 @@ def test_gates_do_not_change_what_the_learner_does(job: RolloutJob):
 
 
 def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJob):
-    free = run(replace(job, labels="last"))
-    for episode in run(replace(job, labels="takeover", ask=Ask("one"))).values():
+    free = run(replace(job, label="last"))
+    for episode in run(replace(job, label="takeover", query=QueryRule("one"))).values():
         rolled_in, recovery = parts(episode)
         columns = recovery.columns
         assert not labelled(rolled_in).any()
@@ -109,8 +109,8 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
 
 
 def test_an_expert_that_is_never_wanted_takes_nothing_over(job: RolloutJob):
-    free = run(replace(job, labels="last"))
-    for episode in run(replace(job, labels="takeover", ask=Ask("safety", 1e6))).values():
+    free = run(replace(job, label="last"))
+    for episode in run(replace(job, label="takeover", query=QueryRule("safety", 1e6))).values():
         assert len(parts(episode)) == 1
         assert len(episode) == ENV.horizon
         assert not labelled(episode).any()
@@ -119,12 +119,12 @@ def test_an_expert_that_is_never_wanted_takes_nothing_over(job: RolloutJob):
 
 
 def test_an_expert_that_takes_over_solves_what_it_took_over(job: RolloutJob):
-    episodes = run(replace(job, env=EnvConfig(), labels="takeover", ask=Ask("one"), hold=3))
+    episodes = run(replace(job, env=EnvConfig(), label="takeover", query=QueryRule("one"), hold=3))
     assert all(episode.success for episode in episodes.values())
 
 
 def test_a_takeover_in_a_disturbed_world_is_cut_where_the_expert_took_over(job: RolloutJob):
-    noisy = replace(job, labels="takeover", ask=Ask("one"), disturbance=STANDARD)
+    noisy = replace(job, label="takeover", query=QueryRule("one"), disturbance=STANDARD)
     for episode in run(noisy).values():
         rolled_in, recovery = parts(episode)
         assert (rolled_in.columns["actor"] == Actor.LEARNER).all()
@@ -133,8 +133,8 @@ def test_a_takeover_in_a_disturbed_world_is_cut_where_the_expert_took_over(job: 
 
 
 def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJob):
-    free = run(replace(job, labels="last"))
-    for episode in run(replace(job, labels="branch", ask=Ask("probability", 0.2), branch_steps=5)).values():
+    free = run(replace(job, label="last"))
+    for episode in run(replace(job, label="branch", query=QueryRule("probability", 0.2), branch_steps=5)).values():
         path, *branches = parts(episode)
         assert not labelled(path).any()
         for key, column in free[episode.seed].columns.items():
@@ -152,13 +152,13 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
 
 def test_what_a_job_lacks_is_said_before_it_runs(checkpoint: Path):
     with pytest.raises(UsageError, match="needs other policies to disagree with"):
-        RolloutJob(ENV, "policy", policy=checkpoint, ask=Ask("ensemble", 0.1))
+        RolloutJob(ENV, "policy", policy=checkpoint, query=QueryRule("ensemble", 0.1))
     with pytest.raises(UsageError, match="takes over from a policy; this rollout is driven by 'mixture'"):
-        RolloutJob(ENV, "mixture", policy=checkpoint, labels="takeover")
+        RolloutJob(ENV, "mixture", policy=checkpoint, label="takeover")
     with pytest.raises(UsageError, match="needs its noise"):
         RolloutJob(ENV, "noisy_expert")
     with pytest.raises(UsageError, match="needs a policy with a likelihood"):
-        run(RolloutJob(ENV, "policy", policy=checkpoint, ask=Ask("likelihood", 0.0)))
+        run(RolloutJob(ENV, "policy", policy=checkpoint, query=QueryRule("likelihood", 0.0)))
 
 
 def test_a_noisy_expert_is_labelled_by_the_clean_one():

@@ -75,7 +75,7 @@ def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None =
 
 
 def test_a_rollout_is_lerobots_own_loop_to_the_bit(act):
-    job = RolloutJob(ENV, "policy", policy=act, labels="last")
+    job = RolloutJob(ENV, "policy", policy=act, label="last")
     for episode in run_job(job, SEEDS[:2]):
         assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(act, episode.seed))
 
@@ -90,14 +90,14 @@ def test_an_episode_does_not_depend_on_its_company(driver, act):
 
 @pytest.mark.slow
 def test_two_processes_evaluate_as_one_does(act):
-    job = RolloutJob(ENV, "policy", policy=act, labels="last")
+    job = RolloutJob(ENV, "policy", policy=act, label="last")
     with Engine(2) as engine:
         assert evaluate(engine, job, SEEDS, "act") == evaluate(Engine(1), job, SEEDS, "act")
 
 
 @pytest.mark.gl
 def test_a_policy_sees_the_pictures_that_lerobot_would_show_it(seeing):
-    [episode] = run_job(RolloutJob(ENV, "policy", policy=seeing, labels="last"), SEEDS[:1])
+    [episode] = run_job(RolloutJob(ENV, "policy", policy=seeing, label="last"), SEEDS[:1])
     assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(seeing, SEEDS[0], DIM))
     bright = lerobots_rollout(seeing, SEEDS[0], replace(DIM, look=Look()))
     assert not np.array_equal(episode.columns["executed_action"], bright)
@@ -118,7 +118,7 @@ def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing, tmp_pa
 
 @pytest.mark.gl
 def test_an_evaluation_says_which_pictures_it_was_made_with(seeing):
-    result = evaluate(Engine(1), RolloutJob(ENV, "policy", policy=seeing, labels="last"), SEEDS[:1], "seeing")
+    result = evaluate(Engine(1), RolloutJob(ENV, "policy", policy=seeing, label="last"), SEEDS[:1], "seeing")
     assert result.fingerprint == env_fingerprint(ENV, DIM)
     assert result.fingerprint != env_fingerprint(ENV, replace(DIM, look=Look()))
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.engine.ask import drawn_step
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.query import drawn_step
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled
 from manip_il.evaluation.certificate_table import align, certificate_lines

@@ -14,7 +14,7 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4, film, make_film, paths, run_states, shown_steps, strip
 from manip_il.sim.env import EnvConfig
 
-JOB = RolloutJob(EnvConfig(), "expert", labels="last")
+JOB = RolloutJob(EnvConfig(), "expert", label="last")
 SEED = 4_000_000
 
 

@@ -48,7 +48,7 @@ def mlp(tmp_path_factory):
 
 
 def job_of(policy, **changes) -> RolloutJob:
-    return RolloutJob(ENV, "policy", policy=policy, labels="last", **changes)
+    return RolloutJob(ENV, "policy", policy=policy, label="last", **changes)
 
 
 @pytest.mark.slow
@@ -97,7 +97,7 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
 
 def test_places_are_the_true_ones_of_first_and_last_state():
     job = RolloutJob(
-        EnvConfig("fetch"), "expert", labels="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),)
+        EnvConfig("fetch"), "expert", label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),)
     )
     [episode] = run_job(job, SEEDS[:1])
     result = episode_result(job, episode)
@@ -115,7 +115,7 @@ def test_places_are_the_true_ones_of_first_and_last_state():
 
 
 def test_a_task_without_an_object_has_no_place_of_one(act):
-    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), "expert", labels="last")
+    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), "expert", label="last")
     [one] = evaluate(Engine(1), job, SEEDS[:1], "expert").episodes
     assert set(one.detail["start"]) == {"hand"}
 
@@ -149,7 +149,7 @@ def result(seed: int, success: bool) -> EpisodeResult:
 
 def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     engine = coins([seed % 50 != 7 for seed in range(10_000)])
-    job = RolloutJob(ENV, "random", labels="last")
+    job = RolloutJob(ENV, "random", label="last")
     found = evaluate(engine, job, range(10_000), "coin", until_width=0.05)
     low, high = found.success.interval
     assert high - low <= 0.05
@@ -164,7 +164,7 @@ def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
 
 def test_until_width_gives_up_at_the_last_seed(coins):
     found = evaluate(
-        coins([True] * 150), RolloutJob(ENV, "random", labels="last"), range(150), "coin", until_width=0.001
+        coins([True] * 150), RolloutJob(ENV, "random", label="last"), range(150), "coin", until_width=0.001
     )
     assert len(found.episodes) == 150
     assert found.to_json()["interval_method"].startswith("confidence sequence")
@@ -172,7 +172,7 @@ def test_until_width_gives_up_at_the_last_seed(coins):
 
 def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
     outcomes = [seed % 9 != 0 for seed in range(1_000)]
-    job = RolloutJob(ENV, "random", labels="last")
+    job = RolloutJob(ENV, "random", label="last")
     for width in (None, 0.1):
         whole = evaluate(coins(outcomes), job, range(1_000), "coin", until_width=width)
         engine = coins(outcomes)
@@ -187,4 +187,4 @@ def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
 @pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
 def test_a_width_that_cannot_be_is_refused(width, coins):
     with pytest.raises(UsageError, match="expected between 0 and 1"):
-        evaluate(coins([True]), RolloutJob(ENV, "random", labels="last"), range(1), "coin", until_width=width)
+        evaluate(coins([True]), RolloutJob(ENV, "random", label="last"), range(1), "coin", until_width=width)

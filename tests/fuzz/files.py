@@ -117,7 +117,7 @@ def _kept(folder: Path):
 
     from ..cli.made_runs import ENV
 
-    return KeptEpisodes.open(folder, RolloutJob(ENV, "expert", labels="last"), "nominal", "eval")
+    return KeptEpisodes.open(folder, RolloutJob(ENV, "expert", label="last"), "nominal", "eval")
 
 
 def _read_kept(folder: Path) -> None:

@@ -96,6 +96,14 @@ def test_a_fresh_process_acts_bit_equal(warm_lerobot, spec, tmp_path):
     assert np.array_equal(np.load(tmp_path / "out.npy"), actions(LearnedPolicy.load(checkpoint), {3: 0})[3])
 
 
+def test_lerobots_policies_have_no_distribution_here(act):
+    policy, (states, environments) = LearnedPolicy.load(act), observations(1)
+    with pytest.raises(UsageError, match="a policy of type 'act' has no distribution of actions here"):
+        policy.sample(states, environments, {}, [np.random.default_rng(0)])
+    with pytest.raises(UsageError, match="expected an mlp with loss gaussian, mixture, categorical"):
+        policy.log_prob(states, environments, {}, np.zeros((1, 4)))
+
+
 def test_an_episode_that_is_left_out_or_reset_begins_anew(act):
     policy = LearnedPolicy.load(act)
     states, environments = observations(0)

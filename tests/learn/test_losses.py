@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import distributions as td
 
 from manip_il.errors import UnknownName
 from manip_il.learn.losses import (
+    DISTRIBUTIONS,
     LOSSES,
     MIN_LOG_STD,
     CategoricalHead,
+    Distribution,
     GaussianHead,
     Head,
     MixtureHead,
@@ -138,3 +141,92 @@ def test_log_deviation_has_a_floor():
 def test_unknown_loss_names_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'mixture'"):
         head_for("mixtur")
+
+
+def drawn(head: Distribution, params: torch.Tensor, count: int, seed: int = 0) -> torch.Tensor:
+    """Samples (count, n) from one row of params."""
+    rng = np.random.default_rng(seed)
+    draws = torch.from_numpy(np.stack([head.draw(rng) for _ in range(count)]))
+    return head.sample(params.expand(count, -1), draws)
+
+
+def distribution(loss: str, n: int = N) -> Distribution:
+    head = head_for(loss, n)
+    assert isinstance(head, Distribution)
+    return head
+
+
+def test_a_head_whose_spread_is_not_learnt_is_no_distribution():
+    assert [loss for loss in LOSSES if isinstance(head_for(loss), Distribution)] == list(DISTRIBUTIONS)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gaussian_samples_have_its_mean_and_deviation(seed: int):
+    head, generator = GaussianHead(N), torch.Generator().manual_seed(seed)
+    torch.nn.init.normal_(head.raw_log_std, generator=generator)
+    params = torch.randn((1, head.size), generator=generator)
+    samples, std = drawn(head, params, 20_000, seed).detach(), floored_log_std(head.raw_log_std).exp().detach()
+    assert ((samples.mean(0) - params[0]).abs() < 5 * std / 20_000**0.5).all()
+    torch.testing.assert_close(samples.std(0), std, rtol=0.03, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mixture_samples_have_its_mean_and_come_from_every_component_in_its_share(seed: int):
+    head, generator = MixtureHead(1, 3), torch.Generator().manual_seed(seed)
+    params = torch.randn((1, head.size), generator=generator)
+    params[:, 3:6], params[:, 6:] = torch.tensor([-10.0, 0.0, 10.0]), -1.0  # three heaps, far apart
+    log_weights, means, _ = head.split(params)
+    shares, samples = log_weights[0].exp(), drawn(head, params, 20_000, seed)
+    nearest = (samples - means[0, :, 0]).abs().argmin(-1)
+    found = torch.bincount(nearest, minlength=3) / len(samples)
+    assert ((found - shares).abs() < 5 * (shares * (1 - shares) / len(samples)).sqrt()).all()
+    assert samples.mean().item() == pytest.approx((shares * means[0, :, 0]).sum().item(), abs=0.4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_categorical_samples_are_bin_centres_in_the_share_of_their_probability(seed: int):
+    head = CategoricalHead(2, 5)
+    params = torch.randn((1, head.size), generator=torch.Generator().manual_seed(seed))
+    bins = (drawn(head, params, 20_000, seed) + 1) * 2
+    assert torch.equal(bins, bins.round())
+    for i, probability in enumerate(params.reshape(2, 5).softmax(-1)):
+        found = torch.bincount(bins[:, i].long(), minlength=5) / len(bins)
+        assert ((found - probability).abs() < 5 * (probability * (1 - probability) / len(bins)).sqrt()).all()
+
+
+@pytest.mark.parametrize("loss", ["gaussian", "mixture"])
+def test_a_density_integrates_to_one(loss, generator):
+    head, grid = distribution(loss, n=2), torch.linspace(-12, 12, 601)
+    params = 0.3 * torch.randn((1, head.size), generator=generator)
+    points = torch.cartesian_prod(grid, grid)
+    density = head.log_prob(params.expand(len(points), -1), points).double().exp()
+    assert (density.sum() * (grid[1] - grid[0]) ** 2).item() == pytest.approx(1, abs=1e-3)
+
+
+def test_the_probabilities_of_all_bins_are_one_together(generator):
+    head, centres = CategoricalHead(2, 5), torch.linspace(-1, 1, 5)
+    params, points = torch.randn((1, head.size), generator=generator), torch.cartesian_prod(centres, centres)
+    assert head.log_prob(params.expand(len(points), -1), points).exp().sum().item() == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("loss", DISTRIBUTIONS)
+def test_the_mean_log_prob_of_samples_is_the_entropy(loss, generator):
+    head = distribution(loss, n=1)
+    params = torch.randn((1, head.size), generator=generator)
+    samples = [drawn(head, params, 20_000, seed) for seed in (1, 2)]
+    entropy = [-head.log_prob(params.expand(20_000, -1), one).mean().item() for one in samples]
+    assert entropy[0] == pytest.approx(entropy[1], abs=0.05)
+    if loss == "categorical":
+        probabilities = params.softmax(-1)
+        assert entropy[0] == pytest.approx(-(probabilities * probabilities.log()).sum().item(), abs=0.03)
+    if loss == "gaussian":
+        assert entropy[0] == pytest.approx(floored_log_std(torch.zeros(1)).item() + 1.4189, abs=0.03)
+
+
+@pytest.mark.parametrize("loss", DISTRIBUTIONS)
+def test_log_prob_has_a_gradient(loss, generator):
+    head = distribution(loss)
+    params = torch.randn((4, head.size), generator=generator).requires_grad_()
+    head.log_prob(params, torch.zeros(4, N)).sum().backward()
+    assert params.grad is not None
+    assert params.grad.abs().sum() > 0

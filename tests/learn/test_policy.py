@@ -14,8 +14,8 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.learn.losses import LOSSES
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
@@ -156,3 +156,56 @@ def test_pictures_go_in_as_lerobot_feeds_them():
         policy.act(states, environments, {"wrist": picture})
     with pytest.raises(MismatchError, match="the states has 2, the episodes has 1"):
         policy.act(states, environments, {"front": picture}, [40])
+
+
+def generators(*seeds: int) -> list[np.random.Generator]:
+    return [np.random.default_rng(seed) for seed in seeds]
+
+
+@pytest.mark.parametrize("loss", DISTRIBUTIONS)
+def test_a_sample_is_its_generators_whatever_is_sampled_beside_it(loss, table, spec, tmp_path):
+    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, loss))
+    states, environments = observations(130)
+    together = policy.sample(states, environments, {}, generators(*range(130)))
+    assert np.array_equal(policy.sample(states, environments, {}, generators(*range(130))), together)
+    likely = policy.log_prob(states, environments, {}, together)
+    for rows in ([0], [77], [129, 3], list(range(129, 40, -1))):
+        assert np.array_equal(policy.sample(states[rows], environments[rows], {}, generators(*rows)), together[rows])
+        assert np.array_equal(policy.log_prob(states[rows], environments[rows], {}, together[rows]), likely[rows])
+    other = policy.sample(states, environments, {}, generators(*range(1, 131)))
+    assert (other != together).any(axis=1).mean() > 0.9
+
+
+@pytest.mark.parametrize("loss", ["gaussian", "mixture"])
+def test_what_is_sampled_is_likelier_than_what_is_not(loss, table, spec, tmp_path):
+    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, loss))
+    states, environments = observations(200)
+    sampled = policy.sample(states, environments, {}, generators(*range(200)))
+    assert sampled.shape == (200, 4)
+    near, far = (policy.log_prob(states, environments, {}, sampled + shift) for shift in (0.0, 5.0))
+    assert np.isfinite(near).all()
+    assert (near > far).mean() > 0.95
+
+
+def test_gaussian_samples_lie_around_the_action(table, spec, tmp_path):
+    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, "gaussian"))
+    states, environments = (np.tile(one, (4_000, 1)) for one in (table["observation.state"][:1], observations(1)[1]))
+    samples = policy.sample(states, environments, {}, generators(*range(4_000)))
+    error = np.abs(samples.mean(axis=0) - policy.act(states[:1], environments[:1])[0])
+    assert (error < 5 * samples.std(axis=0) / np.sqrt(4_000)).all()
+
+
+def test_a_policy_without_a_distribution_says_so_in_one_line(checkpoint):
+    policy, (states, environments) = LearnedPolicy.load(checkpoint), observations(2)
+    says = "loss 'mse' learns no spread of actions; expected gaussian, mixture, categorical"
+    with pytest.raises(UsageError, match=says):
+        policy.sample(states, environments, {}, generators(0, 1))
+    with pytest.raises(UsageError, match=says):
+        policy.log_prob(states, environments, {}, np.zeros((2, 4)))
+
+
+def test_every_row_wants_a_generator_of_its_own(table, spec, tmp_path):
+    policy = LearnedPolicy.load(make_checkpoint(table, spec, tmp_path, "gaussian"))
+    with pytest.raises(MismatchError, match="the states has 2, the generators has 1"):
+        policy.sample(*observations(2), {}, generators(0))
+    assert policy.sample(*observations(0), {}, []).shape == (0, 4)

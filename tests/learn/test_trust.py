@@ -73,7 +73,7 @@ def test_a_step_that_loads_by_name_runs_only_where_it_is_trusted(act, ran):
 def test_a_worker_trusts_only_what_its_job_does(act, ran):
     add_step(act, EVIL)
     edit_config(act, input_features={"observation.state": {"type": "STATE", "shape": [8]}})
-    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), "policy", policy=act, labels="last")
+    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), "policy", policy=act, label="last")
     with pytest.raises(ManipError, match="--trust=true"):
         list(run_job(pickle.loads(pickle.dumps(job)), [0]))
     assert ran == []

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.dagger.config import DaggerConfig, check_sight
-from manip_il.dagger.fitting import branch_steps, check_labels, plan_length, resolved_ask
+from manip_il.algorithms.beta import BetaSchedule
+from manip_il.algorithms.config import RunConfig, check_labels, check_sight
+from manip_il.engine.query import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.look import CameraConfig
@@ -18,34 +19,37 @@ DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
     ("options", "says"),
     [
         ({"label_budget": 0}, "label_budget is 0; expected at least 1"),
-        ({"ask": "ensemble:0.1"}, "there is one policy; give ensemble=2"),
-        ({"ensemble": 3}, "nothing asks it"),
-        ({"label": "takeover", "beta": "linear:3"}, "learner rolls in alone"),
-        ({"label": "takeover", "ask": "every"}, "from the first step on"),
+        ({"query_rule": QueryRule("ensemble", 0.1)}, "there is one policy; give ensemble=2"),
+        ({"ensemble": 3}, "no query uses it"),
+        ({"label": "takeover", "beta": BetaSchedule("linear", 3)}, "learner rolls in alone"),
+        ({"label": "takeover", "query_rule": QueryRule("every")}, "from the first step on"),
         ({"method": "cloning", "label": "branch"}, "the expert drive throughout"),
-        ({"method": "dart", "ask": "one"}, "the expert drive throughout"),
+        ({"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
         ({"refit_steps": 100}, "refit_steps is for refit=warm"),
         ({"branch_steps": 0}, "branch_steps is 0"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(options, says: str):
     with pytest.raises(UsageError, match=says):
-        DaggerConfig(**options)
+        RunConfig(**options)
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"fit": ACT, "ask": "probability:0.1"}, "act learns from 8 in a row; use label=branch or label=takeover"),
+        (
+            {"fit": ACT, "query_rule": QueryRule("one")},
+            "act learns from 8 in a row; use label=branch",
+        ),
         ({"fit": DIFFUSION, "label": "branch", "branch_steps": 4}, "diffusion leaves out the last 7 frames"),
-        ({"ask": "likelihood:-2"}, "--policy.type=mlp with --policy.loss=mixture or categorical"),
-        ({"fit": FitConfig({"loss": "gaussian"}), "ask": "likelihood:-2"}, "mixture or categorical"),
-        ({"fit": ACT, "label": "branch", "ask": "likelihood:-2"}, "--policy.type=mlp"),
+        ({"query_rule": QueryRule("likelihood", -2)}, "--policy.type=mlp with --policy.loss=mixture or categorical"),
+        ({"fit": FitConfig({"loss": "gaussian"}), "query_rule": QueryRule("likelihood", -2)}, "mixture or categorical"),
+        ({"fit": ACT, "label": "branch", "query_rule": QueryRule("likelihood", -2)}, "--policy.type=mlp"),
     ],
 )
 def test_labels_that_the_policy_cannot_use_are_refused(options, says: str):
     with pytest.raises(UsageError, match=says):
-        check_labels(DaggerConfig(**options))
+        check_labels(RunConfig(**options))
 
 
 @pytest.mark.parametrize(
@@ -55,23 +59,27 @@ def test_labels_that_the_policy_cannot_use_are_refused(options, says: str):
         (FitConfig(), ("front",), "dagger", "the policy takes none"),
         (ACT, ("front",), "dagger", "the policy takes none"),
         (FitConfig({"type": "cnn"}), ("front",), "dart", "not for a policy on images"),
-        (FitConfig(observation="images"), ("front",), "dagger", "mlp does not take images"),
     ],
 )
 def test_what_is_pictured_is_what_is_looked_at(fit, cameras, method, says: str):
-    config = DaggerConfig(fit=fit, method=method, cameras=CameraConfig(cameras) if cameras else None)
+    config = RunConfig(fit=fit, method=method, cameras=CameraConfig(cameras) if cameras else None)
     with pytest.raises(UsageError, match=says):
         check_sight(config)
 
 
+def test_an_mlp_that_is_to_see_is_refused_where_it_is_configured():
+    with pytest.raises(UsageError, match="mlp does not take images"):
+        FitConfig(observation="images")
+
+
 def test_a_branch_is_as_long_as_the_policy_needs_for_a_whole_plan():
-    assert [plan_length(fit) for fit in (FitConfig(), ACT, DIFFUSION)] == [1, 8, 16]
-    lengths = [branch_steps(DaggerConfig(fit=fit, label="branch")) for fit in (FitConfig(), ACT, DIFFUSION)]
+    assert [fit.plan_length for fit in (FitConfig(), ACT, DIFFUSION)] == [1, 8, 16]
+    lengths = [RunConfig(fit=fit, label="branch").steps_of_branch for fit in (FitConfig(), ACT, DIFFUSION)]
     assert lengths == [1, 8, 16 + 7]
 
 
 @pytest.mark.parametrize(
     ("label", "expected"), [("per_state", "every"), ("takeover", "one"), ("branch", "probability:0.125")]
 )
-def test_every_label_mode_knows_when_to_ask(label, expected: str):
-    assert str(resolved_ask(DaggerConfig(fit=ACT, label=label))) == expected
+def test_every_label_mode_has_a_query_rule_of_its_own(label, expected: str):
+    assert str(RunConfig(fit=ACT, label=label).query) == expected

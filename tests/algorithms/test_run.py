@@ -1,8 +1,7 @@
-"""Algorithm 3.1 on a very small scale: what it leaves on disk, and that a stopped run goes on as if it had not been."""
+"""Runs on a very small scale: what it leaves on disk, and that a stopped run goes on as if it had not been."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,43 +9,50 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.dagger import loop
-from manip_il.dagger.config import DaggerConfig
-from manip_il.dagger.fitting import LEARNING_COLUMNS
-from manip_il.dagger.loop import RoundResult, Watch, best_round, run_dagger
-from manip_il.dagger.rounds import datasets, round_folder
+from manip_il.algorithms import run as run_module
+from manip_il.algorithms.beta import BetaSchedule
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.rounds import RoundResult, best_round
+from manip_il.algorithms.run import Watch, round_folder
+from manip_il.algorithms.table import run_algorithm
 from manip_il.data.lerobot_io import dataset_info, read_table, read_tables
 from manip_il.engine.engine import Engine
+from manip_il.engine.query import QueryRule
 from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import CameraConfig
 
+from .trees import files, is_data
+
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
-CONFIG = DaggerConfig(
+ALONE = BetaSchedule("constant", 0)
+CONFIG = RunConfig(
     env=EnvConfig("fetch", "reach", horizon=40),
     demonstrations=4,
     rounds=1,
     episodes_per_round=2,
-    beta="constant:0.5",
+    beta=BetaSchedule("constant", 0.5),
     fit=FitConfig({"width": 16}, steps=20, batch_size=32),
     validation_episodes=2,
 )
 
 
-def files(folder: Path) -> dict[str, str]:
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+def datasets(folder: Path, last: int) -> list[Path]:
+    """Those of rounds 0 to `last`."""
+    roots = (round_folder(folder, i) / "dataset" for i in range(last + 1))
+    return [root for root in roots if root.is_dir()]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> tuple[Path, list[RoundResult], list[Episode]]:
     """One whole run: its folder, its rounds, and every episode that it made."""
     folder, seen = tmp_path_factory.mktemp("dagger"), list[Episode]()
-    results = list(run_dagger(CONFIG, folder, Engine(), Watch(on_episode=seen.append)))
+    results = list(run_algorithm(CONFIG, folder, Engine(), Watch(on_episode=seen.append)))
     return folder, results, seen
 
 
@@ -136,7 +142,7 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
 
     monkeypatch.setattr(Engine, "run", refuse)
     logged: list[dict] = []
-    again = list(run_dagger(CONFIG, folder, Engine(), Watch(on_log=logged.append)))
+    again = list(run_algorithm(CONFIG, folder, Engine(), Watch(on_log=logged.append)))
     assert logged == []
     assert [replace(result, seconds={}) for result in again] == [replace(result, seconds={}) for result in results]
     assert files(folder) == before
@@ -144,10 +150,6 @@ def test_running_it_again_computes_nothing_anew(run, monkeypatch):
 
 class Stop(Exception):
     pass
-
-
-def is_data(name: str) -> bool:
-    return name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))
 
 
 @pytest.mark.parametrize("episodes", [2, 5, 7])  # in the demonstrations, in round 1, in a validation
@@ -162,8 +164,8 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
             raise Stop
 
     with pytest.raises(Stop):
-        list(run_dagger(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)))
-    again = list(run_dagger(CONFIG, tmp_path, Engine()))
+        list(run_algorithm(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)))
+    again = list(run_algorithm(CONFIG, tmp_path, Engine()))
     assert [result.validation for result in again] == [result.validation for result in results]
     mine, theirs = files(tmp_path), files(whole)
     assert mine.keys() == theirs.keys()
@@ -172,14 +174,14 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
 
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypatch):
     begun: list[Path | None] = []
-    plain = loop.fit_round
+    plain = run_module.fit_round
 
-    def watch(config: DaggerConfig, roots, folder: Path, init_from: Path | None = None, *rest):
+    def watch(config: RunConfig, roots, folder: Path, init_from: Path | None = None, *rest):
         begun.append(init_from)
         return plain(config, roots, folder, init_from, *rest)
 
-    monkeypatch.setattr(loop, "fit_round", watch)
-    results = list(run_dagger(replace(CONFIG, refit="warm"), tmp_path, Engine()))
+    monkeypatch.setattr(run_module, "fit_round", watch)
+    results = list(run_algorithm(replace(CONFIG, refit="warm"), tmp_path, Engine()))
     assert begun == [None, results[0].policy]
     assert files(results[1].policy) != files(run[1][1].policy)
 
@@ -189,8 +191,8 @@ def labels(folder: Path, rounds: int) -> int:
 
 
 def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
-    config = replace(CONFIG, rounds=5, beta="constant:0", label_budget=180)
-    results = list(run_dagger(config, tmp_path, Engine()))
+    config = replace(CONFIG, rounds=5, beta=ALONE, label_budget=180)
+    results = list(run_algorithm(config, tmp_path, Engine()))
     assert [result.labels for result in results][-1] == 180 == labels(tmp_path, results[-1].round)
     assert results[-1].round < 5
     assert dataset_info(tmp_path / "dataset").frames >= 180
@@ -198,7 +200,7 @@ def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
 
 @pytest.mark.parametrize("method", ["cloning", "dart"])
 def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path):
-    results = list(run_dagger(replace(CONFIG, method=method, beta="constant:0"), tmp_path, Engine()))
+    results = list(run_algorithm(replace(CONFIG, method=method, beta=ALONE), tmp_path, Engine()))
     table = read_tables(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
     later = table["round"].ravel() == 1
     drove = {"cloning": Actor.EXPERT, "dart": Actor.NOISY_EXPERT}[method]
@@ -211,19 +213,19 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     assert results[1].queries == results[1].labels + extra
 
 
-def test_a_round_in_which_nobody_asks_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
-    config = replace(CONFIG, beta="constant:0", ask="safety:1000", rounds=2)
-    results = list(run_dagger(config, tmp_path, Engine()))
+def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
+    config = replace(CONFIG, beta=ALONE, query_rule=QueryRule("safety", 1000), rounds=2)
+    results = list(run_algorithm(config, tmp_path, Engine()))
     assert len({result.labels for result in results}) == 1
     assert not (round_folder(tmp_path, 1) / "dataset").exists()
-    assert "the expert was asked in none of them" in caplog.text
-    assert results[2].queries > results[0].queries  # it was asked in every state, to know
+    assert "the expert was queried in none of its rollouts" in caplog.text
+    assert results[2].queries > results[0].queries  # it was queried in every state, to know
     assert dataset_info(tmp_path / "dataset").episodes == 4
 
 
 def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
-    config = replace(CONFIG, beta="constant:0", ask="ensemble:0.05", ensemble=2)
-    results = list(run_dagger(config, tmp_path, Engine()))
+    config = replace(CONFIG, beta=ALONE, query_rule=QueryRule("ensemble", 0.05), ensemble=2)
+    results = list(run_algorithm(config, tmp_path, Engine()))
     first, second = (round_folder(tmp_path, 0) / name for name in ("policy", "policy_1"))
     assert files(first).keys() == files(second).keys()
     weights = "checkpoints/000020/pretrained_model/model.safetensors"
@@ -246,8 +248,8 @@ ACT = {
 
 @pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])
 def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(label, length, tmp_path):
-    config = replace(CONFIG, beta="constant:0", fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm")
-    results = list(run_dagger(config, tmp_path, Engine()))
+    config = replace(CONFIG, beta=ALONE, fit=FitConfig(ACT, steps=4, batch_size=8), label=label, refit="warm")
+    results = list(run_algorithm(config, tmp_path, Engine()))
     assert results[1].labels > results[0].labels
     assert json.loads((results[1].policy / "config.json").read_text())["type"] == "act"
     table = read_tables(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
@@ -261,9 +263,9 @@ def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(labe
 @pytest.mark.gl
 def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
-    config = replace(CONFIG, beta="constant:0", demonstrations=2, env=EnvConfig("panda", "reach", horizon=10), fit=fit)
+    config = replace(CONFIG, beta=ALONE, demonstrations=2, env=EnvConfig("panda", "reach", horizon=10), fit=fit)
     config = replace(config, cameras=CameraConfig(("front",), 64, 64), validation_episodes=1)
-    results = list(run_dagger(config, tmp_path, Engine()))
+    results = list(run_algorithm(config, tmp_path, Engine()))
     assert results[1].labels > results[0].labels
     sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
     assert set(sees) == {"observation.state", "observation.images.front"}

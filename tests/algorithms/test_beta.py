@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.dagger.beta import BetaSchedule
-from manip_il.dagger.config import DaggerConfig
+from manip_il.algorithms.beta import BetaSchedule
+from manip_il.algorithms.config import RunConfig
 from manip_il.errors import UnknownName, UsageError
 
 
@@ -27,7 +27,7 @@ from manip_il.errors import UnknownName, UsageError
 )
 def test_the_values_of_a_schedule(text: str, betas: list[float]):
     schedule = BetaSchedule.parse(text)
-    assert [schedule.at(round_) for round_ in range(4)] == pytest.approx(betas)
+    assert [schedule(round_) for round_ in range(4)] == pytest.approx(betas)
 
 
 @given(
@@ -37,7 +37,7 @@ def test_the_values_of_a_schedule(text: str, betas: list[float]):
     )
 )
 def test_the_expert_drives_all_of_round_0_and_never_more_later(text: str):
-    betas = [BetaSchedule.parse(text).at(round_) for round_ in range(30)]
+    betas = [BetaSchedule.parse(text)(round_) for round_ in range(30)]
     assert betas[0] == 1
     assert all(0 <= later <= earlier <= 1 for earlier, later in pairwise(betas))
 
@@ -68,9 +68,9 @@ def test_a_schedule_without_a_number_is_refused_and_shown_how(text: str):
         ("episodes_per_round", 0),
         ("validation_episodes", 0),
         ("disturbed_share", 1.5),
-        ("beta", "linear:0"),
+        ("method", "daggr"),
     ],
 )
 def test_a_run_that_makes_no_sense_is_refused(name: str, value: object):
-    with pytest.raises(UsageError, match=f"{name} is '?{value}"):
-        DaggerConfig(**{name: value})  # pyright: ignore[reportArgumentType]
+    with pytest.raises(UsageError, match=f"{name} (is )?'?{value}"):
+        RunConfig(**{name: value})  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""Episodes on disk: run what is missing, keep each one the moment it ends."""
+"""Record episodes: run what is missing, keep each one the moment it ends, write datasets from them."""
 
 from __future__ import annotations
 
@@ -146,8 +146,8 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     said = {"driver": job.driver, "round": job.round, "beta": job.beta}
     if job.driver not in ("policy", "mixture"):
         return said
-    steps = {"branch_steps": job.branch_steps} if job.labels == "branch" else {}
-    return {**said, "label": job.labels, "ask": str(job.ask), **steps}
+    steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}
+    return {**said, "label": job.label, "query": str(job.query), **steps}
 
 
 def check_journals(journals: Path, job: RolloutJob) -> list[str]:

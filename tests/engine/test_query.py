@@ -1,4 +1,4 @@
-"""When the expert is asked: each gate's rule, and what it refuses."""
+"""When the expert is queried: each gate's rule, and what it refuses."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from manip_il.engine.ask import (
-    Ask,
-    AtDrawnStep,
-    ByChance,
-    WhereDisputed,
-    WhereUnsafe,
-    WhereUnsure,
+from manip_il.engine.query import (
+    QueryRule,
     action_gap,
+    at_drawn_step,
+    by_chance,
     drawn_step,
+    where_disputed,
+    where_unsafe,
+    where_unsure,
 )
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Label, Observation, Phase, State
@@ -52,8 +52,10 @@ class Constant:
 class Doubtful:
     """Finds an action the less likely, the larger the state."""
 
-    def log_likelihood(self, states, environment_states, actions):
-        return -states[:, 0].astype(np.float64)
+    cameras = ()
+
+    def log_prob(self, states, environment_states, images, actions):
+        return -actions.shape[1] * states[:, 0].astype(np.float64)
 
 
 def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
@@ -62,7 +64,7 @@ def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | No
 
 @pytest.mark.parametrize("text", ["every", "one", "probability:0.1", "ensemble:0.2", "likelihood:-2", "safety:0.5"])
 def test_a_rule_is_written_as_it_is_read(text: str):
-    assert str(Ask.parse(text)) == text
+    assert str(QueryRule.parse(text)) == text
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,7 @@ def test_a_rule_is_written_as_it_is_read(text: str):
 )
 def test_a_rule_that_cannot_be_is_refused_with_what_can(text: str, says: str):
     with pytest.raises((UsageError, UnknownName), match=says):
-        Ask.parse(text)
+        QueryRule.parse(text)
 
 
 def test_differences_are_measured_in_steps_of_the_worst_dimension():
@@ -92,27 +94,27 @@ def test_differences_are_measured_in_steps_of_the_worst_dimension():
 def test_safety_asks_where_expert_and_learner_differ_by_more_than_the_bound():
     teacher = Teacher([0.0, 0.0, 0.08])
     turns = [turn(teacher=teacher), turn(teacher=teacher)]
-    gate = WhereUnsafe(0.5, SCALE)
-    assert gate.wants(turns, [np.array([0.04, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])]) == [False, True]
+    gate = where_unsafe(0.5, SCALE)
+    assert gate(turns, [np.array([0.04, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])]) == [False, True]
     assert [one.label for one in turns] == [None, None]  # knowing is not keeping
 
 
 def test_an_ensemble_asks_where_its_members_spread():
     others = [Constant(0.0, 0.0, 0.08), Constant(0.0, 0.0, 0.08)]
-    gate = WhereDisputed(0.2, others, (), SCALE)
+    gate = where_disputed(0.2, others, (), SCALE)
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
-    assert gate.wants([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
+    assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
     assert [member.begun for member in others] == [[7], [7]]  # a policy with a memory must know who begins
 
 
 def test_an_unsure_learner_asks():
-    assert WhereUnsure(-1.0, Doubtful()).wants([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
+    assert where_unsure(-1.0, Doubtful())([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
 
 
 def test_chance_asks_in_its_share_of_the_steps_and_the_same_for_a_seed():
     def asked(seeds) -> np.ndarray:
-        gate = ByChance(0.3)
-        return np.array([gate.wants([turn(seed, step) for seed in seeds], []) for step in range(200)])
+        gate = by_chance(0.3)
+        return np.array([gate([turn(seed, step) for seed in seeds], []) for step in range(200)])
 
     both = asked([1, 2])
     assert both.mean() == pytest.approx(0.3, abs=5 * math.sqrt(0.3 * 0.7 / both.size))
@@ -122,8 +124,8 @@ def test_chance_asks_in_its_share_of_the_steps_and_the_same_for_a_seed():
 def test_one_step_of_an_episode_is_drawn_evenly():
     drawn = [drawn_step(seed, 10) for seed in range(2_000)]
     assert np.bincount(drawn, minlength=10) == pytest.approx(200, abs=5 * math.sqrt(180))
-    gate = AtDrawnStep(10)
-    assert [gate.wants([turn(3, step)], []) for step in range(10)].index([True]) == drawn[3]
+    gate = at_drawn_step(10)
+    assert [gate([turn(3, step)], []) for step in range(10)].index([True]) == drawn[3]
 
 
 def test_a_turn_asks_once_and_only_where_there_is_an_expert():

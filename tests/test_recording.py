@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.dagger.collect import check_journals, collect, collect_successes, record
 from manip_il.data.build import Recording, build
 from manip_il.data.journal import list_episodes, read_episode, read_header
 from manip_il.data.lerobot_io import read_table
@@ -17,6 +16,7 @@ from manip_il.engine.engine import Engine, Keep
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
+from manip_il.recording import check_journals, collect, collect_successes, record
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import CameraConfig
 

@@ -1,0 +1,144 @@
+"""What one run of an algorithm is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from manip_il.algorithms.beta import BetaSchedule
+from manip_il.algorithms.sampling import Sampling
+from manip_il.algorithms.table import ALGORITHMS
+from manip_il.engine.query import QueryRule
+from manip_il.errors import UnknownName, UsageError
+from manip_il.learn.fit_config import FitConfig
+from manip_il.seeding import MAX_ROUNDS
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig
+
+_AT_LEAST_1 = (
+    *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble"),
+    *("label_budget", "branch_steps", "refit_steps"),
+)
+_LEARNER_ALONE = BetaSchedule("constant", 0.0)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Options of `manip-il dagger` by their names; round 0 is always the expert's own demonstrations.
+
+    method: a name in `ALGORITHMS`. rounds: after round 0, fewer where label_budget, the sound labels of all rounds
+    together, is reached before. beta: the share of a round's steps that the expert drives. label, branch_steps: what
+    the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many as the policy
+    plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble: policies fitted
+    every round, of which the first drives.
+
+    refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
+    the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
+    many steps after success. disturbed_share: of a round's learner rollouts that run under
+    `manip_il.sim.disturb.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
+    """
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    method: str = "dagger"
+    demonstrations: int = 50
+    rounds: int = 5
+    episodes_per_round: int = 50
+    label_budget: int | None = None
+    beta: BetaSchedule = _LEARNER_ALONE
+    label: Literal["per_state", "takeover", "branch"] = "per_state"
+    query_rule: QueryRule | None = None
+    branch_steps: int | None = None
+    ensemble: int = 1
+    sampling: Sampling = field(default_factory=Sampling)
+    refit: Literal["scratch", "warm"] = "scratch"
+    refit_steps: int | None = None
+    fit: FitConfig = field(default_factory=FitConfig)
+    validation_episodes: int = 200
+    hold: int = 10
+    disturbed_share: float = 0.5
+    cameras: CameraConfig | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in ALGORITHMS:
+            raise UnknownName("method", self.method, ALGORITHMS)
+        for name in _AT_LEAST_1:
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise UsageError(f"{name} is {value}; expected at least 1")
+        if not 0 <= self.disturbed_share <= 1:
+            raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 to 1")
+        if self.rounds < 0:
+            raise UsageError(f"rounds is {self.rounds}; expected at least 0")
+        if self.rounds >= MAX_ROUNDS:
+            raise UsageError(f"rounds is {self.rounds}; expected fewer than {MAX_ROUNDS}")
+        if self.refit_steps is not None and self.refit == "scratch":
+            raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
+        self._check_queries()
+
+    def _check_queries(self) -> None:
+        rule, given = self.query_rule or QueryRule(), (self.label, self.query_rule, self.beta)
+        if not ALGORITHMS[self.method].learner_drives and given != ("per_state", None, _LEARNER_ALONE):
+            raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
+        if self.label == "takeover" and self.beta != _LEARNER_ALONE:
+            raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
+        if self.label == "takeover" and self.query_rule == QueryRule("every"):
+            raise UsageError("label is 'takeover' and query 'every': the expert would drive from the first step on")
+        if rule.kind == "ensemble" and self.ensemble < 2:
+            raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
+        if rule.kind != "ensemble" and self.ensemble > 1:
+            raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
+
+    def episodes(self, round_: int) -> int:
+        """Episodes of a round."""
+        return self.demonstrations if round_ == 0 else self.episodes_per_round
+
+    @property
+    def steps_of_branch(self) -> int:
+        """Of a branch: what was given, else as many as the policy can learn a whole plan from."""
+        return self.branch_steps or self.fit.plan_length + self.fit.dropped_frames
+
+    @property
+    def query(self) -> QueryRule:
+        """When the expert is queried: everywhere; for `takeover` once; for `branch` for as many labels as steps."""
+        if self.query_rule is not None or self.label == "per_state":
+            return self.query_rule or QueryRule()
+        return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)
+
+
+def check_sight(config: RunConfig) -> None:
+    """Raise `UsageError` unless what the policy sees is recorded, and nothing is pictured for a blind one."""
+    sees = config.fit.sees
+    if sees and config.cameras is None:
+        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,wrist")
+    if config.cameras is not None and not sees:
+        raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
+    if sees and not ALGORITHMS[config.method].takes_images:
+        raise UsageError(
+            f"method {config.method!r} measures the learner's errors from state vectors; it is not for a policy on "
+            "images"
+        )
+
+
+def check_labels(config: RunConfig) -> None:
+    """Raise `UsageError` for labels that the policy cannot learn from, or a query rule that it cannot answer.
+
+    The policy's own configuration is made for this, which imports LeRobot; it raises what is wrong with that, too.
+    """
+    fit, plan = config.fit, config.fit.plan_length
+    fit.mlp(0) if fit.is_mlp else fit.other(0)
+    name, rule = fit.policy.get("type", "mlp"), config.query
+    if config.label == "per_state" and plan > 1 and rule.kind != "every":
+        raise UsageError(
+            f"query={rule} with label=per_state yields single labels, and {name} learns from {plan} in a row; "
+            "use label=branch or label=takeover"
+        )
+    if config.label == "branch" and config.steps_of_branch <= fit.dropped_frames:
+        raise UsageError(
+            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {fit.dropped_frames} frames of "
+            "every episode; give more, or --policy.drop_n_last_frames=0"
+        )
+    if rule.kind == "likelihood":
+        from manip_il.learn.policy import LIKELIHOODS, NO_LIKELIHOOD
+
+        if not fit.is_mlp or fit.policy.get("loss", "mse") not in LIKELIHOODS:
+            raise UsageError(NO_LIKELIHOOD)

@@ -1,0 +1,105 @@
+"""What a round is made of: who drives its rollouts, what comes of them, the policy, and how good that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:  # algorithms are read for help and mistakes, too, before anything heavy is imported
+    from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.results import EvalResult
+
+Noise = tuple[tuple[float, ...], ...]  # covariance (n, n) of actions
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What a rollout job says of who drives. beta: the expert's share of the steps. noise: made when it is needed."""
+
+    driver: Literal["noisy_expert", "policy", "mixture"]
+    beta: float = 1.0
+    policies: tuple[Path | None, ...] = (None,)  # the first drives
+    noise: Callable[[], Noise] = tuple
+
+    def complete(self, job: RolloutJob) -> RolloutJob:
+        """Return the job with its driver."""
+        policy, *others = self.policies
+        ensemble = tuple(path for path in others if path)
+        return replace(job, driver=self.driver, beta=self.beta, policy=policy, ensemble=ensemble, noise=self.noise())
+
+
+def noisy_expert(noise: Callable[[], Noise]) -> Drive:
+    """Execute the expert's labels with Gaussian noise of a covariance (Laskey et al. 2017)."""
+    return Drive("noisy_expert", noise=noise)
+
+
+def mixture(policy: Fitted, beta: float) -> Drive:
+    """Execute the expert's label with probability beta in each step, else the learner's action (Ross et al. 2011)."""
+    return Drive("mixture" if beta > 0 else "policy", beta, policy.members)
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """One round's episodes. dataset: None where the expert gave no label. beta: the expert's share of the steps.
+
+    labels: sound ones. queries: states in which the expert was queried. episodes, successes: of the rollouts.
+    """
+
+    round: int
+    dataset: Path | None
+    beta: float
+    labels: int
+    queries: int
+    episodes: int
+    successes: int
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A round's policy. members: the `pretrained_model` folders of an ensemble, of which the first drives."""
+
+    round: int
+    members: tuple[Path, ...]
+
+    @property
+    def path(self) -> Path:
+        """Of the one that drives."""
+        return self.members[0]
+
+
+@dataclass(frozen=True)
+class RoundResult:
+    """One finished round. policy: its checkpoint. Times in [s].
+
+    labels: sound labels learnt from so far. queries: states in which the expert was queried so far, which is more where
+    it must answer to decide (`safety`, `dart`'s held-out episodes). episodes: rollouts so far. rollout_success: of this
+    round's rollouts.
+    """
+
+    round: int
+    beta: float
+    labels: int
+    queries: int
+    episodes: int
+    rollout_success: float
+    policy: Path
+    validation: EvalResult
+    seconds: dict[str, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """One line of `metrics.jsonl`."""
+        success = self.validation.success
+        first = ("round", "beta", "labels", "queries", "episodes", "rollout_success")
+        return {name: getattr(self, name) for name in first} | {
+            "validation_success": success.rate,
+            "validation_interval": list(success.interval),
+            "validation_episodes": success.n,
+            "seconds": self.seconds,
+        }
+
+
+def best_round(results: Sequence[RoundResult]) -> RoundResult:
+    """The highest validation success; of equals the later, which has seen more."""
+    return max(results, key=lambda result: (result.validation.success.rate, result.round))

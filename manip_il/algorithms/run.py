@@ -1,0 +1,246 @@
+"""One run on disk: the steps that algorithms are made of, each of which is skipped where its result is there already.
+
+round_003/journals/    every rollout, the moment it ended
+round_003/dataset/     what is learnt from; missing where the expert gave no label
+round_003/policy/      the fit; policy_1, ... of an ensemble
+round_003/eval.json    the validation
+held_out/              the expert's demonstrations that no policy learns from
+best/, dataset/        the round with the highest validation success, and all rounds' labels, once the run has ended
+
+Everything appears there whole, so that a run that was killed goes on where it was: an episode, a fit's last
+checkpoint, or an evaluation that is there is not made again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import shutil
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from manip_il.algorithms.config import RunConfig, check_labels
+from manip_il.algorithms.fitting import fit_round, round_fit
+from manip_il.algorithms.rounds import Drive, Fitted, Rollouts, RoundResult, best_round
+from manip_il.data import schema
+from manip_il.data.atomic import new_folder
+from manip_il.data.build import Recording
+from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.lerobot_io import dataset_info, merge_datasets, read_table
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.query import QueryRule
+from manip_il.errors import NothingToLearnError
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
+from manip_il.evaluation.runner import evaluate
+from manip_il.mdp import Episode
+from manip_il.recording import MAX_TRIES, Collected, check_journals, collect, collect_successes, provenance, record
+from manip_il.seeding import stream_seeds
+from manip_il.sim.disturb import STANDARD
+
+_LOG = logging.getLogger(__name__)
+BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "journals", "policy"
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a caller sees of a run as it goes. Raising in any of them ends the run; what is on disk stays."""
+
+    on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
+    on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
+    on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
+
+
+class Run:
+    """The steps of one run in `folder`. Raises `UsageError` for labels that the policy cannot learn from."""
+
+    def __init__(self, config: RunConfig, folder: Path, engine: Engine, watch: Watch | None = None):
+        check_labels(config)
+        self.config, self.folder = config, folder
+        self._engine, self._watch = engine, watch or Watch()
+        self._made: dict[int, Rollouts] = {}
+        self._held_out_queries = 0
+        self._fitted: Fitted | None = None
+        self._seconds: dict[str, float] = {}
+
+    def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
+        """Record `count` successful episodes of the expert as a round's."""
+        self._watch.on_stage("collect", round_, count)
+        with self._timed("collect"):
+            if not self._is_recorded(round_):
+                job, journals = self._job(round_), self._folder(round_) / JOURNALS
+                stream = f"round/{round_}" if round_ else "demonstrations"
+                seeds = stream_seeds(stream, MAX_TRIES * count, self.config.seed)
+                episodes = collect_successes(self._engine, job, seeds, count, journals, self._watch.on_episode)
+                recording = Recording(self._repo_id(round_), True, count, provenance(job), labels=self._left(round_))
+                self._record(job, episodes, recording)
+            return self._keep(round_, beta=1.0, queried_everywhere=True)
+
+    def held_out(self, count: int = 10) -> Path:
+        """Record episodes of the expert that no policy learns from; return their dataset."""
+        root, journals = (self.folder / HELD_OUT / name for name in (DATASET, JOURNALS))
+        with self._timed("collect"):
+            if not root.is_dir():
+                job = replace(self._job(0), cameras=None)
+                episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
+                record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
+            self._held_out_queries = sum(read_header(path).frames for path in list_episodes(journals))
+        return root
+
+    def rollouts(self, round_: int, drive: Drive, query: QueryRule | None = None, disturbed: float = 0.0) -> Rollouts:
+        """Record a round's episodes, successful or not, with the expert's labels as `config.label` has them.
+
+        query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
+        `STANDARD`.
+        """
+        config, rule = self.config, query or QueryRule()
+        count, per_state = config.episodes_per_round, config.label == "per_state"
+        self._watch.on_stage("collect", round_, count)
+        with self._timed("collect"):
+            if not self._is_recorded(round_):
+                steps = config.steps_of_branch if config.label == "branch" else 1
+                job = replace(drive.complete(self._job(round_)), trust=config.fit.trust)
+                job = replace(job, label=config.label, query=rule, branch_steps=steps)
+                gated, name = not per_state or rule.kind != "every", self._repo_id(round_)
+                left = self._left(round_)
+                recording = Recording(name, provenance=provenance(job), only_labelled=gated, labels=left)
+                self._record(job, self._collect(job, count, round(disturbed * count)), recording)
+            return self._keep(round_, drive.beta, per_state and rule.kind in ("every", "safety"))
+
+    def fit(self, data: Sequence[Rollouts]) -> Fitted:
+        """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
+        config, before, round_ = self.config, self._fitted, data[-1].round
+        roots = [one.dataset for one in data if one.dataset is not None]
+        starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
+        members: list[Path] = []
+        with self._timed("fit"):
+            for member, start in enumerate(starts):
+                name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
+                self._watch.on_stage(name, round_, round_fit(config, start is not None).total_steps)
+                into = self._folder(round_) / (f"{POLICY}_{member}" if member else POLICY)
+                members.append(fit_round(config, roots, into, start, self._watch.on_log, member))
+        self._fitted = Fitted(round_, tuple(members))
+        return self._fitted
+
+    def validate(self, policy: Fitted) -> RoundResult:
+        """Measure a round's policy on the validation's seeds, which ends the round."""
+        round_, path = policy.round, self._folder(policy.round) / FILE_NAME
+        self._watch.on_stage("validate", round_, self.config.validation_episodes)
+        with self._timed("validate"):
+            validation = EvalResult.read(path) if path.is_file() else self._evaluate(policy, path)
+        seconds, self._seconds = self._seconds, {}
+        here, so_far = self._made[round_], [one for one in self._made.values() if one.round <= round_]
+        return RoundResult(
+            round=round_,
+            beta=here.beta,
+            labels=sum(one.labels for one in so_far),
+            queries=sum(one.queries for one in so_far) + self._held_out_queries,
+            episodes=sum(one.episodes for one in so_far),
+            rollout_success=here.successes / here.episodes,
+            policy=policy.path,
+            validation=validation,
+            seconds={stage: round(took, 2) for stage, took in seconds.items()},
+        )
+
+    def follow(self, rounds: Iterator[RoundResult]) -> Iterator[RoundResult]:
+        """Yield an algorithm's rounds, the finished ones again first, until it ends or the label budget is spent.
+
+        Then `best/pretrained_model` holds the round with the highest validation success (the later of equals) and
+        `dataset` the aggregated LeRobot dataset.
+        """
+        results: list[RoundResult] = []
+        for result in rounds:
+            results.append(result)
+            yield result
+            if self._left(result.round + 1) == 0:
+                break
+        if results:
+            self._finish(best_round(results))
+
+    def _folder(self, round_: int) -> Path:
+        return round_folder(self.folder, round_)
+
+    def _repo_id(self, round_: int) -> str:
+        return f"local/{self.config.env.robot}_{self.config.env.task}_round_{round_}"
+
+    def _is_recorded(self, round_: int) -> bool:
+        return (self._folder(round_) / DATASET).is_dir()
+
+    def _job(self, round_: int) -> RolloutJob:
+        """The expert's rollouts."""
+        config = self.config
+        return RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
+
+    def _left(self, round_: int) -> int | None:
+        """Labels that may still be had in a round; None where there is no limit."""
+        if self.config.label_budget is None:
+            return None
+        had = sum(one.labels for one in self._made.values() if one.round < round_)
+        return max(0, self.config.label_budget - had)
+
+    def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[Collected]:
+        """A round's episodes, of which the first `disturbed` are."""
+        seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
+        journals, seen = self._folder(job.round) / JOURNALS, self._watch.on_episode
+        return itertools.chain(
+            collect(self._engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, seen),
+            collect(self._engine, job, seeds[disturbed:], journals, seen),
+        )
+
+    def _record(self, job: RolloutJob, episodes: Iterator[Collected], recording: Recording) -> None:
+        """Run a round's episodes and write its dataset."""
+        here = self._folder(job.round)
+        for line in check_journals(here / JOURNALS, job):
+            _LOG.warning("%s", line)
+        try:
+            record(episodes, here / JOURNALS, here / DATASET, job, recording)
+        except NothingToLearnError:
+            _LOG.warning("round %d: no labels, as the expert was queried in none of its rollouts", job.round)
+
+    def _keep(self, round_: int, beta: float, queried_everywhere: bool) -> Rollouts:
+        """What lies on disk of a round's rollouts."""
+        here = self._folder(round_)
+        headers = [read_header(path) for path in list_episodes(here / JOURNALS)]
+        dataset = here / DATASET if self._is_recorded(round_) else None
+        labels = int(read_table(dataset, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum()) if dataset else 0
+        queries = sum(header.frames for header in headers) if queried_everywhere else labels
+        successes = sum(header.success for header in headers)
+        self._made[round_] = Rollouts(round_, dataset, beta, labels, queries, len(headers), successes)
+        return self._made[round_]
+
+    def _evaluate(self, policy: Fitted, path: Path) -> EvalResult:
+        config = self.config
+        job = RolloutJob(config.env, "policy", policy=policy.path, label="last", hold=config.hold)  # solved is solved
+        job = replace(job, trust=config.fit.trust)
+        seeds = stream_seeds("validation", config.validation_episodes, config.seed)
+        result = evaluate(self._engine, job, seeds, f"DAgger round {policy.round}", self._watch.on_episode)
+        result.write(path)
+        return result
+
+    def _finish(self, best: RoundResult) -> None:
+        shutil.rmtree(self.folder / BEST, ignore_errors=True)
+        with new_folder(self.folder / BEST) as new:
+            shutil.copytree(best.policy, new / "pretrained_model")
+        root, config = self.folder / DATASET, self.config
+        rounds = [one.dataset for one in self._made.values() if one.dataset is not None]
+        if root.is_dir() and dataset_info(root).episodes == sum(dataset_info(one).episodes for one in rounds):
+            return
+        shutil.rmtree(root, ignore_errors=True)
+        name = f"local/{config.env.robot}_{config.env.task}_dagger"
+        merge_datasets(rounds, root, repo_id=name, provenance={"best_round": best.round})
+
+    @contextmanager
+    def _timed(self, stage: str) -> Generator[None]:
+        """Add what a stage takes to the round's seconds."""
+        started = time.monotonic()
+        yield
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + time.monotonic() - started
+
+
+def round_folder(folder: Path, round_: int) -> Path:
+    """Where a round of the run in `folder` keeps its journals, dataset, policy and evaluation."""
+    return folder / f"round_{round_:03d}"

@@ -1,0 +1,85 @@
+"""An algorithm is one file: here two that are in no table, on a run that resumes by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.rounds import Rollouts, RoundResult, mixture
+from manip_il.algorithms.run import Run, Watch
+from manip_il.data.lerobot_io import dataset_info
+from manip_il.engine.engine import Engine
+from manip_il.learn.fit_config import FitConfig
+from manip_il.mdp import Episode
+from manip_il.sim.env import EnvConfig
+
+from .trees import files, is_data
+
+pytestmark = pytest.mark.slow
+
+CONFIG = RunConfig(
+    env=EnvConfig("fetch", "reach", horizon=40),
+    demonstrations=2,
+    rounds=2,
+    episodes_per_round=2,
+    fit=FitConfig({"width": 16}, steps=20, batch_size=32),
+    validation_episodes=1,
+)
+
+
+def expert_only(run: Run, c: RunConfig) -> Iterator[RoundResult]:
+    """Fit to the expert's demonstrations, once."""
+    policy = run.fit([run.demonstrations(c.demonstrations)])
+    yield run.validate(policy)
+
+
+def halves(run: Run, c: RunConfig) -> Iterator[RoundResult]:
+    """Let expert and learner drive half of the steps each, and learn from the latest rollouts alone."""
+    data: Rollouts = run.demonstrations(c.demonstrations)
+    for i in range(1, c.rounds + 1):
+        policy = run.fit([data])
+        yield run.validate(policy)
+        data = run.rollouts(i, mixture(policy, 0.5))
+    yield run.validate(run.fit([data]))
+
+
+def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[RoundResult]:
+    run = Run(CONFIG, folder, Engine(), watch)
+    return list(run.follow(algorithm(run, CONFIG)))
+
+
+@pytest.mark.parametrize(("algorithm", "rounds"), [(expert_only, 1), (halves, 3)])
+def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorithm, rounds, tmp_path, monkeypatch):
+    whole = follow(algorithm, tmp_path / "whole")
+    assert [result.round for result in whole] == list(range(rounds))
+    assert dataset_info(tmp_path / "whole/dataset").episodes == 2 * rounds
+    seen = 0
+
+    def stop(episode: Episode) -> None:
+        nonlocal seen
+        seen += 1
+        if seen == 3 * rounds:  # in the last round's validation
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        follow(algorithm, tmp_path / "again", Watch(on_episode=stop))
+    again = follow(algorithm, tmp_path / "again")
+    assert [result.validation for result in again] == [result.validation for result in whole]
+    mine, theirs = files(tmp_path / "again"), files(tmp_path / "whole")
+    assert mine.keys() == theirs.keys()
+    assert {name: mine[name] for name in mine if is_data(name)} == {n: theirs[n] for n in theirs if is_data(n)}
+
+    monkeypatch.setattr(Engine, "run", None)  # nothing is left to do
+    third = follow(algorithm, tmp_path / "again")
+    assert [replace(result, seconds={}) for result in third] == [replace(result, seconds={}) for result in again]
+
+
+def test_a_new_algorithm_counts_what_it_used(tmp_path):
+    results = follow(halves, tmp_path)
+    assert [result.beta for result in results] == [1.0, 0.5, 0.5]
+    assert [result.episodes for result in results] == [2, 4, 6]
+    assert [result.labels for result in results] == sorted({result.labels for result in results})
