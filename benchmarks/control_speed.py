@@ -18,9 +18,9 @@ import numpy as np
 from _machine import describe_machine
 
 from manip_il.expert.expert import Expert
+from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.robot import ROBOTS
 
 STEPS = 30  # of an episode: the expert's way from the start to the goal
 

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -30,9 +31,9 @@ import manip_il.learn.train as train
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
 from manip_il.engine.engine import Engine
-from manip_il.expert.ik import ArmIK
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.normalise import Statistics
+from manip_il.robots.ik import ArmIK
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 FAR = 10.0  # [m], [rad]: no limit
@@ -65,7 +66,11 @@ def jumping_labels() -> Iterator[None]:
         return plain(ik, position, rotation, FAR)
 
     jobs._expert.cache_clear()
-    with patch.object(ArmIK, "step", unclipped), patch.multiple(expert, MAX_POSITION_STEP=FAR, MAX_ANGLE_STEP=FAR):
+    unbounded: dict[str, Any] = {
+        "_clip_norm": lambda vector, _longest: vector,
+        "_turn_towards": lambda _rotation, target, _largest: target,
+    }
+    with patch.object(ArmIK, "step", unclipped), patch.multiple(expert, **unbounded):
         yield
     jobs._expert.cache_clear()
 

@@ -29,9 +29,9 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.train import TrainConfig, fit
 from manip_il.mdp import Episode
+from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.robot import ROBOTS
 
 BIN = Path(sys.executable).parent
 TASK = "pick_place"
@@ -81,10 +81,11 @@ def replay_seconds(config: EnvConfig, episode: Episode) -> float:
     env = ManipEnv(config=config)
     env.start(episode.seed)
     scene, data = env.scene, env.data
-    low, high = np.vstack([scene.arm_range, [0, scene.robot.max_opening]]).T
     controls = np.zeros((len(episode), scene.model.nu))
-    actions = np.clip(episode.columns["executed_action"].astype(np.float64), low, high)
-    controls[:, scene.arm_ctrl], controls[:, scene.finger_ctrl] = actions[:, :-1], actions[:, -1:] / 2
+    for control, action in zip(controls, episode.columns["executed_action"], strict=True):
+        action = scene.actions.clip(action, 0)
+        control[scene.arm_ctrl] = action[scene.actions.arm]
+        control[scene.gripper.ctrl] = scene.gripper.command(action[scene.actions.gripper])
     started = time.perf_counter()
     for control in controls:
         data.ctrl[:] = control

@@ -15,17 +15,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import mink
 import numpy as np
 import qpsolvers
 from _machine import describe_machine
 
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.expert import ik
 from manip_il.expert.expert import Expert
 from manip_il.mdp import State
+from manip_il.robots import ik
+from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.robot import ROBOTS
 from manip_il.sim.scene import build_scene
 
 
@@ -64,17 +65,17 @@ def visited(robot: str, episodes: int) -> list[State]:
 def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
     """The quadratic program that a label solves, caught on its way to the solver; None where it needs none."""
     caught: list[qpsolvers.Problem] = []
-    plain = qpsolvers.solve_problem
+    plain = mink.build_ik
 
-    def catch(problem: qpsolvers.Problem, *args: object, **settings: object) -> object:
-        caught.append(problem)
-        return plain(problem, *args, **settings)  # pyright: ignore[reportArgumentType]
+    def catch(*args: Any) -> qpsolvers.Problem:
+        caught.append(plain(*args))
+        return caught[-1]
 
-    ik.qpsolvers.solve_problem = catch  # pyright: ignore[reportAttributeAccessIssue]
+    ik.mink.build_ik = catch
     try:
         expert.label(state)
     finally:
-        ik.qpsolvers.solve_problem = plain
+        ik.mink.build_ik = plain
     return caught[0] if caught else None
 
 

@@ -33,11 +33,11 @@ from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.recording import collect, provenance
+from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig
 from manip_il.sim.render import pictures
-from manip_il.sim.robot import ROBOTS
 
 HOLD = 10  # as `manip-il record`
 CAMERAS = CameraConfig(("front", "wrist"))
@@ -143,9 +143,9 @@ def replay_seconds(job: RolloutJob, seed: int, actions: np.ndarray) -> float:
     env = ManipEnv(config=job.env)
     env.start(seed)
     model, data, physics_steps = env.scene.model, env.data, job.env.physics_steps
-    controls = np.concatenate([actions, actions[:, -1:] / 2], axis=1).astype(np.float64)
-    controls[:, -2] /= 2  # the command is the opening; each finger goes half of it
-    order = [*env.scene.arm_ctrl, *env.scene.finger_ctrl]
+    space, gripper = env.scene.actions, env.scene.gripper
+    commands = [np.append(action[space.arm], gripper.command(action[space.gripper])) for action in actions]
+    controls, order = np.array(commands), [*env.scene.arm_ctrl, *gripper.ctrl]
     if job.cameras is not None:
         pictures(job.env.robot, job.env.task, data, job.cameras)  # the first makes the context
     started = time.perf_counter()

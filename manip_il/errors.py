@@ -46,6 +46,16 @@ class MismatchError(ManipError):
         super().__init__(f"{what} differs: {left} has {left_value}, {right} has {right_value}")
 
 
+class OlderSchemaError(ManipError):
+    """Data of another version of our columns, which cannot be read as today's; says how to make them again."""
+
+    def __init__(self, found: str, reads: int):
+        super().__init__(
+            f"written with schema {found} of manip_il's columns, and this version reads {reads}; make it again, into "
+            "another folder: manip-il record, train or dagger with the same options"
+        )
+
+
 class NotFiniteError(ManipError):
     """NaN or infinity where a number was needed."""
 

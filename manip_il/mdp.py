@@ -17,6 +17,7 @@ from manip_il.errors import ManipError, NotFiniteError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+STATE_EXTRAS = 4  # numbers of a `sim_state` beside physics and variation
 LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
 
 
@@ -28,48 +29,41 @@ class Actor(IntEnum):
     NOISY_EXPERT = 2
 
 
-class Phase(IntEnum):
-    """Where in the task the expert takes a state to be: the rung of its ladder of predicates."""
-
-    APPROACH = 0
-    DESCEND = 1
-    GRASP = 2
-    CARRY = 3
-    AT_GOAL = 4
-    OPEN = 5  # the gripper is closed where it must be open
-    NONE = 6  # no sound label
-
-
 @dataclass(frozen=True, slots=True)
 class State:
     """The full, privileged state: enough to restore the simulator exactly.
 
-    physics: MuJoCo's integration state, (p,). goal: [m], (3,) in the world frame.
-    step: control steps since reset. streak: control steps in a row within the tolerance.
-    ever: whether the episode has succeeded at some step.
+    physics: MuJoCo's integration state, (p,), goals and fixed furniture among it as mocap poses. variation: every model
+    parameter that was drawn for the episode, (v,). step: control steps since reset. streak: control steps in a row
+    within the tolerance. ever: whether the episode has succeeded at some step.
     """
 
     physics: F64
-    goal: F64
+    variation: F64
     step: int = 0
     streak: int = 0
     ever: bool = False
 
     def __post_init__(self) -> None:
-        _require_shape("State.goal", self.goal, (3,))
         require_finite("State.physics", self.physics)
-        require_finite("State.goal", self.goal)
+        require_finite("State.variation", self.variation)
 
     def to_vector(self) -> F64:
-        """One flat float64 vector, (p + 6,): the dataset's `sim_state`."""
-        return np.concatenate([self.physics, self.goal, [self.step, self.streak, self.ever]])
+        """One flat float64 vector, (p + v + 4,): the dataset's `sim_state`."""
+        tail = [len(self.variation), self.step, self.streak, self.ever]
+        return np.concatenate([self.physics, self.variation, tail])
 
     @classmethod
     def from_vector(cls, vector: F64) -> State:
-        """The inverse of `to_vector`, bit for bit."""
+        """The inverse of `to_vector`, bit for bit. Raises `ManipError` for a vector that is none of its."""
         vector = np.asarray(vector, dtype=np.float64)
-        step, streak, ever = vector[-3:]
-        return cls(vector[:-6].copy(), vector[-6:-3].copy(), int(step), int(streak), bool(ever))
+        end = len(vector) - STATE_EXTRAS
+        count, step, streak, ever = vector[end:] if end >= 0 else (-1, 0, 0, 0)
+        require_finite("the end of a simulator state", vector[end:])
+        if not (0 <= count <= end and count % 1 == 0):
+            raise ManipError(f"a simulator state of {len(vector)} numbers that says it has {count:g} of a variation")
+        cut = end - int(count)
+        return cls(vector[:cut].copy(), vector[cut:end].copy(), int(step), int(streak), bool(ever))
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +83,13 @@ class Observation:
 class Label:
     """The expert's answer in one state.
 
-    action: joint targets [rad] and gripper command [m], (n,). residual: what the step leaves of
-    the hand's pose error, in [0, 1] of the error before it. Where `valid` is false, `reason`
+    action: joint targets [rad] and gripper command [m], (n,). phase: number of the task's phase, 0 for none. residual:
+    what the step leaves of the hand's pose error, in [0, 1] of the error before it. Where `valid` is false, `reason`
     says why and `action` holds the arm still.
     """
 
     action: F64
-    phase: Phase
+    phase: int
     valid: bool
     residual: float
     reason: str = ""
@@ -108,8 +102,9 @@ class Label:
 class Transition:
     """One control step of one episode: all of a dataset's frame.
 
-    `state` and `observation` are from before the step; `reward`, `success`, `done` from after it.
-    `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame.
+    `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
+    `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame, and there
+    `final` is what was seen after it.
     """
 
     seed: int
@@ -122,6 +117,8 @@ class Transition:
     reward: float
     success: bool
     done: bool
+    progress: float = 0.0
+    final: Observation | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +126,15 @@ class Episode:
     """A finished episode as columns, keyed as the dataset is (without LeRobot's own index columns).
 
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
-    at some time. success_at_end: within the tolerance for the required steps at the last frame.
+    at some time. success_at_end: within the tolerance for the required steps at the last frame. final: what was seen
+    after every frame that is `next.done`, in their order, so that algorithms can bootstrap; empty where nobody looked.
     """
 
     seed: int
     columns: dict[str, NDArray[np.generic]]
     success: bool
     success_at_end: bool
+    final: tuple[Observation, ...] = ()
 
     def __post_init__(self) -> None:
         lengths = {key: len(column) for key, column in self.columns.items()}
@@ -152,7 +151,9 @@ class Episode:
     def without_pictures(self) -> Episode:
         """The same without its columns of pictures (T, height, width, 3)."""
         columns = {key: column for key, column in self.columns.items() if column.ndim < 4}
-        return self if len(columns) == len(self.columns) else replace(self, columns=columns)
+        if len(columns) == len(self.columns):
+            return self
+        return replace(self, columns=columns, final=tuple(replace(one, images={}) for one in self.final))
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
@@ -164,8 +165,3 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
     row = int(np.argwhere(~np.isfinite(values))[0][0])
     where = f"frame {row}" if values.ndim > 1 else f"index {row}"
     raise NotFiniteError(f"{what}: {values[row]} at {where} is not finite")
-
-
-def _require_shape(what: str, values: NDArray[np.generic], shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise ManipError(f"{what} has shape {values.shape}; expected {shape}")

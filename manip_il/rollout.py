@@ -27,6 +27,11 @@ class Environment(Protocol):
         """Whether the task is solved now."""
         ...
 
+    @property
+    def progress(self) -> float:
+        """How much of the task is done, 0 to 1."""
+        ...
+
     def start(self, seed: int) -> None:
         """Begin the episode of a seed."""
         ...
@@ -82,6 +87,7 @@ class Turn:
     state: State
     labeller: Labeller | None = None
     label: Label | None = None
+    progress: float = 0.0
 
     def ask(self) -> Label:
         """The expert's label of this state, from now on the turn's. Raises `ManipError` where there is no expert."""
@@ -163,7 +169,8 @@ def _next_episode(
 def _look(slot: _Slot, rules: Rules, labeller: Labeller | None) -> None:
     if slot.intruder is not None:
         slot.intruder.before(slot.step)
-    slot.turn = Turn(slot.seed, slot.step, slot.env.observe(), slot.env.get_state(), labeller)
+    env = slot.env
+    slot.turn = Turn(slot.seed, slot.step, env.observe(), env.get_state(), labeller, progress=env.progress)
     last = slot.step == rules.horizon - 1
     if labeller is not None and (rules.query == "every" or (rules.query == "last" and last)):
         slot.turn.ask()
@@ -189,4 +196,6 @@ def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition
         reward=float(solved),
         success=solved,
         done=done,
+        progress=slot.turn.progress,
+        final=slot.env.observe() if done else None,
     )

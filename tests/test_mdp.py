@@ -7,23 +7,25 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from manip_il.errors import ManipError, NotFiniteError
-from manip_il.mdp import Episode, Label, Observation, Phase, State, require_finite
+from manip_il.mdp import STATE_EXTRAS, Episode, Label, Observation, State, require_finite
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 @given(
     arrays(np.float64, st.integers(0, 40), elements=finite),
-    arrays(np.float64, 3, elements=finite),
+    arrays(np.float64, st.integers(0, 15), elements=finite),
     st.integers(0, 10_000),
     st.integers(0, 10_000),
     st.booleans(),
 )
-def test_a_state_survives_its_vector_bit_for_bit(physics, goal, step: int, streak: int, ever: bool):
-    state = State(physics, goal, step, streak, ever)
-    again = State.from_vector(state.to_vector())
+def test_a_state_survives_its_vector_bit_for_bit(physics, variation, step: int, streak: int, ever: bool):
+    state = State(physics, variation, step, streak, ever)
+    vector = state.to_vector()
+    assert (vector.dtype, len(vector)) == (np.float64, len(physics) + len(variation) + STATE_EXTRAS)
+    again = State.from_vector(vector)
     assert again.physics.tobytes() == physics.tobytes()
-    assert again.goal.tobytes() == goal.tobytes()
+    assert again.variation.tobytes() == variation.tobytes()
     assert (again.step, again.streak, again.ever) == (step, streak, ever)
 
 
@@ -32,17 +34,38 @@ def test_a_state_from_a_vector_owns_its_numbers():
     state = State.from_vector(vector)
     vector[:] = 7
     np.testing.assert_array_equal(state.physics, np.ones(5))
-    np.testing.assert_array_equal(state.goal, np.ones(3))
+    np.testing.assert_array_equal(state.variation, np.ones(3))
+
+
+@given(st.integers(0, 40), st.sampled_from([-1.0, 0.5, 41.0, 1e18]))
+def test_a_vector_that_says_it_holds_more_than_it_does_is_none(length: int, count: float):
+    vector = np.append(np.zeros(length), [count, 0, 0, 0])
+    with pytest.raises(ManipError, match=rf"a simulator state of {length + STATE_EXTRAS} numbers that says"):
+        State.from_vector(vector)
+
+
+@pytest.mark.parametrize("length", range(STATE_EXTRAS))
+def test_a_vector_too_short_for_a_state_is_none(length: int):
+    with pytest.raises(ManipError, match=f"a simulator state of {length} numbers"):
+        State.from_vector(np.zeros(length))
+
+
+@pytest.mark.parametrize("place", range(7))
+def test_a_vector_with_a_number_that_is_not_finite_is_none(place: int):
+    vector = State(np.ones(2), np.ones(1)).to_vector()
+    vector[place] = np.nan
+    with pytest.raises(NotFiniteError):
+        State.from_vector(vector)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_is_refused_where_it_enters(bad: float):
     with pytest.raises(NotFiniteError, match=r"State\.physics: .* at index 2"):
         State(np.array([0.0, 0.0, bad]), np.zeros(3))
-    with pytest.raises(NotFiniteError, match=r"State\.goal: .* at index 1"):
+    with pytest.raises(NotFiniteError, match=r"State\.variation: .* at index 1"):
         State(np.zeros(4), np.array([0.0, bad, 0.0]))
     with pytest.raises(NotFiniteError, match=r"Label\.action"):
-        Label(np.array([bad]), Phase.APPROACH, True, 0.0)
+        Label(np.array([bad]), 1, True, 0.0)
     with pytest.raises(NotFiniteError, match=r"observation\.environment_state"):
         Observation(np.zeros(2, np.float32), np.array([bad], np.float32))
 
@@ -56,11 +79,6 @@ def test_the_row_that_is_not_finite_is_named():
 
 def test_whole_numbers_are_always_finite():
     require_finite("actor", np.array([[1], [2]]))
-
-
-def test_a_goal_has_three_coordinates():
-    with pytest.raises(ManipError, match=r"State\.goal has shape \(2,\); expected \(3,\)"):
-        State(np.zeros(4), np.zeros(2))
 
 
 def test_columns_of_unequal_lengths_are_refused_with_both_numbers():
@@ -81,3 +99,13 @@ def test_a_state_cannot_be_changed():
     state = State(np.zeros(2), np.zeros(3))
     with pytest.raises(FrozenInstanceError):
         state.step = 3  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_without_pictures_neither_columns_nor_last_observations_have_any():
+    seen = Observation(np.zeros(2, np.float32), np.zeros(3, np.float32), {"front": np.zeros((4, 4, 3), np.uint8)})
+    columns = {"action": np.zeros((2, 2)), "observation.images.front": np.zeros((2, 4, 4, 3), np.uint8)}
+    plain = Episode(0, columns, True, True, (seen,)).without_pictures()
+    assert list(plain.columns) == ["action"]
+    assert plain.final[0].images == {}
+    np.testing.assert_array_equal(plain.final[0].state, seen.state)
+    assert plain.without_pictures() is plain

@@ -8,7 +8,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 
-from manip_il.mdp import Actor, Label, Observation, Phase, State, Transition
+from manip_il.mdp import Actor, Label, Observation, State, Transition
 from manip_il.rollout import Rules, Turn, rollout
 
 GOAL = 3.0
@@ -24,6 +24,10 @@ class Counter:
     def solved(self) -> bool:
         return self.x >= GOAL
 
+    @property
+    def progress(self) -> float:
+        return min(1.0, max(0.0, self.x / GOAL))
+
     def start(self, seed: int) -> None:
         self.x, self.steps = -float(seed % 10), 0
 
@@ -35,7 +39,7 @@ class Counter:
         return Observation(np.array([self.x], np.float32), np.array([self.steps], np.float32))
 
     def get_state(self) -> State:
-        return State(np.array([self.x]), np.zeros(3), self.steps)
+        return State(np.array([self.x]), np.empty(0), self.steps)
 
 
 class Ones:
@@ -46,7 +50,7 @@ class Ones:
 
     def label(self, state: State) -> Label:
         self.asked.append(state.step)
-        return Label(np.array([1.0]), Phase.CARRY, True, 0.0)
+        return Label(np.array([1.0]), 1, True, 0.0)
 
 
 class Halves:
@@ -128,6 +132,24 @@ def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
     assert [frame.observation.state[0] for frame in frames] == [0, 1, 2, 3]
     assert [frame.success for frame in frames] == [False, False, True, True]
     assert [frame.reward for frame in frames] == [0, 0, 1, 1]
+
+
+def test_progress_is_that_of_the_state_before_the_step():
+    frames = episodes(rollout([Counter()], [0], Follow(), Rules(horizon=4), Ones()))[0]
+    assert [frame.progress for frame in frames] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+
+
+@pytest.mark.parametrize("envs", [1, 3])
+def test_the_last_frame_alone_has_what_was_seen_after_it(envs: int):
+    rules = Rules(horizon=6, hold=1)
+    found = episodes(rollout([Counter() for _ in range(envs)], range(4), Follow(), rules, Ones()))
+    for frames in found.values():
+        assert all(frame.final is None for frame in frames[:-1])
+        last = frames[-1]
+        assert last.done
+        # One action on from the last state, though the environment may have begun another episode by now.
+        assert last.final.state[0] == last.state.physics[0] + last.executed_action[0]
+        assert last.final.environment_state[0] == len(frames)
 
 
 @pytest.mark.parametrize(("hold", "length"), [(0, 3), (2, 5), (None, 30)])

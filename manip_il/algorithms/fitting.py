@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from manip_il.algorithms import sampling
 from manip_il.algorithms.config import RunConfig
 from manip_il.data.lerobot_io import read_tables
-from manip_il.engine.choose import step_scale
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import stream_base
-from manip_il.sim.robot import get_robot
+from manip_il.sim.scene import build_scene
 
 F64 = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
@@ -78,4 +77,5 @@ def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
     """How often each frame of the datasets is drawn; None where all are alike."""
     if config.sampling.is_even:
         return None
-    return config.sampling.weights(read_tables(roots, sampling.COLUMNS), step_scale(get_robot(config.env.robot)))
+    scale = build_scene(config.env.robot, config.env.task).actions.scale
+    return config.sampling.weights(read_tables(roots, sampling.COLUMNS), scale)

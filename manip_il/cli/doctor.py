@@ -83,9 +83,9 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     except (OSError, ValueError, TypeError, RecursionError, ManipError):
         return  # named by the check of the spec
     from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.robots.robot import ROBOTS
     from manip_il.sim.env import EnvConfig
-    from manip_il.sim.robot import ROBOTS
-    from manip_il.sim.task import TASKS
+    from manip_il.tasks.table import TASKS
 
     if spec.robot not in ROBOTS or spec.task not in TASKS:
         yield warning(OURS, f"is for {spec.robot} {spec.task}, which is not known here")

@@ -83,9 +83,9 @@ class EnvGroup:
 
     def config(self, robot: str, task: str, control_hz: int = DEFAULT_HZ) -> EnvConfig:
         """The environment; `UnknownName` for a robot or task, `UsageError` for a value."""
+        from manip_il.robots.robot import get_robot
         from manip_il.sim.env import EnvConfig
-        from manip_il.sim.robot import get_robot
-        from manip_il.sim.task import get_task
+        from manip_il.tasks.table import get_task
 
         get_robot(robot)
         get_task(task)
@@ -233,9 +233,9 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
     from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.robots.robot import ROBOTS
     from manip_il.sim.env import EnvConfig
-    from manip_il.sim.robot import ROBOTS
-    from manip_il.sim.task import TASKS
+    from manip_il.tasks.table import TASKS
 
     if spec.robot not in ROBOTS or spec.task not in TASKS:
         warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])

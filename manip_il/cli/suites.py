@@ -28,9 +28,9 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
     Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera.
     Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where nothing is left.
     """
-    from manip_il.sim.task import get_task
+    from manip_il.tasks.table import get_task
 
-    has_object = get_task(task).has_object
+    has_object = bool(get_task(task).grasped)
     asked = [_read(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
     if not left:
@@ -59,8 +59,8 @@ def _read(name: str) -> Condition:
 
 def read_condition(path: Path) -> Condition:
     """A YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
-    from manip_il.data.yaml_file import read_yaml
     from manip_il.sim.conditions import Condition
+    from manip_il.yaml_file import read_yaml
 
     tree = read_yaml(path, "a YAML of ranges")
     if not isinstance(tree, dict | None):

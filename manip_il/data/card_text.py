@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from manip_il.data.remote.errors import redact
-from manip_il.data.yaml_file import parse_yaml
+from manip_il.yaml_file import parse_yaml
 
 MADE_BY = "| made by | manip_il"
 LICENSE = "apache-2.0"

@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import schema
-from manip_il.mdp import Episode, Phase, Transition
+from manip_il.mdp import Episode, Observation, Transition
+
+_FINAL = "final/"  # before the number of a part and a column: what was seen after its last frame
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
@@ -32,7 +35,7 @@ def to_episode(
 ) -> Episode:
     """An episode with the schema's columns.
 
-    labelled: with the columns of labels; where nobody asked, `label_valid` is 0, the phase NONE, and the label the
+    labelled: with the columns of labels; where nobody asked, `label_valid` is 0, the phase 0, and the label the
     executed action. path: the first so many frames decide whether it succeeded; by default all.
     """
     count = len(frames)
@@ -42,13 +45,14 @@ def to_episode(
         schema.EXECUTED_ACTION: np.stack([frame.executed_action for frame in frames]).astype(np.float32),
         schema.ACTOR: _column([frame.actor for frame in frames], np.int64),
         schema.SIM_STATE: np.stack([frame.state.to_vector() for frame in frames]),
+        schema.PROGRESS: _column([frame.progress for frame in frames], np.float32),
         schema.REWARD: _column([frame.reward for frame in frames], np.float32),
         schema.SUCCESS: _column([frame.success for frame in frames], np.bool_),
         schema.DONE: _column([frame.done for frame in frames], np.bool_),
         schema.SEED: _column([frame.seed for frame in frames], np.int64),
         schema.ROUND: _column([round_] * count, np.int64),
         schema.BETA: _column([beta] * count, np.float32),
-        schema.EXPERT_PHASE: _column([frame.label.phase if frame.label else Phase.NONE for frame in frames], np.int64),
+        schema.EXPERT_PHASE: _column([frame.label.phase if frame.label else 0 for frame in frames], np.int64),
     }
     for camera in frames[0].observation.images:
         columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
@@ -61,6 +65,7 @@ def to_episode(
         columns=columns,
         success=any(frame.success for frame in decides),
         success_at_end=decides[-1].success,
+        final=tuple(frame.final for frame in frames if frame.done and frame.final is not None),
     )
 
 
@@ -70,7 +75,39 @@ def parts(episode: Episode) -> list[Episode]:
     if len(ends) < 2:
         return [episode]
     starts = [0, *ends[:-1].tolist()]
-    return [_part(episode, slice(start, end)) for start, end in zip(starts, ends.tolist(), strict=True)]
+    finals = [(one,) for one in episode.final] if len(episode.final) == len(ends) else [()] * len(ends)
+    return [_part(episode, slice(*rows), final) for *rows, final in zip(starts, ends.tolist(), finals, strict=True)]
+
+
+def final_columns(final: Sequence[Observation]) -> dict[str, NDArray[Any]]:
+    """What was seen after each part of an episode as named arrays, the inverse of `take_final`."""
+    columns: dict[str, NDArray[Any]] = {}
+    for number, one in enumerate(final):
+        pictures = {schema.IMAGES + camera: picture for camera, picture in one.images.items()}
+        shown = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
+        columns |= {f"{_FINAL}{number}/{key}": values for key, values in shown.items()}
+    return columns
+
+
+def take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
+    """Remove what `final_columns` gave from `columns`, and return it as it was.
+
+    Raises `ValueError` for numbers that are not counted from 0, or without joints or environment.
+    """
+    found: dict[str, dict[str, NDArray[Any]]] = {}
+    for name in [name for name in columns if name.startswith(_FINAL)]:
+        number, _, key = name.removeprefix(_FINAL).partition("/")
+        found.setdefault(number, {})[key] = columns.pop(name)
+    if sorted(found) != sorted(map(str, range(len(found)))) or any(
+        {schema.STATE, schema.ENVIRONMENT_STATE} - shown.keys() for shown in found.values()
+    ):
+        raise ValueError(f"it holds last observations {checks.shorten(sorted(found))}; expected them whole, from 0 on")
+    return tuple(_final(found[str(number)]) for number in range(len(found)))
+
+
+def _final(shown: dict[str, NDArray[Any]]) -> Observation:
+    pictures = {key.removeprefix(schema.IMAGES): one for key, one in shown.items() if key.startswith(schema.IMAGES)}
+    return Observation(shown[schema.STATE], shown[schema.ENVIRONMENT_STATE], pictures)
 
 
 def count_labels(episode: Episode) -> int:
@@ -85,10 +122,10 @@ def first_labels(episode: Episode, most: int) -> Episode:
     return replace(episode, columns=episode.columns | {schema.LABEL_VALID: kept})
 
 
-def _part(episode: Episode, rows: slice) -> Episode:
+def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Episode:
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
-    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()))
+    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final)
 
 
 def _taught(frame: Transition) -> NDArray[np.float64]:

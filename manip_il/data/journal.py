@@ -27,8 +27,9 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data import foxglove
+from manip_il.data import foxglove, schema
 from manip_il.data.atomic import PARTIAL, write_file
+from manip_il.data.episodes import final_columns, take_final
 from manip_il.data.foxglove_episode import channels, frame_times
 from manip_il.data.mcap_records import (
     MIB,
@@ -41,10 +42,10 @@ from manip_il.data.mcap_records import (
     unpack,
 )
 from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mdp import Episode
 
-_FORMAT = "1"
+_FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _HEADER_KEYS = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")
 _NPY = ".npy"
@@ -129,7 +130,8 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
             shape = (header.frames, *header.spec.image_size, 3)
             pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
             columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
-        episode = Episode(header.seed, columns, header.success, header.success_at_end)
+        final = take_final(columns)
+        episode = Episode(header.seed, columns, header.success, header.success_at_end, final)
         if len(episode) != header.frames:
             raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
         return header, episode
@@ -172,6 +174,8 @@ def set_aside_damaged(folder: Path) -> list[str]:
     for path in list_episodes(folder):
         try:
             read_journal(path)
+        except OlderSchemaError:
+            raise  # nothing is wrong with it
         except ManipError as error:
             path.rename(path.with_name(path.name + _DAMAGED))
             wrong.append(f"{error} (set aside as {path.name}{_DAMAGED})")
@@ -207,7 +211,7 @@ def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str,
         },
     )
     _add_channels(writer, episode, spec)
-    for key, column in episode.columns.items():
+    for key, column in (episode.columns | final_columns(episode.final)).items():
         if key.startswith(IMAGES):
             continue  # pictures travel as messages, without loss as well
         writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
@@ -285,6 +289,8 @@ def _header(stream: BinaryIO) -> Header:
         raise ValueError(f"it holds {len(ours)} metadata records {_RECORD!r}; expected one")
     data = ours[0]
     if (found := data.get("format")) != _FORMAT:
+        if found == "1":
+            raise OlderSchemaError("1", schema.VERSION)
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
     if missing := [key for key in _HEADER_KEYS if key not in data]:
         raise ValueError(f"its header lacks {', '.join(missing)}")
@@ -305,6 +311,9 @@ def _explain(path: Path) -> Generator[None]:
         yield
     except FileNotFoundError as error:
         raise ManipError(f"no such episode file: {path}") from error
+    except OlderSchemaError as error:
+        error.args = (f"{path}: {error}",)
+        raise
     except Exception as error:  # a damaged file can make a parser raise anything
         why = str(error) or type(error).__name__
         raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error

@@ -35,8 +35,8 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.mcap_path import FieldPath, parse_path
 from manip_il.data.resample import Method
 from manip_il.data.schema import MOST_FPS
-from manip_il.data.yaml_file import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.yaml_file import read_yaml
 
 TEXT = "string"  # LeRobot's dtype of text
 _WHOLE = tuple(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.errors import ManipError, MismatchError, OlderSchemaError, UnknownName
 from manip_il.mdp import Episode, require_finite
 
 STATE = "observation.state"
@@ -22,6 +22,7 @@ ACTOR = "actor"
 LABEL_VALID = "label_valid"
 EXPERT_PHASE = "expert_phase"
 SIM_STATE = "sim_state"
+PROGRESS = "progress"
 REWARD = "next.reward"
 SUCCESS = "next.success"
 DONE = "next.done"
@@ -29,6 +30,7 @@ SEED = "seed"
 ROUND = "round"
 BETA = "beta"
 
+VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FRAMES = 1_000_000  # of an episode
 MOST_FPS = 10_000  # control steps a second
 MOST_NAMES = 10_000  # joints, or numbers that the environment's state has
@@ -57,13 +59,15 @@ class RobotTaskSpec:
     action_meaning: str = "joint position targets [rad], gripper opening command [m]"
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
+    phases: tuple[str, ...] = ()  # what `expert_phase` counts: none, then the rungs of the task's ladder
+    schema: int = VERSION
 
     def __post_init__(self) -> None:
         checks.name("robot", self.robot)
         checks.name("task", self.task)
         checks.whole("fps", self.fps, 1, MOST_FPS)
         checks.whole("sim_state_size", self.sim_state_size, 0, _LARGEST_STATE)
-        for what in ("joint_names", "environment_state_names"):
+        for what in ("joint_names", "environment_state_names", "phases"):
             for one in checks.array(what, getattr(self, what), MOST_NAMES):
                 checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
         for what in ("instruction", "action_meaning"):
@@ -82,6 +86,8 @@ class RobotTaskSpec:
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
         """The inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
         checks.mapping("a robot-task spec", data)
+        if (found := data.get("schema", 1)) != VERSION:
+            raise OlderSchemaError(checks.shorten(found), VERSION)
         known = {field.name for field in fields(cls)}
         needed = {field.name for field in fields(cls) if field.default is MISSING}
         if odd := sorted((needed - set(data)) | (set(data) - known)):
@@ -119,6 +125,7 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
         LABEL_VALID: _feature("int64", ["label_valid"]),
         EXPERT_PHASE: _feature("int64", ["phase"]),
         SIM_STATE: {"dtype": "float64", "shape": (spec.sim_state_size,), "names": None},
+        PROGRESS: _feature("float32", ["progress"]),
         REWARD: _feature("float32", ["reward"]),
         SUCCESS: _feature("bool", ["success"]),
         DONE: _feature("bool", ["done"]),

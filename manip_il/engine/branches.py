@@ -35,6 +35,10 @@ class _Restored:
         self.advance, self.observe, self.get_state = env.advance, env.observe, env.get_state
 
     @property
+    def progress(self) -> float:
+        return self._env.progress
+
+    @property
     def solved(self) -> bool:
         return self._env.solved
 

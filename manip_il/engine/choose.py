@@ -22,7 +22,6 @@ from manip_il.engine.sight import drawn_cameras
 from manip_il.learn.pretrained import check_interface
 from manip_il.rollout import Driver
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.robot import Robot
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.engine.jobs import RolloutJob
@@ -31,13 +30,12 @@ if TYPE_CHECKING:  # torch only where a learner drives
 
 def choose_driver(job: RolloutJob, env: ManipEnv) -> Driver:
     """The driver of a job, with its gate. Raises what loading a policy raises."""
-    robot = env.scene.robot
     if job.driver == "expert":
         return ExpertDriver()
     if job.driver == "noisy_expert":
         return NoisyExpertDriver(np.asarray(job.noise))
     if job.driver == "random":
-        return RandomDriver(robot.max_joint_step, robot.max_opening)
+        return RandomDriver(env.scene.actions)
     assert job.policy is not None
     policy = _load(job, job.policy, env)
     driver = LearnerDriver(policy) if job.driver == "policy" else MixtureDriver(policy, job.beta)
@@ -47,15 +45,8 @@ def choose_driver(job: RolloutJob, env: ManipEnv) -> Driver:
     return driver if job.label == "last" or by_rules else QueryingDriver(driver, _gate(job, policy, env))
 
 
-def step_scale(robot: Robot) -> np.ndarray:
-    """What differences between actions are measured in, (n,): the longest joint step [rad], the whole opening [m]."""
-    scale = np.full(len(robot.joint_names), robot.max_joint_step)
-    scale[-1] = robot.max_opening
-    return scale
-
-
 def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> query.Gate:
-    kind, bound, scale = job.query.kind, job.query.bound, step_scale(env.scene.robot)
+    kind, bound, scale = job.query.kind, job.query.bound, env.scene.actions.scale
     if kind == "one":
         return query.at_drawn_step(job.env.horizon)
     if kind == "probability":

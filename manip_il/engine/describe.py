@@ -10,13 +10,14 @@ from typing import Any
 
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import RobotTaskSpec
+from manip_il.mdp import STATE_EXTRAS
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import CameraConfig
 from manip_il.sim.observe import environment_state_names
 from manip_il.sim.scene import build_scene
+from manip_il.tasks.task import phases
 
 _TOLD_TO_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
-_STATE_EXTRAS = 6  # goal, step, streak, ever: what State.to_vector adds to the physics state
 
 
 @cache
@@ -24,13 +25,14 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
     """Names, sizes and rate that a dataset or policy for this environment must share."""
     scene = build_scene(config.robot, config.task)
     return RobotTaskSpec(
-        robot=config.robot,
+        robot=scene.robot.name,
         task=config.task,
         fps=config.control_hz,
         joint_names=scene.robot.joint_names,
-        environment_state_names=environment_state_names(scene.task),
-        sim_state_size=scene.state_size + _STATE_EXTRAS,
+        environment_state_names=environment_state_names(scene),
+        sim_state_size=scene.state_size + len(scene.nominal) + STATE_EXTRAS,
         instruction=scene.task.instruction,
+        phases=phases(scene.task),
         cameras=cameras.names if cameras else (),
         image_size=(cameras.height, cameras.width) if cameras else (0, 0),
     )

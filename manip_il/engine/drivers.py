@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from manip_il.engine.query import Gate, seen
 from manip_il.mdp import Actor
 from manip_il.policy import Policy
+from manip_il.robots.action_space import ActionSpace
 from manip_il.rollout import Driver, Turn
 from manip_il.seeding import rng_for
 
@@ -103,10 +104,10 @@ class TakeoverDriver:
 
 
 class RandomDriver:
-    """Joint targets drawn evenly within `reach` [rad] of the measured joints, any gripper opening."""
+    """Joint targets drawn evenly within the longest step of the measured joints, any gripper opening."""
 
-    def __init__(self, reach: float, max_opening: float):
-        self._reach, self._max_opening = reach, max_opening
+    def __init__(self, actions: ActionSpace):
+        self._actions = actions
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
@@ -115,5 +116,4 @@ class RandomDriver:
 
     def _draw(self, turn: Turn) -> F64:
         rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "random policy"))
-        q = turn.observation.state[:-1].astype(np.float64)
-        return np.append(q + rng.uniform(-self._reach, self._reach, len(q)), rng.uniform(0, self._max_opening))
+        return self._actions.random_near(turn.observation.state.astype(np.float64), rng)

@@ -153,7 +153,8 @@ def _environment(env: EnvConfig, cameras: CameraConfig | None, conditions: tuple
 
 
 def _without_pictures(transition: Transition) -> Transition:
-    return replace(transition, observation=replace(transition.observation, images={}))
+    final = replace(transition.final, images={}) if transition.final else None
+    return replace(transition, observation=replace(transition.observation, images={}), final=final)
 
 
 @cache

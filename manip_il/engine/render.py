@@ -33,10 +33,10 @@ from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
+from manip_il.robots.robot import ROBOTS
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import PLAIN, Appearance, CameraConfig
-from manip_il.sim.robot import ROBOTS
-from manip_il.sim.task import TASKS
+from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
 _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that pictures of a state depend on

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import META_FILE, read_meta
 from manip_il.learn.pretrained import read_interface
-from manip_il.sim.look import CameraConfig, Look
-from manip_il.sim.world import CAMERAS
+from manip_il.sim.look import CAMERAS, CameraConfig, Look
 
 if TYPE_CHECKING:
     from manip_il.engine.jobs import RolloutJob

@@ -26,7 +26,7 @@ from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.disturb import Disturbance
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.perturb import Perturbation, kinds_for
-from manip_il.sim.task import get_task
+from manip_il.tasks.table import get_task
 
 _LOG = logging.getLogger(__name__)
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range

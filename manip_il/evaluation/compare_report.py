@@ -191,7 +191,7 @@ def _phases(comparison: Comparison) -> str:
     episodes = [[e for member in arm.members for e in member.result.episodes] for arm in _arms(comparison)]
     if not any(e.phase_at_end and not e.success for arm in episodes for e in arm):
         return ""
-    rows = phase_rows(episodes, has_object=has_object(comparison.left.members[0].result))
+    rows = phase_rows(episodes, comparison.left.members[0].result.task)
     keys = "".join(
         f'<li><i class="key {kind}"></i>{escape(name)}</li>' for kind, name in zip(KINDS, comparison.names, strict=True)
     )

@@ -130,7 +130,7 @@ def _where(report: EvalReport) -> str:
         return sections.section("Where it fails", f'<p class="lead">{nothing}</p>', _map(result, failed))
     parts = [_map(result, failed)]
     if any(result.failures):
-        rows = phase_rows([result.episodes], has_object=has_object(result))
+        rows = phase_rows([result.episodes], result.task)
         parts += ["<h3>The phase that they ended in</h3>", phase_chart(rows, ["cloning"], [result.policy])]
         count = "The one failed episode" if failed == 1 else f"The {failed:,} failed episodes"
         words = f"{count} by the phase of the task that the expert assigned to the last state, in task order."

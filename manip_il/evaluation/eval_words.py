@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from manip_il.evaluation.condition_chart import hardest
-from manip_il.evaluation.episode_facts import by_condition, has_object
+from manip_il.evaluation.episode_facts import by_condition
 from manip_il.evaluation.factors import Factor
 from manip_il.evaluation.phase_chart import NOT_TOLD, phase_words
 from manip_il.evaluation.report_data import format_percent
@@ -51,7 +51,7 @@ def _phase_fact(result: EvalResult) -> str:
     phase = main_phase(result)
     if phase is None:
         return "" if result.success.successes == result.success.n else f"The phase of failures is {NOT_TOLD}."
-    words = phase_words(phase[0], has_object=has_object(result))
+    words = phase_words(phase[0], result.task)
     return f"{_named(phase[0]).capitalize()}, where failures end most often: {words}." if words else ""
 
 

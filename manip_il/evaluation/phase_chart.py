@@ -10,25 +10,11 @@ from html import escape
 from manip_il.evaluation.charts import BAR_HEIGHT
 from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.svg import element, percent, title
-from manip_il.mdp import Phase
+from manip_il.tasks.table import TASKS
+from manip_il.tasks.task import NO_PHASE
 
 NOT_TOLD = "not recorded"
-# In the order in which an episode passes them; what each means with an object, and with the hand alone.
-MEANINGS: dict[Phase, tuple[str, str]] = {
-    Phase.OPEN: ("the fingers are closed, or not open wide enough to go around the object", ""),
-    Phase.APPROACH: ("the hand is on its way to above the object", ""),
-    Phase.DESCEND: ("the hand goes down to the object", ""),
-    Phase.GRASP: ("the fingers are around the object and close, but do not hold it yet", ""),
-    Phase.CARRY: ("the object is in the hand, on its way to the goal", "the hand is on its way to the goal"),
-    Phase.AT_GOAL: (
-        "the object is at the goal, but was not held there for long enough",
-        "the hand is at the goal, but did not stay for long enough",
-    ),
-    Phase.NONE: (
-        "not even the expert can continue: the object is off the table or out of reach",
-        "not even the expert can continue from here",
-    ),
-}
+_NONE = "not even the expert can continue: an object is off the table, or something is out of reach"
 
 
 @dataclass(frozen=True)
@@ -40,20 +26,25 @@ class PhaseRow:
     counts: tuple[int, ...]
 
 
-def phase_rows(policies: Sequence[Sequence[EpisodeResult]], *, has_object: bool) -> tuple[PhaseRow, ...]:
-    """The ladder's phases in order, those of the task alone; then what a foreign file calls by other names."""
+def phase_rows(policies: Sequence[Sequence[EpisodeResult]], task: str) -> tuple[PhaseRow, ...]:
+    """The phases of a task's ladder in order; then what a foreign file calls by other names."""
     counted = [Counter(e.phase_at_end or NOT_TOLD for e in episodes if not e.success) for episodes in policies]
-    meanings = {phase.name.lower(): words[0 if has_object else 1] for phase, words in MEANINGS.items()}
+    meanings = _meanings(task)
     others = sorted({name for counts in counted for name in counts} - meanings.keys())
     rows = [PhaseRow(name, words, tuple(c[name] for c in counted)) for name, words in meanings.items()]
-    rows += [PhaseRow(name, "", tuple(c[name] for c in counted)) for name in others]
-    return tuple(row for row in rows if row.meaning or any(row.counts))
+    return (*rows, *(PhaseRow(name, "", tuple(c[name] for c in counted)) for name in others))
 
 
-def phase_words(phase: str, *, has_object: bool) -> str:
-    """What a phase means; empty for one that the ladder does not have."""
-    named = {known.name.lower(): words for known, words in MEANINGS.items()}
-    return named.get(phase, ("", ""))[0 if has_object else 1]
+def phase_words(phase: str, task: str) -> str:
+    """What a phase means; empty for one that the task's ladder does not have."""
+    return _meanings(task).get(phase, "")
+
+
+def _meanings(task: str) -> dict[str, str]:
+    """Name -> words, from the first rung to the last; empty for a task that is not known here."""
+    if task not in TASKS:
+        return {}
+    return {rung.name: rung.words for rung in reversed(TASKS[task].rungs)} | {NO_PHASE: _NONE}
 
 
 def phase_chart(rows: Sequence[PhaseRow], kinds: Sequence[str], names: Sequence[str]) -> str:

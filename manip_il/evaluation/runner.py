@@ -16,8 +16,10 @@ from manip_il.engine.where import places
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.statistics import Proportion
-from manip_il.mdp import Episode, Phase
+from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
+from manip_il.sim.scene import build_scene
+from manip_il.tasks.task import phases
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: whether it lasts, and no more
@@ -83,22 +85,23 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         success_at_end=episode.success_at_end,
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
-        phase_at_end=_last_phase(episode).name.lower(),
+        phase_at_end=_last_phase(job, episode),
         detail={
             "steps_to_success": first,
             "condition": met.condition,
             "drawn": dict(met.drawn),
-            "goal": start.pop("goal"),
+            "goal": start.pop("goal", None),
             "start": start,
             "end": {name: at for name, at in end.items() if name != "goal"},
         },
     )
 
 
-def _last_phase(episode: Episode) -> Phase:
+def _last_phase(job: RolloutJob, episode: Episode) -> str:
     """What the expert calls the last state; nobody asks it about one in which the task is solved."""
-    phase = Phase(int(episode.columns[schema.EXPERT_PHASE].ravel()[-1]))
-    return Phase.AT_GOAL if phase == Phase.NONE and episode.success_at_end else phase
+    names = phases(build_scene(job.env.robot, job.env.task).task)
+    phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
+    return names[-1] if phase == 0 and episode.success_at_end else names[phase]
 
 
 def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence[int]]:

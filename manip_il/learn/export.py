@@ -34,8 +34,8 @@ EXTRA_FILE = "manip_il.json"  # in a TorchScript file: its metadata
 TOLERANCE = 1e-5  # [rad] or [m], between the file's actions and the checkpoint's
 _OPSET = 17
 _ROWS = 64  # observations on which file and checkpoint are compared
-_UNITS = {"x": "m", "y": "m", "z": "m", "tilt": "rad"}
-_UNITLESS = re.compile(r"r[xyz][xyz]|cos.*|sin.*")
+_UNITS = {"x": "m", "y": "m", "z": "m", "width": "m", "tilt": "rad"}
+_UNITLESS = re.compile(r".*\.(axis_[xyz]\.[xyz]|cos[^.]*|sin[^.]*)")
 
 Arrays = dict[str, NDArray[Any]]
 Run = Callable[[Arrays], NDArray[np.float32]]
@@ -198,8 +198,7 @@ def _joint_units(n: int) -> list[str]:
 
 def _unit(name: str) -> str | None:
     """Of a number of the environment state, by its name; None where that does not say."""
-    leaf = name.rpartition(".")[2]
-    return "1" if _UNITLESS.fullmatch(leaf) else _UNITS.get(leaf)
+    return "1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2])
 
 
 def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction, dict[str, Any]]:

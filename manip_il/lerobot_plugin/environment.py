@@ -20,12 +20,12 @@ from manip_il.data.lerobot_log import shorten_ffmpeg_warning
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName
 from manip_il.learn.observation import OBSERVATIONS
+from manip_il.robots.robot import get_robot
 from manip_il.sim import env as sim
 from manip_il.sim.look import CameraConfig
 from manip_il.sim.observe import environment_state_names
 from manip_il.sim.register import ENV_IDS, register_envs
-from manip_il.sim.robot import get_robot
-from manip_il.sim.task import get_task
+from manip_il.sim.scene import build_scene
 
 PACKAGE = "manip_il"
 TASKS = {env_id.removeprefix(f"{PACKAGE}/"): names for env_id, names in ENV_IDS.items()}
@@ -119,7 +119,7 @@ class ManipILEnv(EnvConfig):
             "agent_pos": PolicyFeature(FeatureType.STATE, joints),
         }
         if self.observation != "images":
-            size = len(environment_state_names(get_task(simulation.task)))
+            size = len(environment_state_names(build_scene(simulation.robot, simulation.task)))
             features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
         if pictured is not None:
             picture = PolicyFeature(FeatureType.VISUAL, (*pictured.size, 3))

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
-from manip_il.sim.look import PLAIN, Appearance
-from manip_il.sim.world import CAMERAS, CUBE_HALF_SIZE
+from manip_il.sim.look import CAMERAS, PLAIN, Appearance
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
-CUBE_EDGE = 2 * CUBE_HALF_SIZE  # [m]
 # What a value may be at most and at least; outside, a range is a slip of the pen and not an experiment.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
@@ -137,7 +135,7 @@ class Circumstances:
         shift, turn = self.drawn.get("camera_shift", {}), self.drawn.get("camera_turn", {})
         colour = self.drawn.get("colour")
         return Appearance(
-            edge=self.number("size", CUBE_EDGE),
+            edge=self.drawn.get("size"),
             colour=None if colour is None else tuple(colour),
             camera_shift=tuple((name, tuple(shift[name])) for name in CAMERAS if name in shift),
             camera_turn=tuple((name, tuple(turn[name])) for name in CAMERAS if name in turn),

@@ -15,8 +15,7 @@ from manip_il.errors import UsageError
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import Circumstances
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.task import in_reach
-from manip_il.sim.world import CUBE_HALF_SIZE
+from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
 _MAX_DRAWS = 100
@@ -48,9 +47,8 @@ STANDARD = Disturbance(action_noise=0.1, knock=(0.05, 0.08))
 
 def noisy(action: F64, env: ManipEnv, share: float, rng: np.random.Generator) -> F64:
     """`action` (n,) with Gaussian noise of `share` of its range."""
-    robot = env.scene.robot
-    spread = np.full(len(action), 2 * robot.max_joint_step)
-    spread[-1] = robot.max_opening
+    actions = env.scene.actions
+    spread = np.where(actions.relative, 2, 1) * actions.scale
     return action + rng.normal(0.0, share, len(action)) * spread
 
 
@@ -72,63 +70,68 @@ def jolt_joints(env: ManipEnv, rng: np.random.Generator, largest: float) -> bool
 
     Draws in which something would stand inside something else are drawn again; returns whether one was found.
     """
-    scene, data = env.scene, env.data
-    low, high = scene.arm_range.T
+    scene, world, data = env.scene, env.world, env.data
+    low, high = scene.actions.low[scene.actions.arm], scene.actions.high[scene.actions.arm]
     before = data.qpos.copy()
     for _ in range(_MAX_DRAWS):
         q = before[scene.arm_q] + rng.uniform(-largest, largest, len(scene.arm_q))
-        data.qpos[scene.arm_q] = np.clip(q, low, high)
-        _carry_along(env, before)
+        _carry_along(world, before, np.clip(q, low, high))
         data.qvel[:] = 0.0
-        mujoco.mj_forward(scene.model, data)
+        _settle(world)
         if all(contact.dist > _OVERLAP for contact in data.contact):
             return True
     data.qpos[:] = before
-    mujoco.mj_forward(scene.model, data)
+    _settle(world)
     return False
 
 
 def set_fingers(env: ManipEnv, opening: float) -> None:
     """Command an opening [m] and put the gripper there, unless the object is in the way."""
-    scene, data = env.scene, env.data
-    before = data.qpos[scene.finger_q].copy()
-    data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = opening / 2
-    mujoco.mj_forward(scene.model, data)
+    gripper, data = env.scene.gripper, env.data
+    before = data.qpos[gripper.q].copy()
+    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(opening)
+    _settle(env.world)
     if any(contact.dist <= _OVERLAP for contact in data.contact):
-        data.qpos[scene.finger_q] = before
-        mujoco.mj_forward(scene.model, data)
+        data.qpos[gripper.q] = before
+        _settle(env.world)
 
 
-def _carry_along(env: ManipEnv, before: F64) -> None:
-    """Give an object between the fingers the motion of the hand from `before` (qpos) to now."""
-    scene, data = env.scene, env.data
-    if scene.object_q is None:
-        return
-    at = slice(scene.object_q, scene.object_q + 7)
-    now = data.qpos.copy()
+def _settle(world: World) -> None:
+    """Bring everything that follows from positions up to date, contacts too."""
+    world.moved()
+    mujoco.mj_forward(world.model, world.data)
+
+
+def _carry_along(world: World, before: F64, q: F64) -> None:
+    """Put the arm at `q` [rad], and what was between the fingers at `before` (qpos) with it."""
+    scene, data = world.scene, world.data
     data.qpos[:] = before
-    mujoco.mj_kinematics(scene.model, data)
-    ee, rotation = data.site_xpos[scene.ee_site].copy(), data.site_xmat[scene.ee_site].reshape(3, 3).copy()
-    data.qpos[:] = now
-    offset = rotation.T @ (before[at][:3] - ee)
-    if np.abs(offset).max() > CUBE_HALF_SIZE:
-        data.qpos[at] = before[at]
-        return
-    mujoco.mj_kinematics(scene.model, data)
-    turned = data.site_xmat[scene.ee_site].reshape(3, 3)
-    data.qpos[at][:3] = data.site_xpos[scene.ee_site] + turned @ offset
-    turn, quat = np.empty(4), np.empty(4)
-    mujoco.mju_mat2Quat(turn, (turned @ rotation.T).ravel())
-    mujoco.mju_mulQuat(quat, turn, before[at][3:])
-    data.qpos[at][3:] = quat
+    world.moved()
+    ee, rotation = world.ee.position.copy(), world.ee.rotation.copy()
+    held = [
+        one
+        for one in scene.objects.values()
+        if np.abs(rotation.T @ (before[one.q : one.q + 3] - ee)).max() <= max(world.extents(one.name)) / 2
+    ]
+    data.qpos[scene.arm_q] = q
+    world.moved()
+    turned = world.ee.rotation
+    for one in held:
+        start = before[one.q : one.q + 7]
+        turn, quat = np.empty(4), np.empty(4)
+        mujoco.mju_mat2Quat(turn, (turned @ rotation.T).ravel())
+        mujoco.mju_mulQuat(quat, turn, start[3:])
+        at = world.ee.position + turned @ (rotation.T @ (start[:3] - ee))
+        data.qpos[one.q : one.q + 7] = [*at, *quat]
 
 
 def _move_object(env: ManipEnv, rng: np.random.Generator, distance: tuple[float, float], height: float) -> bool:
-    scene, data = env.scene, env.data
-    if scene.object_q is None or scene.object_v is None:
+    """Move the first of the objects that the hand grasps."""
+    if not env.scene.task.grasped:
         return False
-    start = data.qpos[scene.object_q : scene.object_q + 7].copy()
-    half = float(scene.model.geom("object").size[2])
+    name = env.scene.task.grasped[0]
+    one, world = env.scene.objects[name], env.world
+    start, half = world.data.qpos[one.q : one.q + 7].copy(), world.extents(name)[2] / 2
     for _ in range(_MAX_DRAWS):
         angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
         pose = start.copy()
@@ -138,9 +141,9 @@ def _move_object(env: ManipEnv, rng: np.random.Generator, distance: tuple[float,
             turn = rng.normal(size=4)
             pose[3:] = turn / np.linalg.norm(turn)
         landing = np.array([*pose[:2], half])
-        if in_reach(scene.robot, landing) and _on_table(env, pose) and _place(env, pose):
+        if world.reach.has(landing) and _on_table(env, pose) and _place(world, name, pose):
             return True
-    _place(env, start)
+    _place(world, name, start)
     return False
 
 
@@ -149,16 +152,12 @@ def _on_table(env: ManipEnv, pose: F64) -> bool:
     return bool(np.all(np.abs(pose[:2] - table.pos[:2]) < table.size[:2] - 0.05))
 
 
-def _place(env: ManipEnv, pose: F64) -> bool:
-    """Put the object at rest at `pose` (7,); false where it would stand inside something."""
-    scene, data = env.scene, env.data
-    assert scene.object_q is not None
-    assert scene.object_v is not None
-    data.qpos[scene.object_q : scene.object_q + 7] = pose
-    data.qvel[scene.object_v : scene.object_v + 6] = 0.0
-    mujoco.mj_forward(scene.model, data)
-    cube = scene.model.geom("object").id
-    return all(contact.dist > _OVERLAP for contact in data.contact if cube in (contact.geom1, contact.geom2))
+def _place(world: World, name: str, pose: F64) -> bool:
+    """Put an object at rest at `pose` (7,); false where it would stand inside something."""
+    world.place(name, pose[:3], pose[3:])
+    _settle(world)
+    geom = world.scene.objects[name].geom
+    return all(contact.dist > _OVERLAP for contact in world.data.contact if geom in (contact.geom1, contact.geom2))
 
 
 def disturbance_of(circumstances: Circumstances) -> Disturbance:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from manip_il.sim.look import PLAIN, Appearance
+from manip_il.sim.scene import camera_id
 
 _CHANGED = (
     "geom_size",
@@ -25,10 +27,11 @@ _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
 
 
 class Wardrobe:
-    """The plain looks of a model that is drawn from, and how to leave and to come back to them."""
+    """The plain looks of a model that is drawn from, and how to leave them and come back. objects: their geoms."""
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, objects: Sequence[int] = ()):
         self._model: Any = model
+        self._objects = objects
         self._plain = {name: getattr(self._model, name).copy() for name in _CHANGED}
         lamp = self._model.vis.headlight
         self._headlight = tuple(np.array(colour) for colour in (lamp.ambient, lamp.diffuse, lamp.specular))
@@ -48,17 +51,17 @@ class Wardrobe:
     def _cube(self, appearance: Appearance) -> None:
         if appearance.edge is None and appearance.colour is None:
             return
-        geom = self._model.geom("object").id
-        if appearance.edge is not None:
-            self._model.geom_size[geom] = appearance.edge / 2
-        if appearance.colour is not None:
-            self._model.geom_matid[geom] = -1  # a material's colour would hide the geom's
-            self._model.geom_rgba[geom] = [*appearance.colour, 1.0]
+        for geom in self._objects:
+            if appearance.edge is not None:
+                self._model.geom_size[geom] *= appearance.edge / 2 / self._model.geom_size[geom].max()
+            if appearance.colour is not None:
+                self._model.geom_matid[geom] = -1  # a material's colour would hide the geom's
+                self._model.geom_rgba[geom] = [*appearance.colour, 1.0]
 
     def _cameras(self, appearance: Appearance) -> None:
         shifts, turns = dict(appearance.camera_shift), dict(appearance.camera_turn)
         for name in {*shifts, *turns}:
-            camera = self._model.camera(name).id
+            camera = camera_id(self._model, name)
             quat, turn, moved = self._model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
             mujoco.mju_rotVecQuat(moved, np.asarray(shifts.get(name, (0.0, 0.0, 0.0))), quat)
             self._model.cam_pos[camera] += moved

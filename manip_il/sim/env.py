@@ -10,16 +10,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import UsageError
 from manip_il.mdp import LONGEST_EPISODE, Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.look import PLAIN, CameraConfig, Look
-from manip_il.sim.observe import environment_state, environment_state_names
+from manip_il.sim.observe import environment_state, environment_state_names, joint_state
 from manip_il.sim.render import Picture, pictures
-from manip_il.sim.scene import DT_SIM, STATE_KIND, build_scene
-from manip_il.sim.task import draw_start
+from manip_il.sim.scene import DT_SIM, build_scene
+from manip_il.sim.world import Scene, World
 
 F64 = NDArray[np.float64]
+_JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
 
 
 @dataclass(frozen=True)
@@ -76,18 +77,16 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.look, self.appearance = look or Look(), PLAIN
         self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
-        self.scene = build_scene(self.config.robot, self.config.task)
-        self.data = mujoco.MjData(self.scene.model)
+        self.world = World(build_scene(self.config.robot, self.config.task))
         self.render_mode = render_mode
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
         self.task_description = self.scene.task.instruction
         self.task = self.config.task
-        self._goal = np.zeros(3)
         self._step = self._streak = 0
         self._ever = False
-        self.action_space = self._action_space()
+        self.action_space = _bounded(self.scene.actions.low, self.scene.actions.high)
         self.observation_space = self._observation_space()
 
     def reset(
@@ -98,23 +97,36 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
         return self._observation(), self._info()
 
+    @property
+    def scene(self) -> Scene:
+        """What is simulated."""
+        return self.world.scene
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """MuJoCo's data, as they are now."""
+        return self.world.data
+
     def start(self, seed: int) -> None:
         """`reset` without making an observation."""
-        scene, data = self.scene, self.data
-        start = draw_start(scene.task, scene.robot, rng_for(seed, "reset"))
-        mujoco.mj_resetData(scene.model, data)
-        posture = np.asarray(scene.robot.home) + start.joint_offset
+        world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
+        world.vary(self._drawn_variation())
+        data, robot = world.data, scene.robot
+        mujoco.mj_resetData(world.model, data)
+        for name, pose in scene.task.draw(rng, world).poses.items():
+            world.place(name, *pose)
+        posture = np.asarray(robot.home) + rng.uniform(-1, 1, len(robot.joints)) * _JOINT_JITTER
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
-        data.qpos[scene.finger_q] = data.ctrl[scene.finger_ctrl] = start.opening / 2
-        if scene.object_q is not None:
-            height = scene.model.geom("object").size[2]
-            pose = [*start.object_xy, height, np.cos(start.object_yaw / 2), 0, 0, np.sin(start.object_yaw / 2)]
-            data.qpos[scene.object_q : scene.object_q + 7] = pose
-        self._goal = start.goal
-        data.mocap_pos[scene.goal_mocap] = start.goal
+        opening = rng.uniform(scene.gripper.least, scene.gripper.most)
+        data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         self._step = self._streak = 0
         self._ever = False
-        mujoco.mj_forward(scene.model, data)
+        world.moved()
+        mujoco.mj_forward(world.model, data)
+
+    def _drawn_variation(self) -> F64:
+        """What the episode that begins has, (v,)."""
+        return self.scene.nominal
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action for one control step."""
@@ -123,18 +135,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def advance(self, action: NDArray[Any]) -> None:
         """`step` without making an observation. Raises `NotFiniteError`, `MismatchError`."""
-        scene, data = self.scene, self.data
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape:
-            raise MismatchError("action shape", "the policy", action.shape, "the robot", self.action_space.shape)
-        if not np.isfinite(action).all():
-            raise NotFiniteError(f"action at step {self._step} is not finite: {action}")
-        low, high = self._action_limits
-        action = np.minimum(np.maximum(action, low), high)
-        data.ctrl[scene.arm_ctrl] = action[:-1]
-        data.ctrl[scene.finger_ctrl] = action[-1] / 2
-        mujoco.mj_step(scene.model, data, self.config.physics_steps)
-        mujoco.mj_kinematics(scene.model, data)  # positions as of now, not of the last physics step's start
+        world, scene = self.world, self.scene
+        action = scene.actions.clip(action, self._step)
+        data = world.data
+        data.ctrl[scene.arm_ctrl] = action[scene.actions.arm]
+        data.ctrl[scene.gripper.ctrl] = scene.gripper.command(action[scene.actions.gripper])
+        mujoco.mj_step(world.model, data, self.config.physics_steps)
+        world.moved()  # positions as of now, not of the last physics step's start
         self._step += 1
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
         self._ever = self._ever or self.solved
@@ -145,37 +152,27 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._streak >= self.config.success_steps
 
     def distance(self) -> float:
-        """Of the object (where there is one), else of the hand, to the goal [m]."""
-        scene, data = self.scene, self.data
-        at = data.site_xpos[scene.ee_site]
-        if scene.object_q is not None:
-            at = data.qpos[scene.object_q : scene.object_q + 3]
-        return float(np.linalg.norm(at - self._goal))
+        """How far the task is from being solved [m]."""
+        return self.scene.task.error(self.world)
+
+    @property
+    def progress(self) -> float:
+        """How much of the task is done, 0 to 1."""
+        return min(1.0, max(0.0, self.scene.task.progress(self.world)))
 
     def get_state(self) -> State:
         """Everything that the future depends on; `set_state` restores it bit for bit."""
-        physics = np.empty(self.scene.state_size)
-        mujoco.mj_getState(self.scene.model, self.data, physics, STATE_KIND)
-        return State(physics, self._goal.copy(), self._step, self._streak, self._ever)
+        return State(self.world.physics(), self.world.variation.copy(), self._step, self._streak, self._ever)
 
     def set_state(self, state: State) -> None:
         """Restore a state of the same scene. Raises `MismatchError` for another scene's."""
-        size = self.scene.state_size
-        if len(state.physics) != size:
-            name = f"{self.config.robot} {self.config.task}"
-            raise MismatchError("size of the physics state", "the state", len(state.physics), name, size)
-        mujoco.mj_setState(self.scene.model, self.data, state.physics, STATE_KIND)
-        self._goal = state.goal.copy()
+        self.world.restore(state.physics, state.variation)
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
-        mujoco.mj_kinematics(self.scene.model, self.data)
 
     def observe(self) -> Observation:
         """What a learner sees now (pictures only where the environment has cameras)."""
-        scene, data = self.scene, self.data
-        opening = data.qpos[scene.finger_q].sum()
-        state = np.append(data.qpos[scene.arm_q], opening).astype(np.float32)
         images = self._pictures(self._view) if self._view else {}
-        return Observation(state, environment_state(scene, data, self._goal), images)
+        return Observation(joint_state(self.world), environment_state(self.world), images)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """A picture from the front camera, uint8 (480, 640, 3)."""
@@ -196,15 +193,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             observation["pixels"] = seen.images
         return observation
 
-    def _action_space(self) -> gymnasium.spaces.Box:
-        scene = self.scene
-        limits = np.vstack([scene.arm_range, [0, scene.robot.max_opening]])
-        self._action_limits = limits[:, 0], limits[:, 1]
-        finite = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi).astype(np.float32)
-        return gymnasium.spaces.Box(finite[:, 0], finite[:, 1], dtype=np.float32)
-
     def _observation_space(self) -> gymnasium.spaces.Dict:
-        n, k = len(self.scene.robot.joint_names), len(environment_state_names(self.scene.task))
+        n, k = len(self.scene.robot.joint_names), len(environment_state_names(self.scene))
         spaces: dict[str, gymnasium.Space[Any]] = {
             "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
             "environment_state": gymnasium.spaces.Box(-np.inf, np.inf, (k,), np.float32),
@@ -213,3 +203,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
             picture = gymnasium.spaces.Box(0, 255, (*self.image_size, 3), np.uint8)
             spaces["pixels"] = gymnasium.spaces.Dict(dict.fromkeys(self.cameras, picture))
         return gymnasium.spaces.Dict(spaces)
+
+
+def _bounded(low: F64, high: F64) -> gymnasium.spaces.Box:
+    """The space of actions; a joint that turns freely is told nothing beyond two turns."""
+    limits = np.vstack([low, high])
+    finite = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi).astype(np.float32)
+    return gymnasium.spaces.Box(finite[0], finite[1], dtype=np.float32)

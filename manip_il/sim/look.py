@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.sim.world import CAMERAS
 
+CAMERAS = ("front", "wrist")
 MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 

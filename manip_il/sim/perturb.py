@@ -15,7 +15,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.seeding import rng_for
 from manip_il.sim.disturb import drop_object, jolt_joints, knock_object, set_fingers
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.task import Task
+from manip_il.tasks.task import Task
 
 F64 = NDArray[np.float64]
 Change = Callable[[ManipEnv, np.random.Generator], object]
@@ -39,20 +39,18 @@ class Kind:
 
 def random_action(action: F64, env: ManipEnv, rng: np.random.Generator) -> F64:
     """Any action within one longest joint step of the measured joints, with any gripper opening; (n,)."""
-    robot = env.scene.robot
-    q = _measured(env)
-    step = rng.uniform(-robot.max_joint_step, robot.max_joint_step, len(q))
-    return np.append(q + step, rng.uniform(0, robot.max_opening))
+    return env.scene.actions.random_near(_measured(env), rng)
 
 
 def opposite_action(action: F64, env: ManipEnv, rng: np.random.Generator) -> F64:
     """The joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
-    return np.append(2 * _measured(env) - action[:-1], _other_opening(action, env))
+    mirrored = 2 * _measured(env) - action
+    return np.where(env.scene.actions.relative, mirrored, _other_opening(action, env))
 
 
 def wrong_gripper(action: F64, env: ManipEnv, rng: np.random.Generator) -> F64:
     """`action` (n,) with the opposite gripper command."""
-    return np.append(action[:-1], _other_opening(action, env))
+    return np.where(env.scene.actions.relative, action, _other_opening(action, env))
 
 
 KINDS: dict[str, Kind] = {
@@ -62,7 +60,7 @@ KINDS: dict[str, Kind] = {
     "moved": Kind("object moved up to 10 cm", change=lambda env, rng: knock_object(env, rng, SHIFT)),
     "dropped": Kind("object dropped from 10 cm", change=lambda env, rng: drop_object(env, rng, SHIFT, DROP)),
     "closed": Kind("gripper wrongly closed", change=lambda env, rng: set_fingers(env, 0.0)),
-    "open": Kind("gripper wrongly open", change=lambda env, rng: set_fingers(env, env.scene.robot.max_opening)),
+    "open": Kind("gripper wrongly open", change=lambda env, rng: set_fingers(env, env.world.most_opening)),
     "random": Kind("random action", wrong=random_action, needs_object=False),
     "opposite": Kind("opposite action", wrong=opposite_action, needs_object=False),
     "gripper": Kind("right arm, opposite gripper", wrong=wrong_gripper),
@@ -71,7 +69,7 @@ KINDS: dict[str, Kind] = {
 
 def kinds_for(task: Task) -> dict[str, Kind]:
     """The entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
-    return {name: kind for name, kind in KINDS.items() if task.has_object or not kind.needs_object}
+    return {name: kind for name, kind in KINDS.items() if task.grasped or not kind.needs_object}
 
 
 @dataclass(frozen=True)
@@ -126,10 +124,12 @@ class Perturber:
 
 
 def _measured(env: ManipEnv) -> F64:
-    return env.data.qpos[env.scene.arm_q].copy()
+    """Joint positions [rad] and opening [m], (n,)."""
+    scene = env.scene
+    return scene.actions.join(env.data.qpos[scene.arm_q], env.world.opening)
 
 
 def _other_opening(action: F64, env: ManipEnv) -> float:
     """The end of the gripper's range that the command in `action` is farther from [m]."""
-    largest = env.scene.robot.max_opening
-    return largest if action[-1] < largest / 2 else 0.0
+    gripper = env.scene.gripper
+    return gripper.most if action[env.scene.actions.gripper] < (gripper.least + gripper.most) / 2 else gripper.least

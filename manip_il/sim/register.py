@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import gymnasium
 
-_ROBOTS = {"Panda": "panda", "Fetch": "fetch"}
-_TASKS = {"Reach": "reach", "Lift": "lift", "PickPlace": "pick_place"}
-ENV_IDS = {f"manip_il/{r}{t}-v0": (robot, task) for r, robot in _ROBOTS.items() for t, task in _TASKS.items()}
+from manip_il.robots.robot import ROBOTS
+from manip_il.tasks.table import TASKS
+
+
+def _title(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+ENV_IDS = {f"manip_il/{_title(robot)}{_title(task)}-v0": (robot, task) for robot in ROBOTS for task in TASKS}
 
 
 def register_envs() -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from manip_il.errors import RenderError
 from manip_il.sim.dress import Wardrobe
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.look import PLAIN, Appearance, CameraConfig, Look
-from manip_il.sim.scene import build_scene
+from manip_il.sim.look import CAMERAS, PLAIN, Appearance, CameraConfig, Look
+from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.view import view_model
 
 Picture = NDArray[np.uint8]
@@ -45,12 +45,13 @@ class _Renderer:
 
     def __init__(self, robot: str, task: str, look: Look):
         self._model = view_model(robot, task, look)
-        self._wardrobe = Wardrobe(self._model)
+        objects = build_scene(robot, task).objects.values()
+        self._wardrobe = Wardrobe(self._model, [one.geom for one in objects])
         self._data = mujoco.MjData(self._model)
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._cameras = {self._model.camera(i).name: i for i in range(self._model.ncam)}
+        self._cameras = {name: camera_id(self._model, name) for name in CAMERAS}
         self._context: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:

@@ -1,130 +1,125 @@
-"""Robot and task to one compiled scene: arm, table, cube, goal marker, cameras, light."""
+"""Robot and task to one compiled scene: the world is a spec of its own, and the robot is attached to it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
 from functools import cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.robot import Robot, get_robot
-from manip_il.sim.task import Task, get_task
-from manip_il.sim.world import CUBE_FRICTION, CUBE_HALF_SIZE, CUBE_MASS
+from manip_il.errors import UnknownName, UsageError
+from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.gripper import Gripper
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.spec import arm_spec
+from manip_il.sim import variation
+from manip_il.sim.variation import Object
+from manip_il.sim.world import Scene
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import Task
 
 DT_SIM = 0.002  # [s]
+PREFIX = "robot/"  # of everything of the robot's in a scene
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
+_TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
+_FLOOR = -0.4  # [m]
+_PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
-_OBJECT, _GOAL = "object", "goal"
-STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A compiled model and the addresses of what is named in it.
-
-    `*_q`: indices into qpos; `*_ctrl`: into ctrl. `object_q` is the start of a free joint, or None.
-    """
-
-    robot: Robot
-    task: Task
-    model: mujoco.MjModel
-    arm_q: NDArray[np.int64]
-    finger_q: NDArray[np.int64]
-    arm_v: NDArray[np.int64]
-    arm_ctrl: NDArray[np.int64]
-    finger_ctrl: NDArray[np.int64]
-    object_q: int | None
-    object_v: int | None
-    ee_site: int
-    goal_mocap: int
-    arm_range: NDArray[np.float64]  # (arm, 2) [rad], infinite where a joint turns freely
-
-    @property
-    def qpos_slice(self) -> slice:
-        """Where qpos stands in `State.physics`."""
-        start = mujoco.mj_stateSize(self.model, int(mujoco.mjtState.mjSTATE_TIME))
-        return slice(start, start + self.model.nq)
-
-    @property
-    def state_size(self) -> int:
-        """Length of `State.physics`."""
-        return mujoco.mj_stateSize(self.model, STATE_KIND)
-
-    def model_bytes(self) -> bytes:
-        """The compiled model, byte for byte: what a fingerprint hashes."""
-        buffer = np.zeros(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return buffer.tobytes()
 
 
 @cache
 def build_scene(robot: str, task: str) -> Scene:
-    """The scene of a robot and a task, compiled once a process. Raises `UnknownName`."""
+    """The scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`."""
     the_robot, the_task = get_robot(robot), get_task(task)
-    spec = scene_spec(the_robot, the_task)
-    return _index(the_robot, the_task, spec.compile())
+    try:
+        model = scene_spec(the_robot, the_task).compile()
+    except ValueError as error:
+        why = " ".join(str(error).split())
+        raise UsageError(f"robot {the_robot.name} and task {the_task.name} make no scene: {why}") from None
+    return _index(the_robot, the_task, model)
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     """The uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
-    spec = robot.build()
+    spec = mujoco.MjSpec()
+    spec.modelname = f"{robot.name}_{task.name}"
     spec.option.timestep = DT_SIM
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10  # holds the cube: with the pyramidal default it creeps out of the hand
-    for body in spec.bodies:
-        body.gravcomp = 1.0
-    for site in list(spec.sites):
-        if site.name != "ee":
-            spec.delete(site)
     _add_look(spec)
     _add_table(spec, robot)
-    if task.has_object:
-        _add_cube(spec)
-    _add_goal(spec)
-    _add_cameras(spec, robot)
+    arm = arm_spec(robot)
+    _add_pedestal(spec, arm)
+    _add_wrist_camera(arm)
+    spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
+    _add_front_camera(spec, robot)
+    task.build(spec)
     return spec
 
 
-def arm_model(robot: Robot) -> mujoco.MjModel:
-    """The arm alone, fingers fixed: what inverse kinematics works on."""
-    spec = robot.build()
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
-    for joint in robot.finger_joints:
-        spec.delete(spec.joint(joint))
-    for geom in list(spec.geoms):
-        geom.contype = geom.conaffinity = 0
-    return spec.compile()
+def camera_id(model: mujoco.MjModel, name: str) -> int:
+    """Id of a camera, of the world's or on the robot. Raises `UnknownName`."""
+    for prefix in ("", PREFIX):
+        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, prefix + name)
+        if camera >= 0:
+            return camera
+    known = (model.camera(i).name.removeprefix(PREFIX) for i in range(model.ncam))
+    raise UnknownName("camera", name, known)
 
 
 def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
-    def qpos(names: tuple[str, ...]) -> NDArray[np.int64]:
-        return np.array([model.joint(name).qposadr[0] for name in names], dtype=np.int64)
-
-    def ctrl(names: tuple[str, ...]) -> NDArray[np.int64]:
-        return np.array([model.actuator(name).id for name in names], dtype=np.int64)
-
-    limits = np.array([model.joint(name).range for name in robot.arm_joints])
-    free = np.array([not model.joint(name).limited[0] for name in robot.arm_joints])
-    limits[free] = [-np.inf, np.inf]
+    joints = [model.joint(PREFIX + name) for name in robot.joints]
+    objects = _objects(model)
+    gripper = Gripper(robot, model, PREFIX)
+    _check_objects(robot, task, model, objects, gripper)
     return Scene(
         robot=robot,
         task=task,
         model=model,
-        arm_q=qpos(robot.arm_joints),
-        finger_q=qpos(robot.finger_joints),
-        arm_v=np.array([model.joint(name).dofadr[0] for name in robot.arm_joints], dtype=np.int64),
-        arm_ctrl=ctrl(robot.arm_joints),
-        finger_ctrl=ctrl(robot.finger_joints),
-        object_q=int(model.joint(_OBJECT).qposadr[0]) if task.has_object else None,
-        object_v=int(model.joint(_OBJECT).dofadr[0]) if task.has_object else None,
-        ee_site=model.site("ee").id,
-        goal_mocap=int(model.body(_GOAL).mocapid[0]),
-        arm_range=limits,
+        gripper=gripper,
+        actions=_action_space(robot, joints, gripper),
+        objects=objects,
+        arm_q=np.array([joint.qposadr[0] for joint in joints], dtype=np.int64),
+        arm_v=np.array([joint.dofadr[0] for joint in joints], dtype=np.int64),
+        arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
+        ee_site=model.site(PREFIX + "ee").id,
+        nominal=variation.nominal(model, objects),
     )
+
+
+def _objects(model: mujoco.MjModel) -> dict[str, Object]:
+    """The free bodies, by name, in the model's order."""
+    objects = {}
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            body = int(model.jnt_bodyid[joint])
+            name, geom = model.body(body).name, int(model.body_geomadr[body])
+            objects[name] = Object(name, body, geom, int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint]))
+    return objects
+
+
+def _check_objects(
+    robot: Robot, task: Task, model: mujoco.MjModel, objects: dict[str, Object], gripper: Gripper
+) -> None:
+    """Raise `UsageError` for an object that the gripper cannot go around."""
+    for name in task.grasped:
+        one = objects[name]
+        width = float(np.sort(variation.extents(int(model.geom_type[one.geom]), model.geom_size[one.geom]))[0])
+        if width >= gripper.most:
+            raise UsageError(
+                f"task {task.name}: {name!r} is {width:.3f} m wide, and the gripper of {robot.name} opens to "
+                f"{gripper.most:.3f} m; choose another task or robot"
+            )
+
+
+def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews], gripper: Gripper) -> ActionSpace:
+    limits = np.array([joint.range if joint.limited[0] else [-np.inf, np.inf] for joint in joints])
+    low, high = np.vstack([limits, [gripper.least, gripper.most]]).T
+    scale = np.array([robot.max_joint_step] * len(joints) + [gripper.most - gripper.least])
+    return ActionSpace(robot.joint_names, low, high, scale, np.array([True] * len(joints) + [False]))
 
 
 def _add_look(spec: mujoco.MjSpec) -> None:
@@ -147,8 +142,6 @@ def _add_look(spec: mujoco.MjSpec) -> None:
     )
     spec.add_material(name="floor", rgba=[0.80, 0.83, 0.86, 1], specular=0.0, emission=0.25)
     spec.add_material(name="table", rgba=[0.80, 0.70, 0.57, 1], specular=0.15, shininess=0.3)
-    spec.add_material(name="cube", rgba=[0.86, 0.24, 0.16, 1], specular=0.3, shininess=0.5)
-    spec.add_material(name="goal", rgba=[0.12, 0.72, 0.35, 0.55], specular=0.0, emission=0.4)
     spec.worldbody.add_light(
         pos=[0.9, -0.9, 1.8],
         dir=[-0.35, 0.75, -1.5],
@@ -161,50 +154,59 @@ def _add_look(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
-    x, y = robot.workspace
+    x, y = robot.workspace.centre
     half = np.array(_TABLE_HALF)
+    middle = [x + _TABLE_BEYOND, y, -half[2]]
     spec.worldbody.add_geom(
-        name="table", type=box, size=half, pos=[x + 0.08, y, -half[2]], material="table", friction=[1.0, 0.005, 0.0001]
+        name="table", type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
     )
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        leg = [x + 0.08 + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -0.22]
+        leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -0.22]
         spec.worldbody.add_geom(
             name=f"leg{i}", type=box, size=[0.025, 0.025, 0.18], pos=leg, rgba=[0.35, 0.36, 0.38, 1]
         )
-    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, -0.4], material="floor")
-    if robot.name == "panda":  # a pedestal from the floor to the base
-        spec.worldbody.add_geom(
-            name="pedestal", type=box, size=[0.13, 0.13, 0.195], pos=[-0.04, 0, -0.205], rgba=[0.28, 0.29, 0.32, 1]
-        )
+    spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, _FLOOR], material="floor")
 
 
-def _add_cube(spec: mujoco.MjSpec) -> None:
-    body = spec.worldbody.add_body(name=_OBJECT, pos=[0.5, 0, CUBE_HALF_SIZE])
-    body.add_freejoint(name=_OBJECT)
-    body.add_geom(
-        name=_OBJECT,
+def _add_pedestal(spec: mujoco.MjSpec, arm: mujoco.MjSpec) -> None:
+    """From the floor to the robot's lowest point, where that is in the air."""
+    model = arm.copy().compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
+    root = [i for i in touching if model.body_weldid[model.geom_bodyid[i]] == 0]
+    corners = np.array([_corner_lows(model, data, i) for i in root or touching])
+    lowest = float(corners[:, 2].min())
+    height = lowest - 0.01 - _FLOOR
+    if height <= 0.02:
+        return
+    x, y = corners[:, :2].mean(axis=0)
+    spec.worldbody.add_geom(
+        name="pedestal",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[CUBE_HALF_SIZE] * 3,
-        mass=CUBE_MASS,
-        material="cube",
-        condim=4,
-        friction=[CUBE_FRICTION, 0.02, 0.0001],
-        solimp=[0.95, 0.99, 0.001, 0.5, 2],
-        solref=[0.01, 1],
+        size=[_PEDESTAL, _PEDESTAL, height / 2],
+        pos=[x, y, _FLOOR + height / 2],
+        rgba=[0.28, 0.29, 0.32, 1],
     )
 
 
-def _add_goal(spec: mujoco.MjSpec) -> None:
-    """A marker without contacts; a mocap body, so that lockstep environments can share one model."""
-    body = spec.worldbody.add_body(name=_GOAL, mocap=True, pos=[0.5, 0, 0.2])
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], material="goal", contype=0, conaffinity=0, mass=0
-    )
+def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
+    """The middle of a geom in x and y, and its lowest z [m], (3,); of its box, where it is no mesh."""
+    mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    points = middle + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    if mesh >= 0:  # turned as a mesh is in its geom, its box reaches farther down than it does
+        start = model.mesh_vertadr[mesh]
+        points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+    placed = data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
+    return np.append((placed.max(axis=0) + placed.min(axis=0))[:2] / 2, placed[:, 2].min())
 
 
-def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:
-    x, y = robot.workspace
+def _add_front_camera(spec: mujoco.MjSpec, robot: Robot) -> None:
+    x, y = robot.workspace.centre
     _look_at(spec, "front", eye=(x + 0.85, y - 0.72, 0.66), at=(x - 0.10, y, 0.20), fovy=45)
+
+
+def _add_wrist_camera(spec: mujoco.MjSpec) -> None:
     hand = spec.site("ee").parent
     site = spec.site("ee")
     offset = np.array([0.10, 0.0, -0.08])  # in the ee frame: beside the hand, behind the fingertips [m]

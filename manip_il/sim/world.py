@@ -1,6 +1,231 @@
-"""What every scene has in common, as plain numbers and names: for what must know them without a simulator."""
+"""A compiled scene in one state, answered by name: what tasks, ladders and the expert look at.
 
-CAMERAS = ("front", "wrist")
-CUBE_HALF_SIZE = 0.025  # [m]
-CUBE_MASS = 0.1  # [kg]
-CUBE_FRICTION = 1.0  # sliding, against anything
+Lengths in [m], angles in [rad], everything in the world's frame: z = 0 is the table's top, x away from the robot.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.gripper import Gripper
+from manip_il.robots.reach import Reach, reach_of
+from manip_il.robots.robot import Robot
+from manip_il.sim import variation as varied
+from manip_il.sim.variation import Object
+
+if TYPE_CHECKING:
+    from manip_il.tasks.task import Task
+
+F64 = NDArray[np.float64]
+T = TypeVar("T")
+STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+GOAL = "goal"  # the mocap body that shows where things are to go
+
+
+class Pose(NamedTuple):
+    """Where a body or frame is: position (3,) [m], rotation matrix (3, 3)."""
+
+    position: F64
+    rotation: F64
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A robot and a task as one compiled model, and the addresses of what is named in it.
+
+    arm_q, arm_v, arm_ctrl: indices of the arm's joints into qpos, qvel and ctrl. objects: free bodies by name. ee_site:
+    id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
+    """
+
+    robot: Robot
+    task: Task
+    model: mujoco.MjModel
+    gripper: Gripper
+    actions: ActionSpace
+    objects: Mapping[str, Object]
+    arm_q: NDArray[np.int64]
+    arm_v: NDArray[np.int64]
+    arm_ctrl: NDArray[np.int64]
+    ee_site: int
+    nominal: F64
+
+    @cached_property
+    def qpos_slice(self) -> slice:
+        """Where qpos stands in `State.physics`."""
+        start = mujoco.mj_stateSize(self.model, int(mujoco.mjtState.mjSTATE_TIME))
+        return slice(start, start + self.model.nq)
+
+    @cached_property
+    def state_size(self) -> int:
+        """Length of `State.physics`."""
+        return mujoco.mj_stateSize(self.model, STATE_KIND)
+
+    @cached_property
+    def reach(self) -> Reach:
+        """Where the hand gets to."""
+        return reach_of(self.robot)
+
+    @property
+    def name(self) -> str:
+        """Robot and task, for messages."""
+        return f"{self.robot.name} {self.task.name}"
+
+    def model_bytes(self) -> bytes:
+        """The compiled model, byte for byte: what a fingerprint hashes."""
+        buffer = np.zeros(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
+        mujoco.mj_saveModel(self.model, None, buffer)
+        return buffer.tobytes()
+
+
+class World:
+    """One scene's physics, and named questions to it.
+
+    model and data change their identity with the variation: the shared model as compiled, or one of this world's own.
+    What is asked needs kinematics to be up to date (`moved`).
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.variation = scene.nominal
+        self.model, self.data = scene.model, mujoco.MjData(scene.model)
+        self._plain = self.model, self.data
+        self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
+        self._known: dict[Any, Any] = {}  # until the world moves
+        self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
+
+    # Physics
+
+    def vary(self, variation: F64) -> None:
+        """Make the model what `variation` (v,) says. Raises what `variation.check` raises."""
+        if variation.tobytes() == self.variation.tobytes():
+            return
+        varied.check(variation, self.scene.nominal)
+        self._known.clear()
+        self._extents.clear()
+        self.variation = variation.copy()
+        if np.array_equal(variation, self.scene.nominal):
+            self.model, self.data = self._plain
+            return
+        if self._own is None:
+            model = copy.copy(self.scene.model)  # physics reads masses and sizes from there
+            self._own = model, mujoco.MjData(model)
+        self.model, self.data = self._own
+        varied.apply(self.model, self.scene.model, self.scene.objects, variation)
+        mujoco.mj_setConst(self.model, self.data)  # what follows from masses
+
+    def physics(self) -> F64:
+        """MuJoCo's integration state, (p,)."""
+        physics = np.empty(self.scene.state_size)
+        mujoco.mj_getState(self.model, self.data, physics, STATE_KIND)
+        return physics
+
+    def restore(self, physics: F64, variation: F64) -> None:
+        """Be as a state says, bit for bit. Raises `MismatchError` for a state of another scene."""
+        size = self.scene.state_size
+        if len(physics) != size:
+            raise MismatchError("size of the physics state", "the state", len(physics), self.scene.name, size)
+        self.vary(variation)
+        mujoco.mj_setState(self.model, self.data, physics, STATE_KIND)
+        self.moved()
+
+    def moved(self) -> None:
+        """Bring positions up to date after qpos or mocap poses changed."""
+        self._known.clear()
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def place(self, name: str, position: F64, quaternion: F64) -> None:
+        """Put an object at rest, or a mocap body, at a pose: (3,) [m], wxyz (4,). Call `moved` afterwards."""
+        if name in self.scene.objects:
+            one = self.scene.objects[name]
+            self.data.qpos[one.q : one.q + 7] = [*position, *quaternion]
+            self.data.qvel[one.v : one.v + 6] = 0.0
+            return
+        mocap = int(self._body(name).mocapid[0])
+        if mocap < 0:
+            raise ManipError(f"{name!r} is neither an object nor a mocap body; it cannot be placed")
+        self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = position, quaternion
+
+    # Questions
+
+    def remember(self, key: Any, work_out: Callable[[], T]) -> T:
+        """What `work_out` gives, worked out once until the world changes."""
+        if key not in self._known:
+            self._known[key] = work_out()
+        return self._known[key]
+
+    @property
+    def ee(self) -> Pose:
+        """The frame between the fingertips: z out of the hand, y along the fingers' motion."""
+        return self.remember("ee", self._ee)
+
+    def pose(self, name: str) -> Pose:
+        """Of a body. Raises `UnknownName`."""
+        one = self.scene.objects.get(name)
+        body = one.body if one is not None else self._body(name).id
+        return Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
+
+    @property
+    def goal(self) -> F64:
+        """Where the goal marker is, (3,)."""
+        return self.data.mocap_pos[self._mocap_goal]
+
+    @property
+    def opening(self) -> float:
+        """Between the gripper's pads."""
+        return self.remember("opening", self._opening)
+
+    @property
+    def most_opening(self) -> float:
+        """Between the gripper's pads when it is open."""
+        return self.scene.gripper.most
+
+    def extents(self, name: str) -> tuple[float, ...]:
+        """Lengths of an object along its own axes x, y and z."""
+        if name not in self._extents:
+            geom = self.scene.objects[name].geom
+            kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
+            self._extents[name] = tuple(varied.extents(kind, size).tolist())
+        return self._extents[name]
+
+    def touched(self, name: str) -> bool:
+        """Whether every finger touches an object."""
+        geoms = (self.scene.objects[name].geom,)
+        return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
+
+    @property
+    def reach(self) -> Reach:
+        """Where the hand gets to, pointing down."""
+        return self.scene.reach
+
+    def _ee(self) -> Pose:
+        site = self.scene.ee_site
+        return Pose(self.data.site_xpos[site], self.data.site_xmat[site].reshape(3, 3))
+
+    def _opening(self) -> float:
+        return self.scene.gripper.opening(self.data.qpos)
+
+    @cached_property
+    def has_goal(self) -> bool:
+        """Whether the task shows where things are to go."""
+        return mujoco.mj_name2id(self.scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL) >= 0
+
+    @cached_property
+    def _mocap_goal(self) -> int:
+        return int(self._body(GOAL).mocapid[0])
+
+    def _body(self, name: str) -> Any:
+        try:
+            return self.scene.model.body(name)
+        except KeyError:
+            known = (self.scene.model.body(i).name for i in range(self.scene.model.nbody))
+            raise UnknownName("body", name, known) from None

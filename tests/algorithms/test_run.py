@@ -263,7 +263,7 @@ def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(labe
 @pytest.mark.gl
 def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     fit = FitConfig({"type": "cnn", "device": "cpu", "width": 16}, steps=2, batch_size=4, image_augment=False)
-    config = replace(CONFIG, beta=ALONE, demonstrations=2, env=EnvConfig("panda", "reach", horizon=10), fit=fit)
+    config = replace(CONFIG, beta=ALONE, demonstrations=2, env=EnvConfig("panda", "reach", horizon=20), fit=fit)
     config = replace(config, cameras=CameraConfig(("front",), 64, 64), validation_episodes=1)
     results = list(run_algorithm(config, tmp_path, Engine()))
     assert results[1].labels > results[0].labels

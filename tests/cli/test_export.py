@@ -61,7 +61,7 @@ def test_it_tells_what_goes_in_and_out_and_how_near_the_checkpoint_is(here, caps
     assert float(difference[1]) <= 1e-5
     assert rest == [
         " in: observation.state float32 (batch, 8)",
-        " in: observation.environment_state float32 (batch, 24)",
+        " in: observation.environment_state float32 (batch, 25)",
         " in: observation.images.front uint8 (batch, 32, 48, 3)",
         "out: action float32 (batch, 8)",
         f"exported: {name} ({(here / name).stat().st_size:,} bytes)",
@@ -157,6 +157,6 @@ def test_the_docs_snippets_run_it_without_this_package(here, snippet, format_, a
         (name, "rad" if number < 7 else "m") for number, name in enumerate(SPEC.joint_names)
     ]
     images = {camera: np.zeros((1, 32, 48, 3), np.uint8) for camera in policy.cameras}
-    expected = policy.act(np.zeros((1, 8), np.float32), np.zeros((1, 24), np.float32), images)[0]
+    expected = policy.act(np.zeros((1, 8), np.float32), np.zeros((1, 25), np.float32), images)[0]
     assert np.abs(np.array([float(value) for _, value, _ in said]) - expected).max() <= 1.1e-5
     assert np.abs(expected).max() > 1e-3

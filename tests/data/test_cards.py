@@ -43,7 +43,7 @@ def test_the_datasets_card_is_what_the_hub_reads():
     assert data.task_categories == ["robotics"]
     assert {"LeRobot", "robotics", "panda", "pick_place"} <= set(data.to_dict()["tags"])
     assert data.to_dict()["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
-    for fact in ("| episodes | 10 |", "373 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256"):
+    for fact in ("| episodes | 10 |", "375 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256"):
         assert fact in text
     assert 'LeRobotDataset("user/demos")' in text
 

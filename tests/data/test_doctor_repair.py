@@ -125,7 +125,7 @@ def test_statistics_are_computed_again(alone: Path) -> None:
     edit_json(alone / layout.STATS, lambda stats: stats[s.ACTION].update(mean=[0, 0, 0], q10=[9, 9, 9]))
     wrong = (alone / layout.STATS).read_bytes()
     said = mend(alone)
-    assert said[0] == "recomputed from the data: meta/stats.json, 19 columns"
+    assert said[0] == "recomputed from the data: meta/stats.json, 20 columns"
     assert json.loads((alone / layout.STATS).read_text()) == whole
     assert (alone.with_name("lift.before-repair") / layout.STATS).read_bytes() == wrong
     assert lines(alone) == []

@@ -59,7 +59,7 @@ def small() -> s.RobotTaskSpec:
 
 
 def about(made_for: s.RobotTaskSpec, frames: int = 2, **changes: str) -> Metadata:
-    said = {"format": "1", "seed": "1", "success": "true", "success_at_end": "true", "frames": str(frames)}
+    said = {"format": "2", "seed": "1", "success": "true", "success_at_end": "true", "frames": str(frames)}
     return forge.note(said | {"spec": json.dumps(made_for.to_json()), "fingerprint": "{}"} | changes)
 
 

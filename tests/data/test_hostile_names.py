@@ -224,7 +224,8 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim: Path, tmp_path: Path) -
         ({"fingerprint": None}, "fingerprint is None"),
         ({"provenance": 3}, "provenance is 3"),
         ({"spec": []}, "spec is []"),
-        ({"spec": {"robot": "r"}}, "missing or unknown"),
+        ({"spec": {"robot": "r", "schema": 2}}, "missing or unknown"),
+        ({"spec": {"robot": "r"}}, "written with schema 1"),
     ],
 )
 def test_our_own_file_is_checked(victim: Path, change: dict[str, Any], words: str) -> None:

@@ -58,7 +58,7 @@ def test_lerobots_loader_reads_it():
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset("local/sample", root=SAMPLE)
-    assert (len(dataset), dataset.num_episodes) == (373, 10)
+    assert (len(dataset), dataset.num_episodes) == (375, 10)
     assert dataset.hf_dataset[0]["action"].shape == (8,)
 
 

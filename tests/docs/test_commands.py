@@ -14,6 +14,7 @@ from huggingface_hub import constants
 from manip_il.cli import story
 from manip_il.cli.main import load
 from manip_il.cli.options import parse
+from manip_il.tasks.table import TASKS
 
 from ..data.remote.hub_server import Hub, clean_environment, hub_server
 from ..data.remote.hub_use import TOKEN
@@ -66,6 +67,15 @@ def lerobot(running_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 @pytest.fixture
+def tasks() -> Iterator[None]:
+    """The table of tasks as it was, whatever a page adds to it."""
+    before = dict(TASKS)
+    yield
+    TASKS.clear()
+    TASKS.update(before)
+
+
+@pytest.fixture
 def workplace(
     tmp_path: Path,
     stock: Stock,
@@ -73,6 +83,7 @@ def workplace(
     running_hub: Hub,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
+    tasks: None,
 ) -> Workplace:
     """A folder with the repository's configs, studies made small, and servers that answer for the Hub and S3."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")

@@ -10,11 +10,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from manip_il.cli.main import load, main
 from manip_il.cli.options import parse
+from manip_il.tasks.table import TASKS
 
 from .pages import ROOT, Block, Line, command_of, shell_lines
 from .sizes import small_lerobot, small_words
@@ -69,7 +71,11 @@ class Workplace:
     def _python_block(self, block: Block) -> None:
         self.stock.bring(("python", *(name for name in RECIPES if f'"{name}"' in block.text)), self.folder)
         with contextlib.chdir(self.folder):
-            exec(compile(block.text, block.where, "exec"), {"__name__": "__main__"})
+            names: dict[str, Any] = {"__name__": "__main__"}
+            exec(compile(block.text, block.where, "exec"), names)
+        for one in names.values():
+            if isinstance(one, type) and one.__module__ == "__main__" and hasattr(one, "rungs"):
+                TASKS[one.name] = one()  # the line in tasks/table.py that the page asks for
 
     def _yaml_block(self, block: Block) -> None:
         """`# NAME.yaml` in its first line names a file for the lines that follow; else it is a job of Kubernetes."""

@@ -9,10 +9,11 @@ from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
 from manip_il.errors import ManipError
 from manip_il.expert.expert import Expert
-from manip_il.mdp import Actor, Episode, Label, Observation, Phase, State
+from manip_il.mdp import Actor, Episode, Label, Observation, State
 from manip_il.rollout import Rules, Turn, rollout
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
 
 SEEDS = stream_seeds("certificate", 5)
 STATE = State(np.zeros(4), np.zeros(3))
@@ -62,7 +63,8 @@ def same(left: dict[int, Episode], right: dict[int, Episode]) -> bool:
 
 
 def drivers() -> dict:
-    return {"random": RandomDriver(0.1, 0.1), "mixture": MixtureDriver(Wave(), 0.5), "learner": LearnerDriver(Wave())}
+    actions = build_scene("fetch", "reach").actions
+    return {"random": RandomDriver(actions), "mixture": MixtureDriver(Wave(), 0.5), "learner": LearnerDriver(Wave())}
 
 
 @pytest.mark.parametrize("name", drivers())
@@ -100,7 +102,7 @@ def test_a_mixture_executes_either_the_label_or_the_learners_action():
 def test_beta_is_the_experts_share_of_the_steps(beta: float):
     driver = MixtureDriver(Wave(), beta)
     seen = Observation(np.zeros(8, np.float32), np.zeros(3, np.float32))
-    label = Label(np.ones(8), Phase.CARRY, True, 0.0)
+    label = Label(np.ones(8), 5, True, 0.0)
     turns = [Turn(seed, 0, seen, STATE, label=label) for seed in range(20)]
     actors = [actor for _ in range(50) for _, actor in driver.act(turns)]
     share = np.mean([actor == Actor.EXPERT for actor in actors])
@@ -121,18 +123,20 @@ def test_a_seed_is_its_episode_and_another_seed_another(name: str):
 
 
 def test_a_random_driver_stays_within_its_reach():
-    for episode in run(RandomDriver(0.1, 0.06), robot="panda").values():
+    actions = build_scene("panda", "reach").actions
+    for episode in run(RandomDriver(actions), robot="panda").values():
         step = np.subtract(episode.columns["executed_action"], episode.columns["observation.state"])
-        assert np.abs(step[:, :-1]).max() <= 0.1 + 1e-6
-        assert episode.columns["executed_action"][:, -1].min() >= 0
-        assert episode.columns["executed_action"][:, -1].max() <= 0.06
+        assert (np.abs(step) <= actions.scale + 1e-6)[:, actions.arm].all()
+        openings = episode.columns["executed_action"][:, actions.gripper]
+        assert actions.low[actions.gripper] - 1e-6 <= openings.min()
+        assert openings.max() <= actions.high[actions.gripper] + 1e-6
 
 
 @pytest.mark.parametrize("make", [LearnerDriver, lambda policy: MixtureDriver(policy, 0.5)])
 def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras(make):
     diary = Diary()
     driver = make(diary)
-    label = Label(np.ones(8), Phase.CARRY, True, 0.0)
+    label = Label(np.ones(8), 5, True, 0.0)
 
     def turn(seed: int, step: int) -> Turn:
         images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}

@@ -162,7 +162,8 @@ def test_fingers_that_stand_as_they_would_be_put_are_no_case(measured: Certifica
         env.start(seed)
         for _ in range(draw_moment(seed, "open", whole[seed])):
             env.advance(expert.label(env.get_state()).action)
-        return bool(np.all(env.data.qpos[env.scene.finger_q] > env.scene.robot.max_opening / 2 - NOTICEABLE))
+        gripper = env.scene.gripper
+        return bool(np.all(env.data.qpos[gripper.q] > gripper.command(gripper.most) - NOTICEABLE))
 
     already = {seed for seed in whole if is_open(seed)}
     assert 0 < len(already) < len(whole)

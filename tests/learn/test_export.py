@@ -159,7 +159,7 @@ def test_the_metadata_name_every_number_with_its_unit(kind, tmp_path):
     assert told["outputs"] == [{"name": "action"} | joints]
     units = dict(zip(around["names"], around["units"], strict=True))
     assert tuple(units) == spec.environment_state_names
-    chosen = ("ee.x", "ee.rxy", "object.cos4yaw", "object.tilt", "goal_from_object.z")
+    chosen = ("ee.x", "ee.axis_y.x", "object.cos4yaw", "object.tilt", "goal_from_object.z")
     assert [units[name] for name in chosen] == ["m", "1", "1", "rad", "m"]
     assert None not in units.values()
     assert [(one["name"], one["dtype"], one["shape"]) for one in (front, wrist)] == [

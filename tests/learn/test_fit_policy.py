@@ -117,7 +117,7 @@ def acts(path: Path) -> bytes:
     """What the policy in a folder does in six states of three episodes."""
     rng = np.random.default_rng(0)
     policy = LearnedPolicy.load(path)
-    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
+    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 25))
     actions = [
         policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
         for joints, scene in zip(states, environment, strict=True)
@@ -146,7 +146,7 @@ def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, dem
     meta = CheckpointMeta.of(read_spec(demos))
     trainer = PolicyTrainer(demos, config(ACT), tmp_path / "act", meta, resume=True)
     policy, rng = trainer.policy.eval(), np.random.default_rng(0)
-    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 24))
+    states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 25))
     batch = {
         "observation.state": torch.from_numpy(states[0, :1].astype(np.float32)),
         "observation.environment_state": torch.from_numpy(environment[0, :1].astype(np.float32)),

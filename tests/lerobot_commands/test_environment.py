@@ -31,9 +31,9 @@ def vector_env(config: ManipILEnv, count: int, asynchronous: bool = False) -> An
 @pytest.mark.parametrize(
     ("observation", "inputs"),
     [
-        ("state", {STATE: (8,), POSES: (24,)}),
+        ("state", {STATE: (8,), POSES: (25,)}),
         ("images", {STATE: (8,), PICTURE: (3, 32, 48)}),
-        ("both", {STATE: (8,), POSES: (24,), PICTURE: (3, 32, 48)}),
+        ("both", {STATE: (8,), POSES: (25,), PICTURE: (3, 32, 48)}),
     ],
 )
 def test_a_policys_inputs_are_those_of_the_chosen_observation(observation: str, inputs: dict[str, tuple[int, ...]]):

@@ -23,7 +23,7 @@ def demos(record):
 def mlp(demos, tmp_path_factory):
     """A checkpoint of `manip-il train` that gets there on some seeds only."""
     folder = tmp_path_factory.mktemp("mlp") / "run"
-    words = [f"--dataset.root={demos}", "--steps=40", "--policy.width=32", f"--output_dir={folder}"]
+    words = [f"--dataset.root={demos}", "--steps=80", "--policy.width=32", f"--output_dir={folder}"]
     assert main(["train", *words]) == 0
     return folder / "checkpoints/last/pretrained_model"
 
@@ -31,7 +31,7 @@ def mlp(demos, tmp_path_factory):
 @pytest.fixture(scope="module")
 def mlp_trial(trial, mlp):
     """The evaluation of the mlp, and our results of it."""
-    evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.06), 12)
+    evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 12)
     ours = evaluation.ours(mlp)
     assert {episode.success for episode in ours} == {True, False}  # else equality would say little
     return evaluation, ours

@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import MismatchError, NotFiniteError, UnknownName, UsageError
-from manip_il.mdp import Phase
+from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.observe import environment_state_names
 from manip_il.sim.register import ENV_IDS, register_envs
+from manip_il.sim.varied import VariedEnv
+from manip_il.sim.world import GOAL
+from manip_il.tasks.starts import UPRIGHT
 
-ROBOTS, TASKS = ("panda", "fetch"), ("reach", "lift", "pick_place")
+from ..tables import SCENES, every_robot, every_scene, every_scene_with_an_object
+
 SEED = 5_000_000
+OTHERS = Condition("others", size=(0.03, 0.07), mass=(0.05, 0.3), friction=(0.6, 0.9))
 
 
 def still(env: ManipEnv) -> np.ndarray:
     """The action that holds the arm where it is commanded to be."""
-    scene, ctrl = env.scene, env.data.ctrl
-    return np.append(ctrl[scene.arm_ctrl], 2 * ctrl[scene.finger_ctrl[0]])
+    return env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], env.world.opening)
+
+
+def move_goal(env: ManipEnv, at: np.ndarray) -> None:
+    env.world.place(GOAL, at, UPRIGHT)
+    env.world.moved()
 
 
 def random_actions(env: ManipEnv, count: int, seed: int = 0) -> np.ndarray:
@@ -41,8 +48,7 @@ def trajectory(env: ManipEnv, actions: np.ndarray) -> list[bytes]:
     return seen
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_scene
 @pytest.mark.filterwarnings("ignore:.*infinity.*:UserWarning")  # an observation has no bounds
 def test_gymnasium_takes_it_for_its_own(robot: str, task: str):
     check_env(ManipEnv(robot, task), skip_render_check=True)
@@ -52,7 +58,7 @@ def test_every_robot_and_task_has_a_name_in_gymnasium():
     register_envs()
     register_envs()
     assert {"manip_il/PandaPickPlace-v0", "manip_il/FetchReach-v0"} <= set(ENV_IDS)
-    assert sorted(ENV_IDS.values()) == sorted((robot, task) for robot in ROBOTS for task in TASKS)
+    assert sorted(ENV_IDS.values()) == sorted(SCENES)
     for env_id, (robot, task) in ENV_IDS.items():
         env = gymnasium.make(env_id, horizon=6)
         config = env.unwrapped.config  # pyright: ignore[reportAttributeAccessIssue]
@@ -60,9 +66,9 @@ def test_every_robot_and_task_has_a_name_in_gymnasium():
         assert env.reset(seed=1)[0]["agent_pos"].dtype == np.float32
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_a_seed_is_a_start_whatever_ran_before(robot: str):
-    fresh, used = ManipEnv(robot), ManipEnv(robot)
+@every_scene
+def test_a_seed_is_a_start_whatever_ran_before(robot: str, task: str):
+    fresh, used = ManipEnv(robot, task), ManipEnv(robot, task)
     used.start(SEED + 1)
     trajectory(used, random_actions(used, 10))
     fresh.start(SEED)
@@ -90,16 +96,14 @@ def test_reset_with_a_seed_is_start_with_it():
     assert one.get_state().to_vector().tobytes() != other.get_state().to_vector().tobytes()
 
 
-@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.GRASP, Phase.CARRY])
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_a_restored_state_has_the_same_future(robot: str, phase: Phase, drive_until):
-    env, other = ManipEnv(robot), ManipEnv(robot)
+@every_scene
+@pytest.mark.parametrize("steps", [0, 9, 17])  # before, around and after the grasp
+def test_a_restored_state_has_the_same_future(robot: str, task: str, steps: int, drive):
+    env, other = ManipEnv(robot, task), ManipEnv(robot, task)
     env.start(SEED)
-    drive_until(env, phase)
-    if phase == Phase.GRASP:
-        env.advance(env.observe().state.astype(np.float64) * [*[1] * 7, 0])  # the fingers are closing now
+    drive(env, steps)
     state = env.get_state()
-    actions = random_actions(env, 15)
+    actions = random_actions(env, 12)
     future = trajectory(env, actions)
     other.start(SEED + 5)
     for where in (env, other):
@@ -108,15 +112,42 @@ def test_a_restored_state_has_the_same_future(robot: str, phase: Phase, drive_un
         assert trajectory(where, actions) == future
 
 
-def test_a_restored_state_is_seen_as_it_was(drive_until):
-    env, other = ManipEnv(), ManipEnv()
+@every_scene_with_an_object
+def test_a_restored_state_of_a_varied_episode_has_the_same_future_anywhere(robot: str, task: str, drive):
+    varied, other, plain = (make() for make in (lambda: VariedEnv([OTHERS], robot=robot, task=task),) * 2 + (
+        lambda: ManipEnv(robot, task),))  # fmt: skip
+    varied.start(SEED)
+    drive(varied, 16)
+    state = varied.get_state()
+    actions = random_actions(varied, 12)
+    future = trajectory(varied, actions)
+    other.start(SEED + 1)  # with another cube
+    plain.start(SEED)
+    for where in (varied, other, plain):
+        where.set_state(state)
+        assert where.get_state().to_vector().tobytes() == state.to_vector().tobytes()
+        assert trajectory(where, actions) == future
+
+
+@every_scene
+def test_a_restored_state_is_seen_as_it_was(robot: str, task: str, drive):
+    env, other = ManipEnv(robot, task), ManipEnv(robot, task)
     env.start(SEED)
-    drive_until(env, Phase.CARRY)
+    drive(env, 14)
     seen = env.observe()
     other.set_state(env.get_state())
     assert other.observe().state.tobytes() == seen.state.tobytes()
     assert other.observe().environment_state.tobytes() == seen.environment_state.tobytes()
-    assert other.distance() == env.distance()
+    assert (other.distance(), other.progress) == (env.distance(), env.progress)
+
+
+def test_asking_for_the_state_or_an_observation_changes_nothing():
+    env = ManipEnv()
+    env.start(SEED)
+    before = env.get_state().to_vector().tobytes()
+    env.observe()
+    env.distance()
+    assert env.get_state().to_vector().tobytes() == before
 
 
 def test_a_state_of_another_scene_is_refused_with_both_sizes():
@@ -148,19 +179,20 @@ def test_an_action_of_the_wrong_length_is_refused_with_both_shapes():
 
 
 @pytest.mark.parametrize("side", [0, 1])
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_an_action_is_clipped_to_the_joint_limits(robot: str, side: int):
     env = ManipEnv(robot, "reach")
     env.start(SEED)
-    far = 100.0 * (2 * side - 1)
-    env.advance(np.full(8, far))
-    limits = env.scene.arm_range[:, side]
+    actions, gripper, far = env.scene.actions, env.scene.gripper, 100.0 * (2 * side - 1)
+    env.advance(np.full(len(actions), far))
+    limits = (actions.low, actions.high)[side][actions.arm]
     bounded = np.isfinite(limits)
     assert bounded.any()
     commanded = env.data.ctrl[env.scene.arm_ctrl]
     np.testing.assert_array_equal(commanded[bounded], limits[bounded])
     np.testing.assert_array_equal(commanded[~bounded], far)
-    np.testing.assert_array_equal(env.data.ctrl[env.scene.finger_ctrl], side * env.scene.robot.max_opening / 2)
+    end = (gripper.least, gripper.most)[side]
+    np.testing.assert_array_equal(env.data.ctrl[gripper.ctrl], gripper.command(end))
 
 
 @pytest.mark.parametrize("success_steps", [1, 5])
@@ -168,13 +200,13 @@ def test_success_is_so_many_steps_in_a_row(success_steps: int):
     env = ManipEnv("panda", "reach", success_steps=success_steps)
     env.start(SEED)
     here = env.data.site_xpos[env.scene.ee_site].copy()
-    env.set_state(replace(env.get_state(), goal=here))
+    move_goal(env, here)
     solved = [env.step(still(env))[4]["is_success"] for _ in range(success_steps + 1)]
     assert solved == [False] * (success_steps - 1) + [True, True]
-    env.set_state(replace(env.get_state(), goal=here + [0, 0, 0.1]))
+    move_goal(env, here + [0, 0, 0.1])
     info = env.step(still(env))[4]
     assert (info["is_success"], info["ever_success"]) == (False, True)
-    env.set_state(replace(env.get_state(), goal=here))
+    move_goal(env, here)
     assert env.step(still(env))[4]["is_success"] == (success_steps == 1)
 
 
@@ -182,8 +214,7 @@ def test_success_is_so_many_steps_in_a_row(success_steps: int):
 def test_the_tolerance_decides(tolerance: float, solved: bool):
     env = ManipEnv("panda", "reach", tolerance=tolerance, success_steps=1)
     env.start(SEED)
-    goal = env.data.site_xpos[env.scene.ee_site] + [0, 0, 0.035]
-    env.set_state(replace(env.get_state(), goal=goal))
+    move_goal(env, env.data.site_xpos[env.scene.ee_site] + [0, 0, 0.035])
     _, reward, _, _, info = env.step(still(env))
     assert (reward, info["is_success"]) == (float(solved), solved)
 
@@ -204,13 +235,14 @@ def test_a_control_step_lasts_what_its_rate_says():
     assert env.metadata["render_fps"] == 25
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_number_that_a_learner_sees_has_a_name(task: str):
-    env = ManipEnv("fetch", task)
+@every_scene
+def test_every_number_that_a_learner_sees_has_a_name(robot: str, task: str):
+    env = ManipEnv(robot, task)
     env.start(SEED)
-    seen, names = env.observe(), environment_state_names(env.scene.task)
+    seen, names = env.observe(), environment_state_names(env.scene)
     assert len(seen.environment_state) == len(names) == len(set(names))
     assert len(seen.state) == len(env.scene.robot.joint_names)
+    assert env.observation_space.contains({"agent_pos": seen.state, "environment_state": seen.environment_state})
 
 
 def test_a_name_that_is_unknown_gets_the_nearest():

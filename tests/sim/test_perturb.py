@@ -9,19 +9,19 @@ import pytest
 
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import UnknownName, UsageError
-from manip_il.mdp import Phase
+from manip_il.robots.robot import ROBOTS
 from manip_il.sim.disturb import Disturbance
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.perturb import DROP, JOLT, KINDS, SHIFT, Perturbation, Perturber, kinds_for
-from manip_il.sim.task import TASKS
-from manip_il.sim.world import CUBE_HALF_SIZE
+from manip_il.tasks.objects import CUBE_HALF
+from manip_il.tasks.table import TASKS
 
 SEED, MOMENT = 5_000_000, 7
 CHANGES = [name for name, kind in KINDS.items() if kind.change is not None]
 WRONG = [name for name, kind in KINDS.items() if kind.wrong is not None]
 
 
-@pytest.fixture(params=["panda", "fetch"])
+@pytest.fixture(params=list(ROBOTS))
 def env(request) -> ManipEnv:
     env = ManipEnv(request.param)
     env.start(SEED)
@@ -52,11 +52,12 @@ def wrong(env: ManipEnv, kind: str, action: np.ndarray, seed: int = SEED) -> np.
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_happens_at_its_step_alone(env: ManipEnv, kind: str):
-    one, action = perturber(env, kind), np.append(arm(env), 0.0)
+    one, action = perturber(env, kind), env.scene.actions.join(arm(env), 0.0)
     touched = []
     for step in range(MOMENT + 5):
         env.set_state(replace(env.get_state(), streak=2))
-        env.data.qpos[env.scene.finger_q] = 0.01  # neither open nor closed
+        gripper = env.scene.gripper
+        env.data.qpos[gripper.q] = gripper.command(0.03)  # neither open nor closed
         before = bits(env)
         one.before(step)
         if bits(env) != before or one.action(action) is not action:
@@ -70,7 +71,7 @@ def test_the_world_is_changed_by_as_much_as_the_kind_says(env: ManipEnv, seed: i
         env.start(seed)
         q, at = arm(env), cube(env)
         perturber(env, kind, seed).before(MOMENT)
-        return arm(env) - q, cube(env) - at, float(env.observe().state[-1])
+        return arm(env) - q, cube(env) - at, float(env.observe().state[env.scene.actions.gripper])
 
     turned, _, _ = changed("jolt")
     assert 0 < np.abs(turned).max() <= JOLT
@@ -78,13 +79,14 @@ def test_the_world_is_changed_by_as_much_as_the_kind_says(env: ManipEnv, seed: i
     assert 0 < np.hypot(*moved[:2]) <= SHIFT[1]
     _, dropped, _ = changed("dropped")
     assert np.hypot(*dropped[:2]) <= SHIFT[1]
-    assert dropped[2] == pytest.approx(DROP, abs=CUBE_HALF_SIZE / 10)
-    assert changed("closed")[2] == pytest.approx(0.0, abs=1e-6)
-    assert changed("open")[2] == pytest.approx(env.scene.robot.max_opening, abs=1e-6)
+    assert dropped[2] == pytest.approx(DROP, abs=CUBE_HALF / 10)
+    least, most = env.scene.gripper.least, env.scene.gripper.most
+    assert changed("closed")[2] == pytest.approx(max(0.0, least), abs=1e-6)
+    assert changed("open")[2] == pytest.approx(most, abs=1e-6)
 
 
 def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, drive_until):
-    drive_until(env, Phase.DESCEND)  # with open fingers
+    drive_until(env, "descend")  # with open fingers
     env.set_state(replace(env.get_state(), streak=3))
     before = bits(env)
     perturber(env, "open").before(MOMENT)
@@ -95,22 +97,28 @@ def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, drive_
 
 
 def test_a_random_action_is_any_that_a_learner_may_choose(env: ManipEnv):
-    robot, q = env.scene.robot, arm(env)
-    drawn = np.array([wrong(env, "random", np.zeros(8), seed) for seed in range(200)])
-    steps, openings = drawn[:, :-1] - q, drawn[:, -1]
-    assert np.abs(steps).max() <= robot.max_joint_step
-    assert np.abs(steps).max() > 0.95 * robot.max_joint_step
-    assert 0 <= openings.min() < 0.05 * robot.max_opening
-    assert 0.95 * robot.max_opening < openings.max() <= robot.max_opening
+    actions, gripper, q = env.scene.actions, env.scene.gripper, arm(env)
+    drawn = np.array([wrong(env, "random", np.zeros(len(actions)), seed) for seed in range(200)])
+    steps, openings = drawn[:, actions.arm] - q, drawn[:, actions.gripper]
+    longest, room = env.scene.robot.max_joint_step, gripper.most - gripper.least
+    assert np.abs(steps).max() <= longest
+    assert np.abs(steps).max() > 0.95 * longest
+    assert gripper.least <= openings.min() < gripper.least + 0.05 * room
+    assert gripper.most - 0.05 * room < openings.max() <= gripper.most
 
 
 @pytest.mark.parametrize(("command", "opposite"), [(0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (1.0, 0.0)])
 def test_opposite_actions_mirror_the_step_and_turn_the_gripper_round(env: ManipEnv, command: float, opposite: float):
-    q, largest = arm(env), env.scene.robot.max_opening
+    q, actions, gripper = arm(env), env.scene.actions, env.scene.gripper
     step = np.linspace(-0.1, 0.1, len(q))
-    action = np.append(q + step, command * largest)
-    np.testing.assert_allclose(wrong(env, "opposite", action), np.append(q - step, opposite * largest), atol=1e-12)
-    np.testing.assert_array_equal(wrong(env, "gripper", action), np.append(q + step, opposite * largest))
+
+    def at(share: float) -> float:
+        return gripper.least + share * (gripper.most - gripper.least)
+
+    action = actions.join(q + step, at(command))
+    mirrored, other = actions.join(q - step, at(opposite)), actions.join(q + step, at(opposite))
+    np.testing.assert_allclose(wrong(env, "opposite", action), mirrored, atol=1e-12)
+    np.testing.assert_allclose(wrong(env, "gripper", action), other, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", ["jolt", "moved", "dropped", "random"])
@@ -119,7 +127,7 @@ def test_what_is_drawn_follows_from_the_seed(env: ManipEnv, kind: str):
         env.start(SEED)
         one = perturber(env, kind, seed)
         one.before(MOMENT)
-        return bits(env) + one.action(np.zeros(8)).tobytes()
+        return bits(env) + one.action(np.zeros(len(env.scene.actions))).tobytes()
 
     assert outcome(1) == outcome(1)
     assert outcome(1) != outcome(2)

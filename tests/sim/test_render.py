@@ -12,13 +12,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import RenderError, UnknownName
+from manip_il.robots.robot import ROBOTS
 from manip_il.sim import render
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend, require_known_backend
-from manip_il.sim.look import CameraConfig, Look
-from manip_il.sim.world import CAMERAS
+from manip_il.sim.look import CAMERAS, CameraConfig, Look
 
-ROBOTS = ("panda", "fetch")
 SEED = 5_000_000
 
 
@@ -36,7 +35,7 @@ def no_context_yet() -> Iterator[None]:
     render.close()
 
 
-both_robots = pytest.mark.parametrize("env", ROBOTS, indirect=True)
+with_every_robot = pytest.mark.parametrize("env", list(ROBOTS), indirect=True)
 
 
 def pixels_like(picture: np.ndarray, strongest: int) -> int:
@@ -46,14 +45,14 @@ def pixels_like(picture: np.ndarray, strongest: int) -> int:
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 @pytest.mark.filterwarnings("ignore:.*(infinity|normalized space).*:UserWarning")
 def test_gymnasium_takes_the_one_with_cameras_for_its_own(env: ManipEnv):
     check_env(env)
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_cameras_show_different_pictures_with_something_on_them(env: ManipEnv):
     pictures = env.observe().images
     assert set(pictures) == set(CAMERAS)
@@ -66,7 +65,7 @@ def test_cameras_show_different_pictures_with_something_on_them(env: ManipEnv):
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_the_front_camera_sees_the_green_goal_and_the_red_cube(env: ManipEnv):
     for seed in range(SEED, SEED + 5):
         env.start(seed)
@@ -76,7 +75,7 @@ def test_the_front_camera_sees_the_green_goal_and_the_red_cube(env: ManipEnv):
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_a_state_is_the_same_picture_again(env: ManipEnv):
     state, first = env.get_state(), env.observe().images
     env.start(SEED + 1)
@@ -89,12 +88,12 @@ def test_a_state_is_the_same_picture_again(env: ManipEnv):
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env: ManipEnv):
     before = env.observe().images
     q = env.data.ctrl[env.scene.arm_ctrl].copy()
     for _ in range(10):
-        env.advance(np.append(q + [0.3, 0, 0, 0, 0, 0, 0], 0.04))
+        env.advance(env.scene.actions.join(q + 0.3 * np.eye(len(q))[0], 0.04))
     after = env.observe().images
     share = {name: (np.abs(after[name].astype(int) - before[name]).max(axis=2) > 12).mean() for name in CAMERAS}
     assert share["wrist"] > 0.1
@@ -102,7 +101,7 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_render_is_larger_and_leaves_the_cameras_as_they_were(env: ManipEnv):
     before = env.observe().images["front"]
     assert env.render().shape == (480, 640, 3)
@@ -110,7 +109,7 @@ def test_render_is_larger_and_leaves_the_cameras_as_they_were(env: ManipEnv):
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
     crowd = [ManipEnv(env.config.robot, cameras=CAMERAS) for _ in range(25)]
     for seed, one in enumerate(crowd, SEED):
@@ -141,7 +140,7 @@ def test_other_robots_looks_and_sizes_in_between_change_no_byte():
 
 @pytest.mark.gl
 @pytest.mark.slow
-@both_robots
+@with_every_robot
 def test_another_process_draws_the_same_bytes(env: ManipEnv):
     config = CameraConfig(CAMERAS)
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -162,14 +161,14 @@ def test_the_picture_is_the_mean_of_finer_pixels_the_right_way_up():
 
 
 @pytest.mark.gl
-@both_robots
+@with_every_robot
 def test_pictures_leave_the_physics_alone(env: ManipEnv):
     blind = ManipEnv(env.config.robot)
     blind.start(SEED)
     for _ in range(5):
         env.observe()
         for one in (env, blind):
-            one.advance(np.append(one.data.ctrl[one.scene.arm_ctrl] + 0.02, 0.03))
+            one.advance(one.scene.actions.join(one.data.ctrl[one.scene.arm_ctrl] + 0.02, 0.03))
     np.testing.assert_array_equal(env.get_state().to_vector(), blind.get_state().to_vector())
 
 

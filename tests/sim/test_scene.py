@@ -6,12 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.mdp import Phase
+from manip_il.errors import UnknownName
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import arm_model, build_scene
-from manip_il.sim.world import CUBE_HALF_SIZE, CUBE_MASS
+from manip_il.sim.scene import DT_SIM, build_scene, camera_id
+from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS
 
-ROBOTS = ("panda", "fetch")
+from ..tables import SCENES, every_robot, every_scene
+
 SEED = 5_000_000
 FURNITURE = {"table", "floor", "pedestal", "object", "leg0", "leg1", "leg2", "leg3"}
 
@@ -22,7 +23,7 @@ def touching(env: ManipEnv) -> set[frozenset[str]]:
     return {frozenset(name if name in FURNITURE else "robot" for name in pair) for pair in pairs}
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_at_the_start_the_robot_touches_nothing(robot: str):
     env = ManipEnv(robot)
     for seed in range(SEED, SEED + 20):
@@ -31,64 +32,42 @@ def test_at_the_start_the_robot_touches_nothing(robot: str):
         assert all(contact.dist > -1e-4 for contact in env.data.contact)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_at_home_the_hand_points_down_over_the_workspace(robot: str):
-    scene = build_scene(robot, "reach")
-    data = mujoco.MjData(scene.model)
-    data.qpos[scene.arm_q] = scene.robot.home
-    mujoco.mj_forward(scene.model, data)
-    rotation = data.site_xmat[scene.ee_site].reshape(3, 3)
-    np.testing.assert_allclose(rotation, np.diag([1.0, -1.0, -1.0]), atol=0.05)
-    assert np.hypot(*(data.site_xpos[scene.ee_site][:2] - scene.robot.workspace)) < 0.06
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_an_arm_told_to_stand_still_stands_still(robot: str):
     env = ManipEnv(robot, "reach")
     env.start(SEED)
     q = env.data.qpos[env.scene.arm_q].copy()
-    command = np.append(q, 2 * env.data.ctrl[env.scene.finger_ctrl[0]])
+    command = env.scene.actions.join(q, env.world.opening)
     for _ in range(40):
         env.advance(command)
     np.testing.assert_allclose(env.data.qpos[env.scene.arm_q], q, atol=2e-3)
-
-
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: str):
-    env = ManipEnv(robot, "reach")
-    env.start(SEED)
-    for opening in (env.scene.robot.max_opening, 0.03, 0.0):
-        command = np.append(env.data.ctrl[env.scene.arm_ctrl], opening)
-        for _ in range(20):
-            env.advance(command)
-        assert env.observe().state[-1] == pytest.approx(opening, abs=2e-3)
 
 
 def test_an_untouched_cube_lies_still():
     env = ManipEnv()
     env.start(SEED)
     before = cube(env)
-    command = np.append(env.data.ctrl[env.scene.arm_ctrl], 0.04)
+    command = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], 0.04)
     for _ in range(40):
         env.advance(command)
     np.testing.assert_allclose(cube(env), before, atol=1e-3)
-    assert cube(env)[2] == pytest.approx(CUBE_HALF_SIZE, abs=5e-4)
+    assert cube(env)[2] == pytest.approx(CUBE_HALF, abs=5e-4)
 
 
 def test_the_cube_weighs_what_the_constant_says():
     assert build_scene("panda", "lift").model.body("object").mass[0] == CUBE_MASS
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str, drive_until):
     env = ManipEnv(robot, "lift")
     env.start(SEED)
-    drive_until(env, Phase.AT_GOAL)
-    command = np.append(env.data.ctrl[env.scene.arm_ctrl], 0.0)
+    drive_until(env, "at_goal")
+    command = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], 0.0)
     for _ in range(5):  # the arm comes to rest
         env.advance(command)
     first = in_hand(env)
-    assert cube(env)[2] > 2 * CUBE_HALF_SIZE
+    assert cube(env)[2] > 2 * CUBE_HALF
     for _ in range(100):
         env.advance(command)
     assert np.linalg.norm(in_hand(env) - first) < 1e-3
@@ -105,25 +84,50 @@ def in_hand(env: ManipEnv) -> np.ndarray:
     return data.site_xmat[scene.ee_site].reshape(3, 3).T @ offset
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
-    scene = build_scene(robot, "pick_place")
-    alone, data = arm_model(scene.robot), mujoco.MjData(scene.model)
-    alone_data = mujoco.MjData(alone)
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        q = np.asarray(scene.robot.home) + rng.uniform(-0.5, 0.5, 7)
-        data.qpos[scene.arm_q] = q
-        alone_data.qpos[[alone.joint(name).qposadr[0] for name in scene.robot.arm_joints]] = q
-        mujoco.mj_kinematics(scene.model, data)
-        mujoco.mj_kinematics(alone, alone_data)
-        site = alone.site("ee").id
-        np.testing.assert_allclose(alone_data.site_xpos[site], data.site_xpos[scene.ee_site], atol=1e-12)
-        np.testing.assert_allclose(alone_data.site_xmat[site], data.site_xmat[scene.ee_site], atol=1e-12)
+@every_scene
+def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
+    scene = build_scene(robot, task)
+    assert build_scene(robot, task) is scene
+    assert build_scene.__wrapped__(robot, task).model_bytes() == scene.model_bytes()
 
 
-def test_a_scene_is_compiled_once_and_is_the_same_bytes_again():
-    scene = build_scene("fetch", "lift")
-    assert build_scene("fetch", "lift") is scene
-    assert build_scene.__wrapped__("fetch", "lift").model_bytes() == scene.model_bytes()
-    assert build_scene("fetch", "reach").model_bytes() != scene.model_bytes()
+def test_no_two_scenes_are_the_same_model():
+    models = {build_scene(robot, task).model_bytes() for robot, task in SCENES}
+    assert len(models) == len(SCENES)
+
+
+@every_scene
+def test_addresses_are_what_their_names_say(robot: str, task: str):
+    scene = build_scene(robot, task)
+    assert scene.model.opt.timestep == DT_SIM
+    for address, motor, name in zip(scene.arm_q, scene.arm_ctrl, scene.robot.joints, strict=True):
+        joint = scene.model.joint(f"robot/{name}")
+        assert joint.qposadr[0] == address
+        assert scene.model.actuator_trnid[motor, 0] == joint.id
+    for name, one in scene.objects.items():
+        assert scene.model.joint(name).qposadr[0] == one.q
+        assert scene.model.joint(name).dofadr[0] == one.v
+        assert scene.model.geom(one.geom).bodyid[0] == one.body == scene.model.body(name).id
+    assert set(scene.task.grasped) <= set(scene.objects)
+    assert len(scene.nominal) == 5 * len(scene.objects)
+
+
+@every_robot
+def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
+    model = build_scene(robot, "reach").model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    if "pedestal" not in names:  # the robot stands on the floor itself
+        return
+    pedestal = names.index("pedestal")
+    middle, half = data.geom_xpos[pedestal, 2], model.geom_size[pedestal, 2]
+    assert middle - half == pytest.approx(float(model.geom("floor").pos[2]))
+    geoms = [i for i in range(model.ngeom) if model.geom_bodyid[i] and model.geom_contype[i]]
+    assert not any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.005, None) < 0 for i in geoms)
+    assert any(mujoco.mj_geomDistance(model, data, pedestal, i, 0.05, None) < 0.02 for i in geoms)
+
+
+def test_an_unknown_camera_names_those_there_are():
+    with pytest.raises(UnknownName, match=r"did you mean 'wrist'.*known: front, wrist"):
+        camera_id(build_scene("panda", "reach").model, "writs")

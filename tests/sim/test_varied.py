@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from manip_il.expert.expert import Expert
-from manip_il.sim.conditions import CUBE_EDGE, NOMINAL, Condition, draw
+from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.varied import VariedEnv
-from manip_il.sim.world import CUBE_MASS
+from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS
 
 FETCH = EnvConfig("fetch")
 HEAVY = Condition("heavy", mass=(0.3, 0.3), size=(0.06, 0.06), friction=(0.7, 0.7))
@@ -31,7 +31,7 @@ def drive(env: ManipEnv, steps: int) -> list[tuple[bytes, np.ndarray, np.ndarray
 def names(env: ManipEnv, thing: str) -> list[int]:
     from manip_il.sim.observe import environment_state_names
 
-    known = environment_state_names(env.scene.task)
+    known = environment_state_names(env.scene)
     return [known.index(f"{thing}.{axis}") for axis in "xyz"]
 
 
@@ -51,15 +51,15 @@ def test_a_nominal_episode_is_the_plain_environments_to_the_bit():
 def test_the_cube_has_the_drawn_mass_size_and_friction():
     env = VariedEnv([HEAVY], config=FETCH)
     env.start(0)
-    model = env.scene.model
+    model, q = env.world.model, env.scene.objects["object"].q
     assert model.body("object").mass == pytest.approx(0.3)
     assert model.geom("object").size == pytest.approx([0.03] * 3)
     assert model.body("object").inertia == pytest.approx([0.3 * 0.06**2 / 6] * 3)
     assert model.body("object").subtreemass == pytest.approx(0.3)  # follows only from mj_setConst
-    assert env.data.qpos[env.scene.object_q + 2] == 0.03
+    assert env.data.qpos[q + 2] == 0.03
     for _ in range(10):
-        env.advance(np.append(env.data.qpos[env.scene.arm_q], 0.1))
-    assert env.data.qpos[env.scene.object_q + 2] == pytest.approx(0.03, abs=5e-4)  # rests on the table, not in it
+        env.advance(env.scene.actions.join(env.data.qpos[env.scene.arm_q], 0.1))
+    assert env.data.qpos[q + 2] == pytest.approx(0.03, abs=5e-4)  # rests on the table, not in it
     touching = [contact for contact in env.data.contact if model.geom("object").id in contact.geom]
     assert touching
     assert all(contact.friction[0] == 0.7 for contact in touching)
@@ -71,7 +71,7 @@ def test_the_shared_model_stays_as_it_is():
     env.start(0)
     assert build_scene("fetch", "pick_place").model_bytes() == before
     assert build_scene("fetch", "pick_place").model.body("object").mass == CUBE_MASS
-    assert build_scene("fetch", "pick_place").model.geom("object").size[0] * 2 == CUBE_EDGE
+    assert build_scene("fetch", "pick_place").model.geom("object").size[0] == CUBE_HALF
 
 
 def test_a_late_policy_sees_the_world_three_steps_ago():
@@ -90,13 +90,14 @@ def test_a_late_policy_sees_the_world_three_steps_ago():
 def test_noise_is_on_joints_and_object_and_all_that_follows_from_them():
     plain, noisy = ManipEnv(config=FETCH), VariedEnv([NOISY], config=FETCH)
     joints, cubes = [], []
+    arm, gripper = plain.scene.actions.arm, plain.scene.actions.gripper
     for seed in range(8):
         plain.start(seed)
         noisy.start(seed)
         for true, shown in zip(drive(plain, 20), drive(noisy, 20), strict=True):
             assert true[0] == shown[0]
-            joints.append(shown[1][:-1] - true[1][:-1])
-            assert shown[1][-1] == true[1][-1]  # the gripper's opening has none
+            joints.append((shown[1] - true[1])[arm])
+            assert shown[1][gripper] == true[1][gripper]  # the gripper's opening has none
             ee, cube, apart = (shown[2][names(noisy, thing)] for thing in ("ee", "object", "object_from_ee"))
             cubes.append(cube - true[2][names(noisy, "object")])
             assert np.allclose(apart, cube - ee, atol=1e-6)

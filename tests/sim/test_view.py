@@ -8,12 +8,11 @@ import pytest
 
 from manip_il.sim import render, view
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.look import Look
+from manip_il.sim.look import CAMERAS, Look
 from manip_il.sim.scene import build_scene
 from manip_il.sim.view import cluster, view_model
-from manip_il.sim.world import CAMERAS
 
-ROBOTS = ("panda", "fetch")
+from ..tables import every_robot
 
 
 def ball(rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +60,7 @@ def test_merging_keeps_a_boxs_edges_sharp():
     assert np.abs(np.abs(merged).max(axis=1) - 1).max() < 0.02  # every vertex on the surface
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
     scene = build_scene(robot, "pick_place")
     before = scene.model_bytes()
@@ -79,7 +78,7 @@ def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
 
 
 @pytest.mark.gl
-@pytest.mark.parametrize("robot", ROBOTS)
+@every_robot
 def test_few_faces_look_like_all_of_them(robot, monkeypatch):
     env = ManipEnv(robot, cameras=CAMERAS)
     env.start(5_000_000)

@@ -72,7 +72,7 @@ def test_what_is_pushed_is_trained_on_loaded_and_pulled(program: Program, tmp_pa
         loaded = pool.submit(program, Path(sys.executable).name, "-c", TRAIN_AND_LOAD, *words, *ACT)
         program("manip-il", "pull", url, tmp_path / "back", "--quiet")
         program("manip-il", "pull", "hf://datasets/user/demos", tmp_path / "demos", "--quiet")
-        assert loaded.result().splitlines()[-1] == "373 10 v3.0 tensor(True)"
+        assert loaded.result().splitlines()[-1] == "375 10 v3.0 tensor(True)"
     assert (tmp_path / "lerobot" / "checkpoints" / "000002" / "pretrained_model" / "model.safetensors").is_file()
     back, demos = contents(tmp_path / "back"), contents(tmp_path / "demos")
     assert b"lerobot-eval --policy.path=user/run" in back.pop(CARD)

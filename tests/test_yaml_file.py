@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.yaml_file import DEEPEST, LARGEST, parse_yaml, read_yaml
 from manip_il.errors import UsageError
+from manip_il.yaml_file import DEEPEST, LARGEST, parse_yaml, read_yaml
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in zip("abcdefgh", "bcdefghi", strict=True)

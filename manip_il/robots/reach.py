@@ -1,0 +1,176 @@
+"""Where a robot's hand gets to, pointing down: a map of solutions of its inverse kinematics.
+
+Worked out once a robot and kept: beside the YAML of a robot that ships, else in the user's cache, under the hash of
+what it follows from.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.robots.robot import HERE, Robot
+from manip_il.robots.spec import arm_spec
+
+if TYPE_CHECKING:
+    from manip_il.robots.ik import ArmIK
+
+F64 = NDArray[np.float64]
+_CELL = 0.05  # of the grid [m]
+_BEYOND = 0.2  # the map goes on around the workspace by this much [m]
+_ABOVE = 0.05  # and above it [m]
+_VERSION = 1  # of how the map is worked out
+_STEPS = 80  # of inverse kinematics, at most
+_NEAR, _ANGLE = 1e-3, 0.05  # where it has arrived [m], and what a radian counts for beside that [m/rad]
+ARRIVES = 0.004  # what the hand may miss a pose by and still be there [m]
+STRETCH = 0.02  # it still gets there less exactly [m]
+_BLOCKED = 0.1  # what a posture in which the robot meets itself counts for [m]
+_BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)  # what a file that is no map raises
+_CLEARANCE = 0.02  # parts that are nearer than that meet [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Errors on a grid: how far the hand, pointing down, ends from each point [m], (x, y, z).
+
+    origin: of the grid [m], (3,).
+    """
+
+    origin: F64
+    errors: F64
+
+    @cached_property
+    def _arrives(self) -> list[list[list[bool]]]:
+        """For each cell of the grid, whether the hand gets to all its corners."""
+        there = self.errors < ARRIVES
+        for axis in range(3):
+            low, high = np.delete(there, -1, axis), np.delete(there, 0, axis)
+            there = low & high
+        return there.tolist()
+
+    @cached_property
+    def _corner(self) -> tuple[float, float, float]:
+        return tuple(self.origin.tolist())
+
+    def error(self, position: Sequence[float] | F64) -> float:
+        """How far from `position` [m], (3,), the hand ends; beyond the map also how far that is from it [m]."""
+        place = (np.asarray(position) - self.origin) / _CELL
+        last = np.array(self.errors.shape) - 1
+        inside = np.minimum(np.maximum(place, 0.0), last)
+        low = np.minimum(inside.astype(np.int64), last - 1)
+        (x, y, z), (fx, fy, fz) = low.tolist(), (inside - low).tolist()
+        block = self.errors[x : x + 2, y : y + 2, z : z + 2]
+        block = block[0] + fx * (block[1] - block[0])
+        block = block[0] + fy * (block[1] - block[0])
+        return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(np.abs(place - inside).max())
+
+    def has(self, position: Sequence[float] | F64) -> bool:
+        """Whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
+        cells = self._arrives
+        x, y, z = (math.floor((at - start) / _CELL) for at, start in zip(position, self._corner, strict=True))
+        if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
+            return False
+        return cells[x][y][z]
+
+    def nearly(self, position: Sequence[float] | F64) -> bool:
+        """Whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
+        return self.has(position) or self.error(position) < STRETCH
+
+
+@cache
+def reach_of(robot: Robot) -> Reach:
+    """Return a robot's map, from where it is kept, else worked out (some seconds) and kept."""
+    name = f"{robot.name}.reach.{_key(robot)}.npz"
+    cached = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
+    for path in (HERE / name, cached):
+        with contextlib.suppress(*_BROKEN), np.load(path, allow_pickle=False) as kept:
+            return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
+    reach = _solve(robot)
+    with contextlib.suppress(OSError):  # a map that cannot be kept is worked out again
+        _keep(reach, cached)
+    return reach
+
+
+def _keep(reach: Reach, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{os.getpid()}")
+    with partial.open("wb") as stream:
+        np.savez_compressed(stream, origin=reach.origin, errors=reach.errors.astype(np.float32))
+    partial.replace(path)
+
+
+def _key(robot: Robot) -> str:
+    """Hash what a map follows from: the robot's files, and how this file works it out."""
+    constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, _CLEARANCE)
+    return hashlib.sha256(repr(constants).encode() + robot.content()).hexdigest()[:16]
+
+
+def _solve(robot: Robot) -> Reach:
+    from manip_il.robots.ik import ArmIK  # mink takes long to import, and a kept map needs none
+
+    space, ik = robot.workspace, ArmIK(robot)
+    half = space.half_width + _BEYOND
+    origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
+    shape = tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
+    errors, body = np.empty(shape), _Body(robot)
+    for index in np.ndindex(*shape):
+        miss, q = _miss(robot, ik, origin + _CELL * np.array(index))
+        errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
+    return Reach(origin, errors.astype(np.float32).astype(np.float64))
+
+
+class _Body:
+    """The whole robot, to see whether parts of it meet that are apart at home."""
+
+    def __init__(self, robot: Robot):
+        self._model = arm_spec(robot).compile()
+        self._model.geom_margin[:] = _CLEARANCE
+        self._data = mujoco.MjData(self._model)
+        self._q = np.array([self._model.joint(name).qposadr[0] for name in robot.joints])
+        gripper = [self._model.joint(name).qposadr[0] for name in robot.gripper.joints]
+        self._data.qpos[gripper] = robot.gripper.open
+        self._at_home = frozenset[frozenset[int]]()
+        self._at_home = self._meeting(np.asarray(robot.home))
+
+    def meets_itself(self, q: F64) -> bool:
+        return not self._meeting(q) <= self._at_home
+
+    def _meeting(self, q: F64) -> frozenset[frozenset[int]]:
+        self._data.qpos[self._q] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_collision(self._model, self._data)
+        bodies = self._model.geom_bodyid
+        return frozenset(frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact)
+
+
+def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
+    """How far from a pose with the hand down inverse kinematics ends, from home [m], and where the joints are then.
+
+    An angle counts as a length.
+    """
+    down, q, limits = np.diag([1.0, -1.0, -1.0]), np.asarray(robot.home, dtype=np.float64), ik.limits
+    miss = np.inf
+    for _ in range(_STEPS):
+        ee, rotation = ik.ee_pose(q)
+        angle = np.arccos(np.clip((np.trace(down.T @ rotation) - 1) / 2, -1.0, 1.0))
+        miss = float(np.linalg.norm(position - ee) + _ANGLE * angle)
+        if miss < _NEAR:
+            break
+        step = ik.step(position, down, robot.max_joint_step)
+        if step is None or np.abs(step[0]).max() < 1e-5:
+            break
+        q = np.clip(q + step[0], limits[:, 0], limits[:, 1])
+    return miss, q

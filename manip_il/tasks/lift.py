@@ -1,0 +1,26 @@
+"""Lift: a cube to a goal above where it lies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.pick_place import OBJECT, PickPlace
+from manip_il.tasks.starts import LIFT, UPRIGHT, draw_resting, draw_yaw
+from manip_il.tasks.task import Start
+
+
+@dataclass(frozen=True)
+class Lift(PickPlace):
+    """Pick and place whose goal is above the cube."""
+
+    name: str = "lift"
+    instruction: str = "Lift the cube to the green goal above it."
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw the cube on the table, at any yaw, and the height of the goal over it."""
+        at, turn = draw_resting(rng, world, OBJECT), draw_yaw(rng)
+        goal = at + [0.0, 0.0, rng.uniform(*LIFT)]
+        return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})

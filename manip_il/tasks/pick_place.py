@@ -1,0 +1,68 @@
+"""Pick and place: a cube from the table to a goal on it or in the air."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.ladder import cube_yaw, pick_progress, pick_rungs
+from manip_il.tasks.objects import add_cube, add_goal
+from manip_il.tasks.reach import see_hand
+from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_resting, draw_yaw, resting_height
+from manip_il.tasks.task import Observed, Rung, Start
+
+OBJECT = "object"
+
+
+@dataclass(frozen=True)
+class PickPlace:
+    """Bring the cube's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace."""
+
+    name: str = "pick_place"
+    instruction: str = "Pick up the cube and bring it to the green goal."
+    grasped: tuple[str, ...] = (OBJECT,)
+    rungs: tuple[Rung, ...] = pick_rungs(OBJECT)
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the cube and the goal."""
+        add_cube(spec, OBJECT)
+        add_goal(spec)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw the cube on the table, at any yaw, and the goal, half of the time in the air."""
+        at, turn = draw_resting(rng, world, OBJECT), draw_yaw(rng)
+        goal = draw_goal(rng, world, resting_height(world, OBJECT))
+        return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
+
+    def observe(self, world: World) -> Observed:
+        """Hand, goal, cube, and the ways between them; the cube's yaw four times itself, as its faces are alike."""
+        return see_cube(world, OBJECT)
+
+    def error(self, world: World) -> float:
+        """Of the cube's centre from the goal [m]."""
+        return math.dist(world.pose(OBJECT).position, world.goal)
+
+    def progress(self, world: World) -> float:
+        """By the way that is left along the ladder's path."""
+        return pick_progress(world, OBJECT)
+
+
+def see_cube(world: World, name: str) -> Observed:
+    """`environment_state` of a task with one cube and a goal for it."""
+    pose, ee, goal = world.pose(name), world.ee.position, world.goal
+    yaw, tilt = cube_yaw(pose.rotation)
+    return {
+        **see_hand(world),
+        "goal": goal,
+        name: pose.position,
+        f"{name}.cos4yaw": math.cos(4 * yaw),
+        f"{name}.sin4yaw": math.sin(4 * yaw),
+        f"{name}.tilt": tilt,
+        f"{name}.width": world.extents(name)[0],
+        f"{name}_from_ee": pose.position - ee,
+        f"goal_from_{name}": goal - pose.position,
+    }

@@ -1,0 +1,61 @@
+"""Reach: the hand to a goal in the air."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.ladder import AT_GOAL, CLOSED, hand_down, nearness
+from manip_il.tasks.objects import CUBE_HALF, add_goal
+from manip_il.tasks.starts import UPRIGHT, draw_goal
+from manip_il.tasks.task import Observed, Rung, Start, Target
+
+
+def _to_goal(world: World) -> Target:
+    return Target(world.goal.copy(), hand_down(0.0), CLOSED)
+
+
+_RUNGS = (
+    Rung("at_goal", "the hand is at the goal", lambda w: math.dist(w.goal, w.ee.position) < AT_GOAL, _to_goal),
+    Rung("carry", "the hand is on its way to the goal", lambda w: True, _to_goal),
+)
+
+
+@dataclass(frozen=True)
+class ReachGoal:
+    """Bring `ee` to the goal."""
+
+    name: str = "reach"
+    instruction: str = "Move the hand to the green goal."
+    grasped: tuple[str, ...] = ()
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the goal."""
+        add_goal(spec)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw a goal over the table."""
+        return Start({GOAL: (draw_goal(rng, world, CUBE_HALF, in_air=1.0), UPRIGHT)})
+
+    def observe(self, world: World) -> Observed:
+        """Hand, goal, and the way from one to the other."""
+        return {**see_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
+
+    def error(self, world: World) -> float:
+        """Of `ee` from the goal [m]."""
+        return math.dist(world.ee.position, world.goal)
+
+    def progress(self, world: World) -> float:
+        """By the distance that is left."""
+        return nearness(self.error(world))
+
+
+def see_hand(world: World) -> Observed:
+    """Where the hand is and which way it points: the beginning of every `environment_state`."""
+    ee = world.ee
+    return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

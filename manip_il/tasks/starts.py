@@ -1,0 +1,65 @@
+"""Draws of starts within an arm's reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import UsageError
+from manip_il.sim.world import World
+
+F64 = NDArray[np.float64]
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
+FROM_HAND = 0.1  # of an object from the hand at the start, x and y, as in gymnasium-robotics' FetchPickAndPlace [m]
+IN_AIR = 0.5  # share of goals that are off the table, as in the same environment
+LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
+_MOST_DRAWS = 1_000
+
+
+def draw_resting(rng: np.random.Generator, world: World, name: str) -> F64:
+    """Draw where an object's centre rests on the table, (3,) [m], not under the hand."""
+    centre, height = np.array(world.scene.robot.workspace.centre), resting_height(world, name)
+
+    def draw() -> F64:
+        return np.append(_xy(rng, world), height)
+
+    return draw_until(
+        draw, lambda at: bool(np.linalg.norm(at[:2] - centre) >= FROM_HAND) and world.reach.has(at), world, name
+    )
+
+
+def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:
+    """Draw a goal on the table, `height` over it, or for a share of `in_air` anywhere above that; (3,) [m]."""
+    top = world.scene.robot.workspace.height if rng.uniform() < in_air else 0.0
+    return draw_until(
+        lambda: np.append(_xy(rng, world), height + rng.uniform(0, top)), world.reach.has, world, "the goal"
+    )
+
+
+def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
+    """Draw a turn about the vertical within +-`widest` [rad]: a quaternion, wxyz."""
+    yaw = rng.uniform(-widest, widest)
+    return np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
+    """Draw until it fits. Raises `UsageError` after a thousand draws."""
+    for _ in range(_MOST_DRAWS):
+        drawn = draw()
+        if fits(drawn):
+            return drawn
+    raise UsageError(
+        f"task {world.scene.task.name}: no place for {what} in reach of {world.scene.robot.name} was found"
+    )
+
+
+def resting_height(world: World, name: str) -> float:
+    """Of an object's centre over the table when it lies as it was made [m]."""
+    return world.extents(name)[2] / 2
+
+
+def _xy(rng: np.random.Generator, world: World) -> F64:
+    space = world.scene.robot.workspace
+    return np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width

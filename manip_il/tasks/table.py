@@ -1,0 +1,22 @@
+"""The tasks: one literal table."""
+
+from __future__ import annotations
+
+from manip_il.errors import UnknownName
+from manip_il.tasks.lift import Lift
+from manip_il.tasks.pick_place import PickPlace
+from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.task import Task
+
+TASKS: dict[str, Task] = {
+    "reach": ReachGoal(),
+    "lift": Lift(),
+    "pick_place": PickPlace(),
+}
+
+
+def get_task(name: str) -> Task:
+    """The table's entry; raises `UnknownName`."""
+    if name not in TASKS:
+        raise UnknownName("task", name, TASKS)
+    return TASKS[name]

@@ -1,0 +1,103 @@
+"""What a task is: one file that says its objects, its starts, what is seen of it, and how the expert solves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from manip_il.sim.world import World
+
+F64 = NDArray[np.float64]
+Observed = Mapping[str, "F64 | float"]
+
+
+class Target(NamedTuple):
+    """What the expert aims for: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
+
+    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad].
+    """
+
+    position: F64
+    rotation: F64
+    opening: float
+    max_step: float = 0.12
+    max_turn: float = 0.6
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One rung of a ladder. name: the phase; words: what the world is like there; holds: whether it is."""
+
+    name: str
+    words: str
+    holds: Callable[[World], bool]
+    target: Callable[[World], Target]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a task draws for an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies."""
+
+    poses: Mapping[str, tuple[F64, F64]]
+
+
+class Task(Protocol):
+    """A task, for every arm that can do it.
+
+    grasped: objects that the gripper must go around. rungs: latest first, the last one holding everywhere; each is a
+    function of the world alone, so that the expert can label any state.
+    """
+
+    @property
+    def name(self) -> str:
+        """How options call it."""
+        ...
+
+    @property
+    def instruction(self) -> str:
+        """What a policy that reads language is told."""
+        ...
+
+    @property
+    def grasped(self) -> tuple[str, ...]:
+        """Objects that the hand grasps."""
+        ...
+
+    @property
+    def rungs(self) -> tuple[Rung, ...]:
+        """The ladder."""
+        ...
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add its objects (free bodies), and what stands fixed or shows goals (mocap bodies)."""
+        ...
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw a start within the arm's reach. Raises `UsageError` where there is none."""
+        ...
+
+    def observe(self, world: World) -> Observed:
+        """`environment_state` by names, in its order: numbers, and vectors of x, y and z."""
+        ...
+
+    def error(self, world: World) -> float:
+        """How far the task is from being solved [m]; within the tolerance it is."""
+        ...
+
+    def progress(self, world: World) -> float:
+        """How much is done, 0 to 1; it never falls while the task is being done right."""
+        ...
+
+
+def phases(task: Task) -> tuple[str, ...]:
+    """Names of a task's phases by their number in `expert_phase`: none, then the rungs from the first on."""
+    return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
+
+
+NO_PHASE = "none"  # where there is no sound label

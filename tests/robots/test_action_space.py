@@ -1,0 +1,105 @@
+"""An action is joint targets and one opening, by name and within bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.robots.action_space import ActionSpace
+from manip_il.sim.scene import build_scene
+
+from ..tables import every_robot
+
+finite = st.floats(-1e6, 1e6)
+
+# The gripper stands in the middle here: nothing may take it to be last.
+SPACE = ActionSpace(
+    names=("pan", "gripper", "lift", "free"),
+    low=np.array([-1.0, 0.0, -2.0, -np.inf]),
+    high=np.array([1.0, 0.08, 0.5, np.inf]),
+    scale=np.array([0.1, 0.08, 0.1, 0.1]),
+    relative=np.array([True, False, True, True]),
+)
+
+
+def test_arm_and_gripper_are_told_apart_wherever_they_stand():
+    assert len(SPACE) == 4
+    assert SPACE.arm.tolist() == [0, 2, 3]
+    assert SPACE.gripper == 1
+    assert SPACE.join(np.array([1.0, 2.0, 3.0]), 0.05).tolist() == [1.0, 0.05, 2.0, 3.0]
+
+
+@given(arrays(np.float64, 3, elements=finite), finite)
+def test_what_was_joined_comes_apart_again(arm: np.ndarray, opening: float):
+    action = SPACE.join(arm, opening)
+    np.testing.assert_array_equal(action[SPACE.arm], arm)
+    assert action[SPACE.gripper] == opening
+
+
+@given(arrays(np.float64, 4, elements=finite))
+def test_a_clipped_action_is_the_nearest_within_the_bounds(action: np.ndarray):
+    clipped = SPACE.clip(action, 0)
+    assert (clipped >= SPACE.low).all()
+    assert (clipped <= SPACE.high).all()
+    inside = (action >= SPACE.low) & (action <= SPACE.high)
+    np.testing.assert_array_equal(clipped[inside], action[inside])
+    np.testing.assert_array_equal(SPACE.clip(clipped, 0), clipped)
+    assert clipped[3] == action[3]  # it turns freely
+
+
+def test_an_action_of_single_precision_is_taken():
+    assert SPACE.clip(np.zeros(4, np.float32), 0).dtype == np.float64
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_an_action_that_is_not_finite_is_refused_with_its_step(bad: float):
+    with pytest.raises(NotFiniteError, match="action at step 17 is not finite"):
+        SPACE.clip(np.array([0.0, 0.0, bad, 0.0]), 17)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5,), (1, 4), ()])
+def test_an_action_of_another_shape_is_refused_with_both(shape: tuple[int, ...]):
+    with pytest.raises(MismatchError) as caught:
+        SPACE.clip(np.zeros(shape), 0)
+    assert str(shape) in str(caught.value)
+    assert "(4,)" in str(caught.value)
+
+
+def test_parts_of_different_lengths_are_refused_with_all_of_them():
+    with pytest.raises(ManipError, match="'names': 4, 'low': 3"):
+        replace(SPACE, low=np.zeros(3))
+
+
+def test_a_random_action_is_any_within_a_joint_step_and_any_opening():
+    state = np.array([0.5, 0.02, -0.5, 9.0])
+    drawn = np.array([SPACE.random_near(state, np.random.default_rng(seed)) for seed in range(400)])
+    steps = (drawn - state)[:, SPACE.arm]
+    assert (np.abs(steps) <= SPACE.scale[SPACE.arm]).all()
+    assert (np.abs(steps).max(axis=0) > 0.95 * SPACE.scale[SPACE.arm]).all()
+    assert 0 <= drawn[:, 1].min() < 0.005
+    assert 0.075 < drawn[:, 1].max() <= 0.08
+
+
+@given(st.integers(0, 2**32))
+def test_a_random_action_follows_from_its_generator(seed: int):
+    one, other = (SPACE.random_near(np.zeros(4), np.random.default_rng(seed)) for _ in range(2))
+    assert one.tobytes() == other.tobytes()
+
+
+@every_robot
+def test_a_scenes_actions_are_its_robots_joints_in_their_ranges(robot: str):
+    scene = build_scene(robot, "reach")
+    actions, gripper = scene.actions, scene.gripper
+    assert actions.names == scene.robot.joint_names
+    assert (actions.low < actions.high).all()
+    assert (actions.low[actions.gripper], actions.high[actions.gripper]) == (gripper.least, gripper.most)
+    home = actions.join(np.asarray(scene.robot.home), gripper.most)
+    np.testing.assert_array_equal(actions.clip(home, 0), home)
+    assert (actions.scale[actions.arm] == scene.robot.max_joint_step).all()
+    assert actions.scale[actions.gripper] == gripper.most - gripper.least

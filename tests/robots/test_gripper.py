@@ -1,0 +1,193 @@
+"""A gripper is an opening [m] between pads, whatever drives the fingers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.errors import UsageError
+from manip_il.robots.gripper import TOUCH, Gripper, sweep
+from manip_il.robots.robot import ROBOTS, Robot, get_robot
+from manip_il.robots.spec import arm_spec
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.world import World
+from manip_il.tasks.ladder import LOWEST_EE
+from manip_il.tasks.pick_place import OBJECT
+
+from ..tables import every_robot
+from .own import JAWS, write
+
+SEED = 5_000_000
+EDGE = 0.05  # of the model's cube [m]
+
+
+@cache
+def world_of(robot: str) -> World:
+    world = World(build_scene(robot, "pick_place"))
+    world.data.qpos[world.scene.arm_q] = world.scene.robot.home
+    return world
+
+
+def with_cube(robot: str, opening: float, offset: tuple[float, float, float] = (0, 0, 0), turn: float = 0.0) -> World:
+    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m] and turned [rad]."""
+    world = world_of(robot)
+    gripper = world.scene.gripper
+    world.data.qpos[gripper.q] = gripper.command(opening)
+    world.moved()
+    quat, turned, both = np.empty(4), np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), np.empty(4)
+    mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
+    mujoco.mju_mulQuat(both, quat, turned)
+    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, both)
+    world.moved()
+    return world
+
+
+@every_robot
+def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: str):
+    env = ManipEnv(robot, "reach")
+    env.start(SEED)
+    arm, gripper = env.data.ctrl[env.scene.arm_ctrl].copy(), env.scene.gripper
+    for opening in (gripper.most, 0.03, 0.055, 0.01, gripper.least):
+        for _ in range(25):
+            env.advance(env.scene.actions.join(arm, opening))
+        assert env.world.opening == pytest.approx(opening, abs=1e-3)
+        assert env.observe().state[env.scene.actions.gripper] == np.float32(env.world.opening)
+
+
+@every_robot
+def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
+    world = world_of(robot)
+    gripper = world.scene.gripper
+    for opening in np.linspace(gripper.least + 0.005, gripper.most, 9):
+        world.data.qpos[gripper.q] = gripper.command(opening)
+        world.moved()
+        gap = min(
+            mujoco.mj_geomDistance(world.model, world.data, one, other, 1.0, None)
+            for one in gripper.pads[0]
+            for pads in gripper.pads[1:]
+            for other in pads
+        )
+        assert world.opening == pytest.approx(gap, abs=1e-3)
+
+
+@given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.1, 0.3))
+def test_a_command_is_measured_as_its_opening_within_what_there_is(robot: str, opening: float):
+    gripper, qpos = world_of(robot).scene.gripper, world_of(robot).data.qpos.copy()
+    qpos[gripper.q] = gripper.command(opening)
+    assert gripper.opening(qpos) == pytest.approx(np.clip(opening, gripper.least, gripper.most), abs=1e-9)
+
+
+@every_robot
+def test_a_sweep_comes_apart_from_closed_to_open(robot: str):
+    found = sweep(get_robot(robot))
+    assert (np.diff(found.shares) > 0).all()
+    assert (np.diff(found.openings) > 0).all()
+    assert found.openings[0] < 0.005
+    assert sweep(get_robot(robot)) is found
+
+
+@every_robot
+def test_fingers_that_closed_on_the_cube_touch_it(robot: str):
+    assert with_cube(robot, EDGE).touched(OBJECT)
+    assert with_cube(robot, EDGE + TOUCH).touched(OBJECT)
+
+
+@every_robot
+def test_fingers_that_are_open_around_the_cube_do_not_touch_it(robot: str):
+    for opening in np.linspace(EDGE + 3 * TOUCH, world_of(robot).most_opening, 25):
+        assert not with_cube(robot, opening).touched(OBJECT)
+
+
+@every_robot
+def test_one_finger_at_the_cube_is_no_touch(robot: str):
+    for side in (-1, 1):
+        assert not with_cube(robot, EDGE + 0.015, (0, side * 0.0075, 0)).touched(OBJECT)
+
+
+@every_robot
+def test_a_cube_elsewhere_is_not_touched(robot: str):
+    for offset in ((0.15, 0, 0), (0, 0.15, 0), (0, 0, 0.08)):
+        assert not with_cube(robot, EDGE, offset).touched(OBJECT)
+
+
+@given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.008, 0.008), st.floats(-0.008, 0.008), st.floats(0.005, 0.02))
+def test_what_no_finger_is_near_is_never_touched(robot: str, x: float, z: float, beside: float):
+    # The distance of two boxes that stand apart is now and then said to be none.
+    room = world_of(robot).most_opening - EDGE
+    assert not with_cube(robot, EDGE + min(room, 2 * beside), (x, 0, z)).touched(OBJECT)
+
+
+@every_robot
+def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
+    world = world_of(robot)
+    gripper, table = world.scene.gripper, world.model.geom("table")
+    top = float(table.pos[2] + table.size[2])
+    for opening in (gripper.least, gripper.most):
+        world.data.qpos[gripper.q] = gripper.command(opening)
+        world.moved()
+        lowest = min(_lowest(world, geom) for geom in gripper.geoms)
+        assert lowest - (float(world.ee.position[2]) - LOWEST_EE) > top + 1e-3
+
+
+def _lowest(world: World, geom: int) -> float:
+    """The lowest z of a geom's box [m]."""
+    rotation, box = world.data.geom_xmat[geom].reshape(3, 3), world.model.geom_aabb[geom]
+    return float((world.data.geom_xpos[geom] + rotation @ box[:3])[2] - (np.abs(rotation) @ box[3:])[2])
+
+
+@pytest.mark.parametrize("jaws", JAWS)
+def test_sliding_and_turning_fingers_are_one_thing(jaws: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
+    robot = get_robot(str(write(tmp_path, jaws=jaws)))
+    model = arm_spec(robot).compile()
+    gripper, data = Gripper(robot, model), mujoco.MjData(model)
+    assert gripper.most - gripper.least > 0.05
+    for opening in (0.06, 0.02, 0.04):
+        data.ctrl[gripper.ctrl] = gripper.command(opening)
+        mujoco.mj_step(model, data, 1_000)
+        assert gripper.opening(data.qpos) == pytest.approx(opening, abs=2e-3)
+
+
+def test_the_stiffer_finger_waits_for_the_other(own: Robot):
+    # One actuator may be anywhere: the opening is what lies between the fingers.
+    model = arm_spec(own).compile()
+    gripper, data = Gripper(own, model), mujoco.MjData(model)
+    data.qpos[gripper.q] = [0.04, 0.0]
+    mujoco.mj_kinematics(model, data)
+    (left,), (right,) = gripper.pads
+    gap = mujoco.mj_geomDistance(model, data, left, right, 1.0, None)
+    assert gripper.opening(data.qpos) == pytest.approx(gap, abs=1e-3)
+
+
+def swapped(robot: Robot) -> Robot:
+    return replace(robot, gripper=replace(robot.gripper, closed=robot.gripper.open, open=robot.gripper.closed))
+
+
+def barely(robot: Robot) -> Robot:
+    return replace(robot, gripper=replace(robot.gripper, open=(0.001, 0.001)))
+
+
+@pytest.mark.parametrize("wrong", [swapped, barely])
+def test_fingers_that_do_not_come_apart_are_refused(wrong, own: Robot):
+    with pytest.raises(UsageError) as caught:
+        sweep(wrong(own))
+    assert "robot own: the fingers stand" in str(caught.value)
+    assert "gripper.closed, gripper.open and gripper.fingers" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_finger_that_touches_nothing_is_refused_by_name(own: Robot, tmp_path: Path):
+    text = own.model.read_text().replace('<geom type="box" size="0.01 0.004 0.04"', "<geom contype='0' conaffinity='0' "
+                                         'type="box" size="0.01 0.004 0.04"')  # fmt: skip
+    (tmp_path / "air").mkdir()
+    robot = get_robot(str(write(tmp_path / "air", model=text)))
+    with pytest.raises(UsageError, match="finger 'left' has no geom that can touch anything"):
+        sweep(robot)

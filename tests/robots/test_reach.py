@@ -1,0 +1,199 @@
+"""The map of where a hand gets to is made of solutions of inverse kinematics, worked out once and kept."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.robots import reach
+from manip_il.robots.ik import ArmIK
+from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
+from manip_il.robots.robot import HERE, Robot, get_robot
+
+from ..tables import every_robot
+from .own import write
+
+CELL = 0.05  # of a map [m]
+rng = np.random.default_rng(0)
+MAP = Reach(np.array([0.2, -0.1, 0.0]), np.maximum(0.0, rng.normal(0.005, 0.01, (6, 5, 4))))
+TOP = MAP.origin + CELL * (np.array(MAP.errors.shape) - 1)
+shares = st.tuples(*[st.floats(0, 0.999)] * 3)
+read_again = reach_of.__wrapped__  # without what this process remembers
+
+
+def within(share: tuple[float, ...]) -> np.ndarray:
+    return MAP.origin + np.array(share) * (TOP - MAP.origin)
+
+
+def corners(position: np.ndarray) -> np.ndarray:
+    x, y, z = np.floor((position - MAP.origin) / CELL).astype(int)
+    return MAP.errors[x : x + 2, y : y + 2, z : z + 2]
+
+
+@pytest.mark.parametrize("index", [(0, 0, 0), (3, 2, 1), (5, 4, 3)])
+def test_on_the_grid_the_error_is_the_maps_own(index: tuple[int, int, int]):
+    assert MAP.error(MAP.origin + CELL * np.array(index)) == pytest.approx(MAP.errors[index], abs=1e-12)
+
+
+@given(shares)
+def test_between_points_of_the_grid_the_error_is_between_theirs(share: tuple[float, ...]):
+    around = corners(within(share))
+    assert around.min() - 1e-9 <= MAP.error(within(share)) <= around.max() + 1e-9
+
+
+@given(shares)
+def test_a_place_is_reached_where_all_its_cell_is(share: tuple[float, ...]):
+    assert MAP.has(within(share)) == bool((corners(within(share)) < ARRIVES).all())
+    if MAP.has(within(share)):
+        assert MAP.nearly(within(share))
+
+
+@given(shares, st.integers(0, 2), st.floats(0.001, 3), st.booleans())
+def test_beyond_the_map_nothing_is_reached_and_the_error_grows(share, axis: int, beyond: float, above: bool):
+    inside = within(share)
+    inside[axis] = TOP[axis] if above else MAP.origin[axis]
+    outside = inside.copy()
+    outside[axis] += beyond if above else -beyond
+    assert not MAP.has(outside)
+    assert MAP.error(outside) == pytest.approx(MAP.error(inside) + beyond, abs=1e-6)
+    assert MAP.nearly(outside) == (MAP.error(outside) < STRETCH)
+
+
+def solve_from_home(ik: ArmIK, robot: Robot, position: np.ndarray) -> float:
+    """How far the hand, pointing down, ends from a position [m]."""
+    q = np.asarray(robot.home, dtype=np.float64)
+    for _ in range(120):
+        ik.ee_pose(q)
+        step = ik.step(position, np.diag([1.0, -1.0, -1.0]), robot.max_joint_step)
+        assert step is not None
+        q = np.clip(q + step[0], ik.limits[:, 0], ik.limits[:, 1])
+    at, rotation = ik.ee_pose(q)
+    assert np.arccos(np.clip((np.trace(np.diag([1.0, -1.0, -1.0]) @ rotation) - 1) / 2, -1, 1)) < 0.1
+    return float(np.linalg.norm(at - position))
+
+
+@every_robot
+def test_what_the_map_has_inverse_kinematics_reaches(robot: str):
+    the_robot = get_robot(robot)
+    there, ik, draws = reach_of(the_robot), ArmIK(the_robot), np.random.default_rng(1)
+    centre, space = np.array(the_robot.workspace.centre), the_robot.workspace
+    tried = 0
+    for _ in range(40):
+        xy = centre + draws.uniform(-1, 1, 2) * space.half_width
+        position = np.array([*xy, draws.uniform(0.02, space.height)])
+        if there.has(position):
+            tried += 1
+            assert solve_from_home(ik, the_robot, position) < 0.005
+    assert tried > 20
+
+
+@every_robot
+def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
+    the_robot = get_robot(robot)
+    there, ik, body = reach_of(the_robot), ArmIK(the_robot), reach._Body(the_robot)
+    draws = np.random.default_rng(2)
+    for _ in range(30):
+        index = tuple(draws.integers(there.errors.shape).tolist())
+        miss, q = reach._miss(the_robot, ik, there.origin + CELL * np.array(index))
+        blocked = miss < reach._BLOCKED and body.meets_itself(q)
+        assert there.errors[index] == pytest.approx(miss + (reach._BLOCKED if blocked else 0.0), abs=2e-3)
+
+
+@every_robot
+def test_a_robot_that_ships_has_its_map_beside_it(robot: str):
+    the_robot = get_robot(robot)
+    assert (HERE / f"{robot}.reach.{reach._key(the_robot)}.npz").is_file()
+    assert len(list(HERE.glob(f"{robot}.reach.*.npz"))) == 1
+
+
+@every_robot
+def test_most_of_the_workspace_is_within_reach_and_the_far_end_of_the_room_is_not(robot: str):
+    the_robot = get_robot(robot)
+    there, space = reach_of(the_robot), the_robot.workspace
+    assert there.has(np.array([*space.centre, 0.025]))
+    assert not there.nearly(np.array([*space.centre, 0.1]) + [3.0, 0, 0])
+
+
+@pytest.fixture
+def solved(monkeypatch, tmp_path: Path) -> list[str]:
+    """Names of the robots whose maps were worked out; what is kept lies in a folder of the test's own."""
+    names: list[str] = []
+
+    def solve(robot: Robot) -> Reach:
+        names.append(robot.name)
+        return MAP
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(reach, "_solve", solve)
+    return names
+
+
+def kept(tmp_path: Path) -> list[Path]:
+    return sorted((tmp_path / "cache" / "manip_il").glob("*"))
+
+
+def test_a_map_is_worked_out_once_and_read_again(own: Robot, solved: list[str], tmp_path: Path):
+    first, again = read_again(own), read_again(own)
+    assert solved == ["own"]
+    assert [path.name.split(".")[:2] for path in kept(tmp_path)] == [["own", "reach"]]
+    np.testing.assert_array_equal(again.origin, first.origin)
+    np.testing.assert_allclose(again.errors, first.errors, atol=1e-7)  # kept in single precision
+
+
+def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypatch, tmp_path: Path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(reach, "_BEYOND", -0.05)  # a map of a few points
+    monkeypatch.setattr(reach, "_STEPS", 30)
+    first, again = read_again(own), read_again(own)
+    assert first.errors.tobytes() == again.errors.tobytes()
+    assert first.has(np.array([0.41, 0.01, 0.06]))
+
+
+@pytest.mark.parametrize("changed", ["model", "yaml", "part"])
+def test_another_model_or_yaml_has_a_map_of_its_own(changed: str, solved: list[str], tmp_path: Path):
+    (tmp_path / "parts.xml").write_text("<mujoco/>")
+    path = write(tmp_path)
+    read_again(get_robot(str(path)))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "parts.xml").write_text("<mujoco/>" if changed != "part" else "<mujoco><asset/></mujoco>")
+    other = write(tmp_path / "other")
+    if changed == "model":
+        (tmp_path / "other" / "own.xml").write_text((tmp_path / "own.xml").read_text() + "<!-- later -->")
+    elif changed == "yaml":
+        other.write_text(path.read_text().replace("- 2000", "- 1999", 1))
+    read_again(get_robot(str(other)))
+    assert solved == ["own", "own"]
+    assert len(kept(tmp_path)) == 2
+
+
+def test_the_same_robot_elsewhere_has_the_same_map(solved: list[str], tmp_path: Path):
+    (tmp_path / "other").mkdir()
+    read_again(get_robot(str(write(tmp_path))))
+    (tmp_path / "other" / "pictures").mkdir()
+    (tmp_path / "other" / "pictures" / "vase.stl").write_bytes(b"what lies beside it is none of its")
+    read_again(get_robot(str(write(tmp_path / "other"))))
+    assert solved == ["own"]
+
+
+@pytest.mark.parametrize("broken", [b"", b"no map", b"PK\x03\x04 cut", "half"])
+def test_a_kept_map_that_is_broken_is_worked_out_again(broken, own: Robot, solved: list[str], tmp_path: Path):
+    read_again(own)
+    (path,) = kept(tmp_path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if broken == "half" else broken)
+    read_again(own)
+    assert solved == ["own", "own"]
+    read_again(own)  # and kept in place of the broken one
+    assert solved == ["own", "own"]
+
+
+def test_a_map_that_cannot_be_kept_is_worked_out_all_the_same(own: Robot, solved: list[str], monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", os.devnull)
+    read_again(own)
+    assert read_again(own).errors.shape == MAP.errors.shape
+    assert solved == ["own", "own"]

@@ -1,0 +1,331 @@
+"""A robot is one YAML beside its model; what is wrong in either is one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import PREFIX, build_scene
+
+from ..tables import every_robot
+from .own import ARM, JAWS, tree_of, write
+
+SEED = 5_000_000
+MODEL = ARM.replace("FINGERS", JAWS["slides"][0])
+
+
+def refusal(path: Path, task: str = "reach") -> str:
+    """The one line that a robot's YAML is refused with."""
+    with pytest.raises(UsageError) as caught:
+        build_scene(str(path), task)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
+    path = write(tmp_path, "six_axes")
+    scene = build_scene(str(path), "reach")
+    assert scene.robot.name == "six_axes"
+    assert scene.robot.joint_names == ("turn", "shoulder", "elbow", "wrist", "roll", "gripper")
+    assert scene.name == "six_axes reach"
+
+
+@pytest.mark.usefixtures("everywhere")
+def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path):
+    from manip_il.expert.expert import Expert
+
+    env = ManipEnv(str(write(tmp_path)), "reach", horizon=60)
+    expert = Expert(env.scene)
+    env.start(SEED)
+    for _ in range(60):
+        env.advance(expert.label(env.get_state()).action)
+    assert env.solved
+
+
+def test_a_yaml_is_found_from_the_current_folder(tmp_path: Path, monkeypatch):
+    write(tmp_path, "near")
+    monkeypatch.chdir(tmp_path)
+    assert get_robot("near.yaml").name == "near"
+    assert get_robot("./near.yaml").model == tmp_path / "own.xml"
+
+
+def but(**changes: Any) -> Callable[[], dict[str, Any]]:
+    return lambda: tree_of() | changes
+
+
+def inside(part: str, **changes: Any) -> Callable[[], dict[str, Any]]:
+    return lambda: tree_of() | {part: tree_of()[part] | changes}
+
+
+def without(name: str, part: str | None = None) -> Callable[[], dict[str, Any]]:
+    def make() -> dict[str, Any]:
+        tree = tree_of()
+        del (tree[part] if part else tree)[name]
+        return tree
+
+    return make
+
+
+MISTAKES = {
+    "wrong key": (but(gians=[1]), ["unknown key", "'gians'", "did you mean 'gains'", "known: base,"]),
+    "wrong key inside": (inside("gripper", opne=[1]), ["gripper", "'opne'", "did you mean 'open'"]),
+    "the name is the file's": (but(name="mine"), ["unknown key", "'name'"]),
+    "missing key": (without("home"), ["has no 'home'"]),
+    "missing key inside": (without("fingers", "gripper"), ["gripper has no 'fingers'"]),
+    "too few numbers": (but(home=[0, 0, 0]), ["home has 3 numbers", "expected 5"]),
+    "too many numbers": (but(gains=[1000] * 6), ["gains has 6 numbers", "expected 5"]),
+    "half a position": (inside("ee", position=[0, 0]), ["ee.position has 2 numbers", "expected 3"]),
+    "no quaternion": (inside("ee", quaternion=[0, 0, 0, 0]), ["ee.quaternion is", "expected one of length 1, wxyz"]),
+    "openings for one finger": (inside("gripper", open=[0.04]), ["gripper.open has 1 numbers", "expected 2"]),
+    "text for a number": (but(home=[0, "up", 0, 0, 0]), ["home", "'up'", "expected a finite number"]),
+    "a number that is none": (but(gains=[float("nan")] * 5), ["gains is nan", "expected a finite number"]),
+    "a negative gain": (but(gains=[-1] * 5), ["gains is -1", "from 0"]),
+    "a number for a list": (but(joints=7), ["joints is 7", "expected a list"]),
+    "no joints": (but(joints=[], home=[], gains=[]), ["joints names", "expected at least one"]),
+    "a joint twice": (but(joints=["turn"] * 5), ["joints names", "each once"]),
+    "unknown joint": (
+        but(joints=["turn", "shoulder", "elbwo", "wrist", "roll"]),
+        ["unknown joint", "own", "'elbwo'", "did you mean 'elbow'", "known: elbow, left"],
+    ),
+    "unknown gripper joint": (inside("gripper", joints=["left", "rihgt"]), ["'rihgt'", "did you mean 'right'"]),
+    "unknown body": (inside("ee", body="hnad"), ["unknown body", "own", "'hnad'", "did you mean 'hand'"]),
+    "unknown finger": (inside("gripper", fingers=["left", "rigth"]), ["unknown body", "did you mean 'right'"]),
+    "one finger": (inside("gripper", fingers=["left"]), ["gripper.fingers names 1", "expected two or more bodies"]),
+    "no way to open": (
+        inside("gripper", open=[0.0, 0.04]),
+        ["gripper.closed and gripper.open are both 0 for joint 'left'"],
+    ),
+    "opened the wrong way round": (inside("gripper", closed=[0.045] * 2, open=[0.0] * 2), ["the fingers stand"]),
+    "a gripper's joint among the arm's": (
+        but(joints=["turn", "shoulder", "elbow", "wrist", "left"]),
+        ["'left'", "joints", "gripper.joints"],
+    ),
+    "a fixed joint of the arm's": (but(fixed={"elbow": 1.0}), ["'fixed' of robot own", "'elbow'"]),
+    "a fixed joint that is none": (but(fixed={"torso": 1.0}), ["'fixed' of robot own", "'torso'"]),
+    "a fixed place that is none": (but(fixed={"torso": "up"}), ["fixed: torso is 'up'", "expected a finite number"]),
+    "a step that is a leap": (but(max_joint_step=3), ["max_joint_step is 3", "from 0.001 to 1"]),
+    "a workspace as large as a hall": (inside("workspace", half_width=5), ["workspace.half_width is 5", "to 2"]),
+    "a colour with alpha": (but(colours={"*": [1, 1, 1, 1]}), ["colours: * has 4 numbers", "expected 3"]),
+    "not a mapping": (lambda: ["joints"], ["['joints']", "expected an object of named values"]),
+    "an empty file": (lambda: None, ["None", "expected an object of named values"]),
+    "a part that is no mapping": (but(gripper=None), ["gripper is None"]),
+    "a package that is not installed": (
+        but(model="no_such_arms:arm.xml"),
+        ["model is in 'no_such_arms'", "not installed", "pip install no_such_arms"],
+    ),
+    "a model that is not there": (but(model="onw.xml"), ["cannot read", "onw.xml", "No such file"]),
+    "a folder for a model": (but(model="."), ["cannot read"]),
+    "includes that are not there": (but(includes="parts", model="missing.xml"), ["cannot read", "missing.xml"]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_in_the_yaml_is_one_line(mistake: str, tmp_path: Path):
+    make, words = MISTAKES[mistake]
+    path = write(tmp_path, tree=make())
+    path.write_text(path.read_text() if make() is not None else "")
+    line = refusal(path)
+    for word in [*words, "own"]:  # by path or by name, the file is told
+        assert word in line
+
+
+def test_mistakes_that_need_no_model_name_the_file(tmp_path: Path):
+    for mistake in ("wrong key", "wrong key inside", "missing key inside", "too few numbers", "one finger"):
+        path = write(tmp_path, mistake.replace(" ", "_"), tree=MISTAKES[mistake][0]())
+        assert str(path) in refusal(path)
+
+
+MODELS = {
+    "no XML": ("<mujoco><worldbody>", ["cannot read"]),
+    "no MJCF": ("<html/>", ["cannot read"]),
+    "an unknown element": (MODEL.replace('<light name="lamp" pos="0 0 3"/>', "<lihgt/>"), ["cannot read", "lihgt"]),
+    "bytes": ("\x00\x01", ["cannot read"]),
+    "a mesh that is not there": (
+        MODEL.replace("</asset>", '<mesh name="shell" file="shell.stl"/></asset>').replace(
+            '<geom type="sphere" size="0.02" mass="0.2"/>', '<geom type="mesh" mesh="shell"/>'
+        ),
+        ["shell.stl"],
+    ),
+    "a body without mass": (
+        MODEL.replace('<geom type="box" size="0.02 0.06 0.01" pos="0 0 0.01" mass="0.2"/>', ""),
+        ["mass"],
+    ),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_model_that_mujoco_cannot_read_is_one_line(model: str, tmp_path: Path):
+    text, words = MODELS[model]
+    line = refusal(write(tmp_path, model=text))
+    for word in [*words, "own"]:
+        assert word in line
+
+
+def test_text_that_is_no_yaml_is_one_line(tmp_path: Path):
+    path = write(tmp_path)
+    for text in ("joints: [", "a: &a [1]\nb: *a\n", "\tjoints: 3"):
+        path.write_text(text)
+        get_robot_line = refusal(path)
+        assert str(path) in get_robot_line
+        assert "is not YAML" in get_robot_line
+
+
+def test_a_yaml_that_is_not_there_is_one_line(tmp_path: Path):
+    assert "expected a robot's YAML" in refusal(tmp_path / "none.yaml")
+
+
+def test_a_files_name_is_a_name(tmp_path: Path):
+    assert "a robot's name is 'my arm'" in refusal(write(tmp_path, "my arm"))
+
+
+def test_a_name_that_is_neither_in_the_table_nor_a_yaml_gets_the_nearest():
+    with pytest.raises(UnknownName, match=r"unknown robot 'pnada'.*did you mean 'panda'"):
+        get_robot("pnada")
+
+
+def test_a_gripper_too_small_for_the_tasks_cube_is_one_line(tmp_path: Path):
+    path = write(tmp_path, tree=inside("gripper", open=[0.02, 0.02])())
+    line = refusal(path, "pick_place")
+    assert "task pick_place: 'object' is 0.050 m wide, and the gripper of own opens to 0.042 m" in line
+    assert build_scene(str(path), "reach").gripper.most < 0.05
+
+
+def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
+    spec = arm_spec(own)
+    for kind in ("cameras", "lights", "sensors", "keys", "equalities", "textures"):
+        assert list(getattr(spec, kind)) == [], kind
+    assert [site.name for site in spec.sites] == ["ee"]
+    assert not any(body.mocap for body in spec.bodies)
+    assert sorted(motor.name for motor in spec.actuators) == sorted([*own.joints, *own.gripper.joints])
+    model = spec.compile()
+    assert (model.opt.timestep, model.opt.gravity[2]) == (0.002, -9.81)
+    assert [material.name for material in spec.materials] == ["steel"]
+
+
+@every_robot
+def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
+    scene = build_scene(robot, "reach")
+    model = scene.model
+    assert sorted(model.camera(i).name for i in range(model.ncam)) == ["front", f"{PREFIX}wrist"]
+    assert all(model.light_bodyid == 0)
+    assert model.nsensor == model.nkey == 0
+    assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == ["goal"]
+    skies = [i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
+    assert [model.texture(i).name for i in skies] == ["sky"]
+    driven = {model.joint(int(model.actuator_trnid[i, 0])).name for i in range(model.nu)}
+    assert driven == {PREFIX + name for name in (*scene.robot.joints, *scene.robot.gripper.joints)}
+    assert model.nu == len(driven)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_models_own_world_is_left_out_without_a_warning(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file where it runs
+    build_scene(str(write(tmp_path)), "reach")
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+@every_robot
+def test_everything_of_the_robots_has_its_prefix(robot: str):
+    scene = build_scene(robot, "reach")
+    for name in (*scene.robot.joints, *scene.robot.gripper.joints):
+        assert scene.model.joint(PREFIX + name).id >= 0
+    arm = [i for i in range(scene.model.njnt) if scene.model.joint(i).name.startswith(PREFIX)]
+    assert len(arm) == len(scene.robot.joints) + len(scene.robot.gripper.joints)
+
+
+@every_robot
+def test_the_arm_alone_has_its_joints_and_no_others(robot: str):
+    the_robot = get_robot(robot)
+    alone = arm_model(the_robot)
+    assert [alone.joint(i).name for i in range(alone.njnt)] == list(the_robot.joints)
+    assert alone.nu == 0
+
+
+@pytest.mark.parametrize("value", [-0.5, 0.0, 0.7])
+@pytest.mark.parametrize("joint", ["turn", "elbow", "roll"])
+def test_a_fixed_joint_stands_where_the_yaml_says(joint: str, value: float, tmp_path: Path):
+    whole = arm_model(get_robot(str(write(tmp_path, "whole"))))
+    tree = tree_of()
+    place = tree["joints"].index(joint)
+    for values in (tree["joints"], tree["home"], tree["gains"]):
+        del values[place]
+    fixed = arm_model(get_robot(str(write(tmp_path, "fixed", tree=tree | {"fixed": {joint: value}}))))
+    assert fixed.njnt == whole.njnt - 1
+    free, held = mujoco.MjData(whole), mujoco.MjData(fixed)
+    for name in tree["joints"]:
+        free.joint(name).qpos[0] = held.joint(name).qpos[0] = 0.4
+    free.joint(joint).qpos[0] = value
+    for model, data in ((whole, free), (fixed, held)):
+        mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(held.site("ee").xpos, free.site("ee").xpos, atol=1e-9)
+    np.testing.assert_allclose(held.site("ee").xmat, free.site("ee").xmat, atol=1e-9)
+
+
+def test_a_base_moves_the_robot(tmp_path: Path):
+    plain, moved = write(tmp_path, "plain"), write(tmp_path, "moved", tree=tree_of() | {"base": [0.1, 0.2, -0.3]})
+    ees = []
+    for path in (plain, moved):
+        model = arm_model(get_robot(str(path)))
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        ees.append(data.site("ee").xpos.copy())
+    np.testing.assert_allclose(ees[1] - ees[0], [0.1, 0.2, -0.3], atol=1e-9)
+
+
+@every_robot
+def test_at_home_the_hand_points_down_over_the_workspace(robot: str):
+    scene = build_scene(robot, "reach")
+    data = mujoco.MjData(scene.model)
+    data.qpos[scene.arm_q] = scene.robot.home
+    mujoco.mj_forward(scene.model, data)
+    rotation = data.site_xmat[scene.ee_site].reshape(3, 3)
+    np.testing.assert_allclose(rotation, np.diag([1.0, -1.0, -1.0]), atol=0.05)
+    assert np.hypot(*(data.site_xpos[scene.ee_site][:2] - scene.robot.workspace.centre)) < 0.06
+
+
+@every_robot
+def test_the_fingers_move_along_the_hands_y(robot: str):
+    scene = build_scene(robot, "reach")
+    data, gripper = mujoco.MjData(scene.model), scene.gripper
+    data.qpos[scene.arm_q] = scene.robot.home
+    places = []
+    for opening in (gripper.least, gripper.most):
+        data.qpos[gripper.q] = gripper.command(opening)
+        mujoco.mj_kinematics(scene.model, data)
+        places.append(np.array([data.geom_xpos[pads[0]] for pads in gripper.pads]))
+    moved = (places[1] - places[0]) @ data.site_xmat[scene.ee_site].reshape(3, 3)
+    assert (np.abs(moved[:, 1]) > 0.02).all()
+    assert (np.abs(moved[:, [0, 2]]) < 0.4 * np.abs(moved[:, [1]])).all()
+
+
+@every_robot
+def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
+    scene = build_scene(robot, "pick_place")
+    alone, data = arm_model(scene.robot), mujoco.MjData(scene.model)
+    alone_data = mujoco.MjData(alone)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = np.asarray(scene.robot.home) + rng.uniform(-0.5, 0.5, len(scene.robot.joints))
+        data.qpos[scene.arm_q] = q
+        alone_data.qpos[[alone.joint(name).qposadr[0] for name in scene.robot.joints]] = q
+        mujoco.mj_kinematics(scene.model, data)
+        mujoco.mj_kinematics(alone, alone_data)
+        site = alone.site("ee").id
+        np.testing.assert_allclose(alone_data.site_xpos[site], data.site_xpos[scene.ee_site], atol=1e-12)
+        np.testing.assert_allclose(alone_data.site_xmat[site], data.site_xmat[scene.ee_site], atol=1e-12)
+
+
+@every_robot
+def test_what_a_robot_follows_from_is_the_same_bytes_again(robot: str):
+    the_robot = get_robot(robot)
+    assert the_robot.content() == Robot.read(Path(the_robot.model).with_name(f"{robot}.yaml")).content()
+    assert arm_spec(the_robot).compile().nq == arm_spec(the_robot).compile().nq

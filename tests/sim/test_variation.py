@@ -1,0 +1,132 @@
+"""A variation is five numbers an object: half its lengths, its mass, its friction."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.errors import ManipError, MismatchError
+from manip_il.sim.conditions import Condition, draw
+from manip_il.sim.scene import build_scene
+from manip_il.sim.variation import Object, apply, check, extents, nominal, with_drawn
+from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS, FRICTION
+
+from ..tables import every_scene
+
+lengths = st.floats(0.005, 0.1)
+SHAPES = {
+    "box": ("0.01 0.02 0.03", (0.02, 0.04, 0.06)),
+    "sphere": ("0.02", (0.04, 0.04, 0.04)),
+    "cylinder": ("0.02 0.03", (0.04, 0.04, 0.06)),
+    "capsule": ("0.02 0.03", (0.04, 0.04, 0.10)),
+}
+
+
+def free_body(shape: str, size: str, mass: float = 0.2) -> tuple[mujoco.MjModel, dict[str, Object]]:
+    xml = f"""<mujoco><worldbody><body name="thing"><freejoint name="thing"/>
+    <geom type="{shape}" size="{size}" mass="{mass}"/></body></worldbody></mujoco>"""
+    return mujoco.MjSpec.from_string(xml).compile(), {"thing": Object("thing", 1, 0, 0, 0)}
+
+
+@every_scene
+def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
+    scene = build_scene(robot, task)
+    for row in scene.nominal.reshape(-1, 5):
+        np.testing.assert_array_equal(row, [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION])
+
+
+def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was():
+    plain = np.array([0.025, 0.025, 0.025, 0.1, 1.0])
+    np.testing.assert_allclose(with_drawn(plain, {"size": 0.07}), [0.035, 0.035, 0.035, 0.1, 1.0])
+    np.testing.assert_allclose(with_drawn(plain, {"mass": 0.3}), [0.025, 0.025, 0.025, 0.3, 1.0])
+    np.testing.assert_allclose(with_drawn(plain, {"friction": 0.5}), [0.025, 0.025, 0.025, 0.1, 0.5])
+    np.testing.assert_array_equal(with_drawn(plain, {"colour": [1, 0, 0]}), plain)
+    assert plain.tolist() == [0.025, 0.025, 0.025, 0.1, 1.0]
+
+
+def test_a_drawn_size_is_the_longest_edge_and_keeps_proportions():
+    tall = np.array([0.01, 0.02, 0.04, 0.1, 1.0])
+    np.testing.assert_allclose(with_drawn(tall, {"size": 0.04})[:3], [0.005, 0.01, 0.02])
+
+
+def test_every_object_is_drawn_alike_and_no_object_is_none():
+    two = np.tile([0.025, 0.025, 0.025, 0.1, 1.0], 2)
+    np.testing.assert_allclose(with_drawn(two, {"mass": 0.2})[[3, 8]], 0.2)
+    assert with_drawn(np.empty(0), {"mass": 0.2, "size": 0.05}).shape == (0,)
+
+
+def test_circumstances_become_a_variation_by_their_names():
+    condition = Condition("object", size=(0.03, 0.07), mass=(0.05, 0.3), friction=(0.5, 1.5))
+    for seed in range(20):
+        drawn = draw([condition], seed).drawn
+        row = with_drawn(np.array([0.025, 0.025, 0.025, 0.1, 1.0]), drawn)
+        assert row[0] * 2 == pytest.approx(drawn["size"])
+        assert (row[3], row[4]) == (drawn["mass"], drawn["friction"])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_extents_are_the_lengths_along_a_things_own_axes(shape: str):
+    size, expected = SHAPES[shape]
+    model, _ = free_body(shape, size)
+    np.testing.assert_allclose(extents(int(model.geom_type[0]), model.geom_size[0]), expected)
+    np.testing.assert_allclose(2 * model.geom_aabb[0, 3:], expected)
+
+
+def test_a_shape_that_nobody_grasps_is_refused():
+    with pytest.raises(ManipError, match="expected a box, sphere, cylinder or capsule"):
+        extents(int(mujoco.mjtGeom.mjGEOM_MESH), np.ones(3))
+
+
+@pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
+@given(x=lengths, y=lengths, z=lengths, mass=st.floats(0.01, 2))
+def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: float, z: float, mass: float):
+    size = {"box": (x, y, z), "sphere": (x,), "cylinder": (x, y)}[shape]
+    plain, objects = free_body(shape, SHAPES[shape][0])
+    compiled, _ = free_body(shape, " ".join(map(repr, size)), mass)
+    changed = copy.copy(plain)
+    apply(changed, plain, objects, np.array([*size, *[0.0] * (3 - len(size)), mass, 1.0]))
+    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    turned = compiled.body_iquat[1]  # MuJoCo turns a body's axes so that its moments are sorted
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, turned)
+    axes = axes.reshape(3, 3)
+    tensor = axes @ np.diag(compiled.body_inertia[1]) @ axes.T
+    own = np.empty(9)
+    mujoco.mju_quat2Mat(own, changed.body_iquat[1])
+    own = own.reshape(3, 3)
+    np.testing.assert_allclose(own @ np.diag(changed.body_inertia[1]) @ own.T, tensor, rtol=1e-6, atol=1e-12)
+    for name in ("body_mass", "body_subtreemass", "geom_rbound", "geom_aabb"):
+        np.testing.assert_allclose(getattr(changed, name), getattr(compiled, name), rtol=1e-9, err_msg=name)
+
+
+def test_a_nominal_variation_changes_nothing():
+    plain, objects = free_body("box", "0.02 0.02 0.02")
+    changed = copy.copy(plain)
+    apply(changed, plain, objects, nominal(plain, objects))
+    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    for name in ("body_mass", "body_inertia", "geom_size", "geom_friction", "geom_priority", "geom_aabb", "bvh_aabb"):
+        np.testing.assert_array_equal(getattr(changed, name), getattr(plain, name), err_msg=name)
+
+
+def test_only_a_drawn_friction_has_priority():
+    plain, objects = free_body("box", "0.02 0.02 0.02")
+    for friction, priority in ((0.5, 1), (float(plain.geom_friction[0, 0]), 0)):
+        changed = copy.copy(plain)
+        apply(changed, plain, objects, with_drawn(nominal(plain, objects), {"friction": friction}))
+        assert changed.geom_priority[0] == priority
+
+
+def test_wrong_variations_are_refused():
+    like = np.array([0.025, 0.025, 0.025, 0.1, 1.0])
+    check(like, like)
+    with pytest.raises(MismatchError, match="has 4"):
+        check(like[:4], like)
+    with pytest.raises(ManipError, match="above 0"):
+        check(like * [1, 1, 1, -1, 1], like)
+    round_thing = np.array([0.02, 0.0, 0.0, 0.1, 1.0])  # a sphere's second and third sizes are none
+    check(round_thing, round_thing)

@@ -1,0 +1,251 @@
+"""A world is one scene in one state, asked by name; its model is its own only where it was varied."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.variation import with_drawn
+from manip_il.sim.world import World
+from manip_il.tasks.pick_place import OBJECT
+from manip_il.tasks.starts import UPRIGHT
+
+from ..tables import every_scene, every_scene_with_an_object
+
+SEED = 5_000_000
+HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
+
+
+@pytest.fixture
+def world() -> World:
+    world = World(build_scene("fetch", "pick_place"))
+    world.moved()
+    return world
+
+
+def fall(world: World, steps: int = 60) -> bytes:
+    """The physics of a world in which the cube falls onto the table and the arm stays."""
+    mujoco.mj_resetData(world.model, world.data)
+    world.data.qpos[world.scene.arm_q] = world.data.ctrl[world.scene.arm_ctrl] = world.scene.robot.home
+    world.place(OBJECT, np.array([0.6, 0.1, 0.06]), np.array([0.9, 0.1, 0.3, 0.3]))
+    mujoco.mj_step(world.model, world.data, steps)
+    return world.physics().tobytes()
+
+
+@every_scene
+def test_a_world_as_compiled_shares_its_scenes_model(robot: str, task: str):
+    scene = build_scene(robot, task)
+    one, other = World(scene), World(scene)
+    assert one.model is other.model is scene.model
+    assert one.data is not other.data
+    one.vary(scene.nominal.copy())
+    assert one.model is scene.model
+
+
+def test_a_varied_world_has_a_model_of_its_own_and_leaves_the_shared_one(world: World):
+    before = world.scene.model_bytes()
+    world.vary(with_drawn(world.scene.nominal, HEAVY))
+    fall(world)
+    assert world.model is not world.scene.model
+    assert world.scene.model_bytes() == before
+    assert World(world.scene).model is world.scene.model
+
+
+def test_two_varied_worlds_do_not_share_a_model(world: World):
+    other = World(world.scene)
+    world.vary(with_drawn(world.scene.nominal, {"size": 0.07}))
+    other.vary(with_drawn(world.scene.nominal, {"size": 0.03}))
+    assert world.extents(OBJECT)[0] == pytest.approx(0.07)
+    assert other.extents(OBJECT)[0] == pytest.approx(0.03)
+
+
+@every_scene_with_an_object
+def test_back_to_nominal_is_never_having_varied(robot: str, task: str):
+    scene = build_scene(robot, task)
+    plain, varied = World(scene), World(scene)
+    varied.vary(with_drawn(scene.nominal, HEAVY))
+    fall(varied)
+    varied.vary(scene.nominal)
+    assert varied.model is scene.model
+    assert fall(varied) == fall(plain)
+
+
+def test_a_variation_is_the_same_world_whatever_it_was_before(world: World):
+    other, drawn = World(world.scene), with_drawn(world.scene.nominal, HEAVY)
+    world.vary(with_drawn(world.scene.nominal, {"size": 0.03, "mass": 0.06, "friction": 1.4}))
+    fall(world)
+    world.vary(drawn)
+    other.vary(drawn)
+    assert fall(world) == fall(other)
+    assert model_bytes(world) == model_bytes(other)
+
+
+def model_bytes(world: World) -> bytes:
+    buffer = np.zeros(mujoco.mj_sizeModel(world.model), dtype=np.uint8)
+    mujoco.mj_saveModel(world.model, None, buffer)
+    return buffer.tobytes()
+
+
+@given(st.floats(0.03, 0.07), st.floats(0.05, 0.3), st.floats(0.3, 2))
+@settings(max_examples=25)
+def test_physics_has_what_the_variation_says(edge: float, mass: float, friction: float):
+    world = World(build_scene("fetch", "pick_place"))
+    world.vary(with_drawn(world.scene.nominal, {"size": edge, "mass": mass, "friction": friction}))
+    one, model = world.scene.objects[OBJECT], world.model
+    np.testing.assert_allclose(model.geom_size[one.geom], edge / 2)
+    assert model.body_mass[one.body] == mass
+    np.testing.assert_allclose(model.body_inertia[one.body], mass * edge**2 / 6)
+    assert model.geom_friction[one.geom, 0] == friction
+    assert world.extents(OBJECT) == pytest.approx((edge, edge, edge))
+    # What MuJoCo works out from them.
+    assert model.body_subtreemass[one.body] == pytest.approx(mass)
+    np.testing.assert_allclose(model.dof_invweight0[one.v : one.v + 3], 1 / mass)
+    np.testing.assert_allclose(model.dof_invweight0[one.v + 3 : one.v + 6], 6 / (mass * edge**2))
+    assert model.geom_rbound[one.geom] == pytest.approx(np.sqrt(3) * edge / 2)
+
+
+def test_a_varied_model_is_the_model_compiled_with_those_numbers():
+    drawn = {"size": 0.064, "mass": 0.21}
+    world = World(build_scene("fetch", "lift"))
+    world.vary(with_drawn(world.scene.nominal, drawn))
+    compiled = compiled_with(half=0.032, mass=0.21)
+    for name in ("body_mass", "body_inertia", "body_subtreemass", "dof_invweight0", "geom_size", "geom_rbound",
+                 "geom_aabb", "geom_friction", "bvh_aabb", "body_invweight0"):  # fmt: skip
+        np.testing.assert_allclose(
+            getattr(world.model, name), getattr(compiled, name), rtol=1e-9, atol=1e-12, err_msg=name
+        )
+
+
+def compiled_with(half: float, mass: float) -> mujoco.MjModel:
+    """Lift's scene with a cube that was made so."""
+    from manip_il.sim.scene import scene_spec
+
+    scene = build_scene("fetch", "lift")
+    spec = scene_spec(scene.robot, scene.task)
+    spec.geom(OBJECT).size, spec.geom(OBJECT).mass = [half] * 3, mass
+    spec.body(OBJECT).pos = scene.model.body(OBJECT).pos
+    return spec.compile()
+
+
+def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
+    world.vary(with_drawn(world.scene.nominal, {"friction": 0.4}))
+    fall(world, 600)
+    geom = world.scene.objects[OBJECT].geom
+    touching = [contact for contact in world.data.contact if geom in contact.geom]
+    assert touching
+    assert all(contact.friction[0] == 0.4 for contact in touching)
+
+
+@pytest.mark.parametrize("edge", [0.03, 0.07])
+def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, edge: float):
+    world.vary(with_drawn(world.scene.nominal, {"size": edge}))
+    world.place(OBJECT, np.array([0.6, 0.1, edge / 2 + 0.01]), UPRIGHT)
+    mujoco.mj_step(world.model, world.data, 400)
+    world.moved()
+    assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
+
+
+def test_a_variation_of_another_length_is_refused_with_both(world: World):
+    with pytest.raises(MismatchError, match=r"size of the variation.*has 3, .*has 5"):
+        world.vary(np.ones(3))
+    with pytest.raises(MismatchError, match=r"has 5, .*has 0"):
+        World(build_scene("fetch", "reach")).vary(np.ones(5))
+
+
+@pytest.mark.parametrize("bad", [0.0, -0.01])
+@pytest.mark.parametrize("place", range(5))
+def test_a_variation_that_no_body_can_have_is_refused_and_changes_nothing(world: World, place: int, bad: float):
+    wrong = world.scene.nominal.copy()
+    wrong[place] = bad
+    with pytest.raises(ManipError, match="expected lengths, masses and frictions above 0"):
+        world.vary(wrong)
+    assert world.model is world.scene.model
+    np.testing.assert_array_equal(world.variation, world.scene.nominal)
+
+
+def test_a_world_keeps_no_hold_of_the_numbers_that_it_was_varied_by(world: World):
+    drawn = with_drawn(world.scene.nominal, HEAVY)
+    world.vary(drawn)
+    drawn[:] = 1.0
+    assert world.variation[0] == pytest.approx(0.035)
+
+
+def test_a_restored_world_is_the_one_that_was_saved(world: World):
+    other = World(world.scene)
+    world.vary(with_drawn(world.scene.nominal, HEAVY))
+    fall(world, 30)
+    world.moved()
+    other.restore(world.physics(), world.variation)
+    assert other.physics().tobytes() == world.physics().tobytes()
+    for name in (OBJECT, "robot/robot0:gripper_link"):
+        np.testing.assert_array_equal(other.pose(name).position, world.pose(name).position)
+        np.testing.assert_array_equal(other.pose(name).rotation, world.pose(name).rotation)
+
+
+def test_physics_of_another_scene_is_refused_with_both_sizes(world: World):
+    with pytest.raises(MismatchError, match=rf"has 3, fetch pick_place has {world.scene.state_size}"):
+        world.restore(np.zeros(3), world.scene.nominal)
+
+
+def test_what_was_worked_out_is_known_until_the_world_moves(world: World):
+    asked = []
+
+    def work_out() -> int:
+        asked.append(1)
+        return len(asked)
+
+    assert [world.remember("answer", work_out) for _ in range(3)] == [1, 1, 1]
+    world.moved()
+    assert world.remember("answer", work_out) == 2
+    world.vary(with_drawn(world.scene.nominal, HEAVY))
+    world.moved()
+    assert world.remember("answer", work_out) == 3
+    world.restore(world.physics(), world.variation)
+    assert world.remember("answer", work_out) == 4
+
+
+def test_answers_follow_the_world(world: World):
+    gripper = world.scene.gripper
+    for opening, x in ((0.02, 0.55), (0.08, 0.65)):
+        world.data.qpos[gripper.q] = gripper.command(opening)
+        world.place(OBJECT, np.array([x, 0.1, 0.2]), UPRIGHT)
+        world.place("goal", np.array([x, 0.0, 0.3]), UPRIGHT)
+        world.data.qpos[world.scene.arm_q] = np.asarray(world.scene.robot.home) + (x - 0.6)
+        world.moved()
+        assert world.opening == pytest.approx(opening)
+        assert world.pose(OBJECT).position[0] == world.goal[0] == pytest.approx(x)
+        np.testing.assert_array_equal(world.ee.position, world.data.site("robot/ee").xpos)
+
+
+def test_placing_puts_an_object_at_rest(world: World):
+    world.data.qvel[:] = 1.0
+    world.place(OBJECT, np.array([0.5, 0.1, 0.3]), UPRIGHT)
+    world.moved()
+    np.testing.assert_array_equal(world.pose(OBJECT).position, [0.5, 0.1, 0.3])
+    np.testing.assert_allclose(world.pose(OBJECT).rotation, np.eye(3))
+    assert not world.data.joint(OBJECT).qvel.any()
+    assert world.data.qvel.any()
+
+
+def test_what_cannot_be_placed_is_refused_by_name(world: World):
+    with pytest.raises(UnknownName, match=r"unknown body 'objct'.*did you mean 'object'"):
+        world.place("objct", np.zeros(3), UPRIGHT)
+    with pytest.raises(UnknownName, match="did you mean 'goal'"):
+        world.pose("gaol")
+    with pytest.raises(ManipError, match="'robot/robot0:gripper_link' is neither an object nor a mocap body"):
+        world.place("robot/robot0:gripper_link", np.zeros(3), UPRIGHT)
+
+
+@every_scene
+def test_an_environments_state_holds_its_variation(robot: str, task: str):
+    env = ManipEnv(robot, task)
+    env.start(SEED)
+    state = env.get_state()
+    np.testing.assert_array_equal(state.variation, env.scene.nominal)
+    assert state.to_vector().size == env.scene.state_size + len(env.scene.nominal) + 4

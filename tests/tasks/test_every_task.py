@@ -1,0 +1,204 @@
+"""What holds for every task on every robot: its ladder, its progress, its end, its name in a fingerprint."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.data.schema import EXPERT_PHASE
+from manip_il.engine import describe
+from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.errors import UnknownName
+from manip_il.expert.expert import Expert
+from manip_il.seeding import stream_seeds
+from manip_il.sim.conditions import NOMINAL, Condition
+from manip_il.sim.disturb import STANDARD, Disturbance
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.varied import VariedEnv
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.pick_place import OBJECT
+from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.table import TASKS, get_task
+from manip_il.tasks.task import NO_PHASE, phases
+
+from ..tables import every_scene, every_scene_with_an_object, every_task
+
+SEEDS = stream_seeds("certificate", 2)
+SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))
+FALL = 0.002  # that progress may have where it should not fall at all
+
+
+@every_task
+def test_a_task_has_the_name_that_it_is_called_by(task: str):
+    assert get_task(task) is TASKS[task]
+    assert TASKS[task].name == task
+    assert TASKS[task].instruction.endswith(".")
+
+
+@every_task
+def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
+    names = phases(TASKS[task])
+    assert names[0] == NO_PHASE
+    assert len(set(names)) == len(names)
+    assert list(names[:0:-1]) == [rung.name for rung in TASKS[task].rungs]
+    assert all(rung.words for rung in TASKS[task].rungs)
+
+
+@every_scene
+def test_what_a_task_grasps_and_where_it_goes_are_in_its_scene(robot: str, task: str):
+    scene = build_scene(robot, task)
+    assert set(scene.task.grasped) <= set(scene.objects)
+    assert scene.model.body_mocapid[scene.model.body(GOAL).id] >= 0
+
+
+@every_scene
+def test_the_last_rung_holds_everywhere(robot: str, task: str):
+    world, rng = World(build_scene(robot, task)), np.random.default_rng(0)
+    scene = world.scene
+    for _ in range(20):
+        world.data.qpos[scene.arm_q] = np.asarray(scene.robot.home) + rng.uniform(-1, 1, len(scene.robot.joints))
+        world.data.qpos[scene.gripper.q] = scene.gripper.command(rng.uniform(0, 0.1))
+        for name in scene.objects:
+            turn = rng.normal(size=4)
+            world.place(name, rng.uniform(-1, 1, 3), turn / np.linalg.norm(turn))
+        world.moved()
+        assert scene.task.rungs[-1].holds(world)
+        for rung in scene.task.rungs:
+            target = rung.target(world)
+            assert np.isfinite([*target.position, *target.rotation.ravel(), target.opening]).all()
+            np.testing.assert_allclose(target.rotation @ target.rotation.T, np.eye(3), atol=1e-9)
+
+
+@every_scene
+def test_every_rung_of_the_ladder_occurs(robot: str, task: str):
+    seen = set[int]()
+    for driver, disturbance in (("expert", STANDARD), ("random", Disturbance())):
+        job = RolloutJob(EnvConfig(robot, task, horizon=45), driver, hold=2, disturbance=disturbance)
+        for episode in run_job(job, SEEDS):
+            seen |= set(episode.columns[EXPERT_PHASE].ravel().tolist())
+    assert seen - {0} == set(range(1, len(phases(TASKS[task]))))
+
+
+@cache
+def expert_path(robot: str, task: str, varied: bool) -> list[tuple[list[float], ManipEnv]]:
+    """Progress along the expert's path, solved episodes each with the environment as it ended."""
+    paths = []
+    for seed in SEEDS:
+        env = VariedEnv([SIZES if varied else NOMINAL], robot=robot, task=task)
+        expert, path = Expert(env.scene), []
+        env.start(seed)
+        while not env.solved and len(path) < env.config.horizon:
+            path.append(env.progress)
+            env.advance(expert.label(env.get_state()).action)
+        paths.append(([*path, env.progress], env))
+    return paths
+
+
+def check_progress(path: list[float], env: ManipEnv) -> None:
+    assert env.solved
+    assert 0 <= min(path) <= path[0] < 0.9
+    assert np.diff(path).min() > -FALL
+    assert max(path) <= 1
+    assert path[-1] > 1 - FALL
+
+
+@every_scene
+def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str, task: str):
+    for path, env in expert_path(robot, task, False):
+        check_progress(path, env)
+
+
+@every_scene_with_an_object
+def test_so_it_is_with_other_cubes(robot: str, task: str):
+    for path, env in expert_path(robot, task, True):
+        check_progress(path, env)
+
+
+@every_scene
+def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
+    env = ManipEnv(robot, task)
+    for seed in SEEDS:
+        env.start(seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(30):
+            env.advance(env.scene.actions.random_near(env.observe().state, rng))
+            assert 0 <= env.scene.task.progress(env.world) <= 1
+
+
+@every_scene
+def test_what_is_solved_is_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
+    for _, env in expert_path(robot, task, False):
+        assert env.solved
+        assert env.scene.task.error(env.world) == env.distance() < env.config.tolerance
+        fresh = ManipEnv(robot, task)
+        fresh.set_state(env.get_state())
+        at = fresh.world.goal + [0.0, 0.0, 0.1]
+        fresh.world.place(GOAL, at, UPRIGHT)
+        fresh.world.moved()
+        fresh.advance(fresh.scene.actions.join(fresh.data.ctrl[fresh.scene.arm_ctrl], 0.0))
+        assert fresh.distance() > fresh.config.tolerance
+        assert not fresh.solved
+        assert fresh.progress < env.progress
+
+
+@every_scene
+def test_a_solved_task_is_one_whose_things_are_at_the_goal(robot: str, task: str):
+    for _, env in expert_path(robot, task, False):
+        world = env.world
+        thing = world.pose(OBJECT).position if OBJECT in env.scene.task.grasped else world.ee.position
+        assert np.linalg.norm(thing - world.goal) < env.config.tolerance
+
+
+# Of one joint's motor, of one thing's weight, of the light: whatever it is, it is another model.
+CHANGES: dict[str, Callable[[mujoco.MjModel], None]] = {
+    "a gain": lambda model: model.actuator_gainprm.__imul__(1.01),
+    "a weight": lambda model: model.body_mass.__imul__(1.01),
+    "a friction": lambda model: model.geom_friction.__imul__(1.01),
+    "a place": lambda model: model.body_pos.__iadd__(1e-6),
+    "the step": lambda model: setattr(model.opt, "timestep", 0.0021),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@every_scene
+def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: str, monkeypatch):
+    config, scene = EnvConfig(robot, task), build_scene(robot, task)
+    before = env_fingerprint(config)
+    model = copy.copy(scene.model)
+    CHANGES[change](model)
+    monkeypatch.setattr(describe, "build_scene", lambda *_: replace(scene, model=model))
+    after = describe._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
+    assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
+
+
+@every_scene
+def test_the_fingerprint_is_the_scenes_and_the_settings(robot: str, task: str):
+    plain = env_fingerprint(EnvConfig(robot, task))
+    assert env_fingerprint(EnvConfig(robot, task)) == plain
+    longer = env_fingerprint(EnvConfig(robot, task, horizon=99))
+    assert {key for key in plain if plain[key] != longer[key]} == {"config_sha256"}
+
+
+@every_scene
+def test_a_datasets_words_fit_the_scene(robot: str, task: str):
+    spec, env = env_spec(EnvConfig(robot, task)), ManipEnv(robot, task)
+    env.start(SEEDS[0])
+    seen, state = env.observe(), env.get_state()
+    assert len(spec.joint_names) == len(seen.state) == len(env.scene.actions)
+    assert len(spec.environment_state_names) == len(seen.environment_state)
+    assert spec.sim_state_size == len(state.to_vector())
+    assert spec.phases == phases(env.scene.task)
+    assert spec.instruction == env.task_description
+
+
+def test_a_task_that_is_none_gets_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'pick_place'"):
+        get_task("pick_and_place")

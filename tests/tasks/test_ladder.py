@@ -1,0 +1,360 @@
+"""The ladder of predicates on hands and objects placed by hand."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from manip_il.sim.world import Pose
+from manip_il.tasks.ladder import (
+    AT_GOAL,
+    AT_GRASP_ANGLE,
+    CLEAR,
+    FUNNEL_RADIUS,
+    HOVER,
+    LOWEST_EE,
+    MAX_TILT,
+    OPEN_SLACK,
+    angle_between,
+    angle_from_down,
+    cube_yaw,
+    grasp_of,
+    grasp_yaw,
+    hand_down,
+    nearness,
+    pick_progress,
+    pick_rungs,
+)
+from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.task import Rung, Target
+
+OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [m]
+RUNGS = pick_rungs("object")
+widths = st.floats(0.03, 0.07)
+steepest = 60.0  # change of a target per change of where the hand is
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A world in which hand, cube and goal stand where a test puts them. edge: of the cube [m]."""
+
+    ee: Pose
+    cube: Pose
+    goal: np.ndarray
+    opening: float = OPEN
+    edge: float = EDGE
+    touching: bool = False
+    most_opening: float = OPEN
+
+    def pose(self, name: str) -> Pose:
+        return {"object": self.cube}[name]
+
+    def extents(self, name: str) -> tuple[float, ...]:
+        return (self.edge,) * 3
+
+    def touched(self, name: str) -> bool:
+        return self.touching
+
+    def remember(self, key: Any, work_out: Callable[[], Any]) -> Any:
+        return work_out()
+
+    def moved(self, x: float, y: float, z: float) -> Placed:
+        return replace(self, ee=Pose(self.ee.position + [x, y, z], self.ee.rotation))
+
+
+def about(axis: tuple[float, float, float], angle: float) -> np.ndarray:
+    quat, matrix = np.empty(4), np.empty(9)
+    mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, float), angle)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def at(x: float, y: float, z: float, yaw: float = 0.0, tilt: float = 0.0, edge: float = EDGE, **changes: Any) -> Placed:
+    """The hand, pointing down and turned by `yaw`, by this much off a cube that rests on the table; wide open."""
+    cube = np.array([0.5, 0.1, edge / 2])
+    hand = Pose(cube + [x, y, z], hand_down(yaw))
+    return Placed(hand, Pose(cube, about((1, 0, 0), tilt)), np.array([0.4, -0.1, 0.2]), edge=edge, **changes)
+
+
+def held(to_goal: tuple[float, float, float], edge: float = EDGE) -> Placed:
+    """The cube in the hand, and the goal that far from it."""
+    cube = np.array([0.5, 0.1, 0.15])
+    return Placed(Pose(cube, hand_down(0.0)), Pose(cube, np.eye(3)), cube + to_goal, edge, edge, touching=True)
+
+
+def rung(world: Placed, rungs: tuple[Rung, ...] = RUNGS) -> tuple[str, Target]:
+    """The name and target of the first rung that holds."""
+    found = next(one for one in rungs if one.holds(world))
+    return found.name, found.target(world)
+
+
+def top(world: Placed) -> float:
+    return float(world.cube.position[2]) + world.edge / 2
+
+
+def test_far_from_the_object_the_hand_goes_over_it_with_open_fingers():
+    name, target = rung(at(-0.2, 0.1, 0.2))
+    assert (name, target.opening) == ("approach", OPEN)
+    np.testing.assert_allclose(target.position, [0.5, 0.1, EDGE + HOVER])
+
+
+def test_over_the_object_the_hand_descends_all_the_way():
+    name, target = rung(at(0, 0, 0.08))
+    assert (name, target.opening) == ("descend", OPEN)
+    np.testing.assert_allclose(target.position, [0.5, 0.1, EDGE / 2])
+
+
+@given(widths)
+def test_hovering_counts_from_the_top_whatever_the_objects_size(edge: float):
+    world = at(-0.2, 0.1, 0.2, edge=edge)
+    raised = max(0.0, LOWEST_EE - edge / 2)  # a low cube is gripped above its middle
+    assert rung(world)[1].position[2] == pytest.approx(top(world) + HOVER + raised)
+
+
+@given(widths)
+def test_waiting_is_clear_of_the_top_whatever_the_objects_size(edge: float):
+    for waiting in (at(0, 0, 0.1, edge=edge, tilt=MAX_TILT + 0.1), at(0, 0, 0.1, edge=edge, opening=0.0)):
+        raised = max(0.0, LOWEST_EE - edge / 2)
+        assert rung(waiting)[1].position[2] == pytest.approx(top(waiting) + CLEAR + raised)
+
+
+@given(st.floats(0, 0.2), st.floats(0, 0.2), widths)
+def test_the_nearer_to_being_over_the_object_the_lower_the_hand_may_go(one: float, other: float, edge: float):
+    near, far = (grasp_of(at(off, 0, 0.3, edge=edge), "object").height for off in sorted((one, other)))
+    assert 0 <= near <= far <= edge / 2 + HOVER
+
+
+@given(st.floats(0, 0.2), st.floats(-0.7, 0.7), widths, widths)
+def test_the_funnel_narrows_where_the_object_fills_the_hand(off: float, yaw: float, one: float, other: float):
+    narrow, wide = (grasp_of(at(off, 0, 0.3, yaw, edge=edge), "object").height for edge in sorted((one, other)))
+    assert narrow <= wide
+
+
+def test_beside_a_wide_object_the_fingers_have_less_room_than_beside_a_narrow_one():
+    small, large = at(0.9 * FUNNEL_RADIUS, 0, 0.1, edge=0.03), at(0.9 * FUNNEL_RADIUS, 0, 0.1, edge=0.07)
+    assert grasp_of(small, "object").height == 0
+    assert grasp_of(large, "object").height > 0
+    assert rung(small)[1].position[2] < rung(large)[1].position[2] - 0.005
+
+
+@given(st.floats(0.06, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.04), widths)
+def test_beside_the_object_a_hand_that_is_too_low_only_rises(off: float, direction: float, height: float, edge: float):
+    world = at(off * np.cos(direction), off * np.sin(direction), height, edge=edge)
+    _, target = rung(world)
+    np.testing.assert_array_equal(target.position[:2], world.ee.position[:2])
+    assert target.position[2] > world.ee.position[2] + 0.03 - (EDGE - edge) / 2
+
+
+@given(
+    st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.01, 0.2), widths, st.sampled_from([0.0, 0.2, OPEN]),
+    st.lists(st.floats(-1, 1), min_size=3, max_size=3),
+)  # fmt: skip
+def test_within_a_rung_targets_are_continuous(x, y, z, edge: float, opening: float, way: list[float]):
+    world = at(x, y, z, edge=edge, opening=opening)
+    near = world.moved(*(1e-5 * np.array(way)))
+    (name, target), (other, beside) = rung(world), rung(near)
+    assume(name == other)
+    assert np.abs(beside.position - target.position).max() <= steepest * 1e-5
+    np.testing.assert_allclose(beside.rotation, target.rotation, atol=1e-9)
+    assert beside.opening == target.opening
+
+
+@pytest.mark.parametrize("edge", [0.03, 0.05, 0.07])
+def test_around_the_object_the_fingers_close(edge: float):
+    world = at(0.003, -0.003, 0.004, edge=edge)
+    name, target = rung(world)
+    assert (name, target.opening) == ("grasp", 0.0)
+    np.testing.assert_allclose(target.position, [0.5, 0.1, max(edge / 2, LOWEST_EE)])
+
+
+def test_closing_goes_on_once_it_has_begun():
+    beside = 0.018  # too far to begin with
+    half = EDGE + 0.75 * OPEN_SLACK
+    assert rung(at(beside, 0, 0))[0] != "grasp"
+    assert rung(at(beside, 0, 0, opening=half))[0] == "grasp"
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.03, EDGE + OPEN_SLACK / 2])
+def test_fingers_that_closed_too_early_open_before_the_hand_descends(opening: float):
+    world = at(0, 0, 0.09, opening=opening)
+    name, target = rung(world)
+    assert (name, target.opening) == ("open", OPEN)
+    assert target.position[2] >= top(world) + CLEAR
+
+
+@given(st.floats(0.03, 0.0799))
+def test_a_hand_that_is_all_open_goes_around_whatever_it_can(edge: float):
+    assert grasp_of(at(0, 0, 0.1, edge=edge), "object").open_enough
+    assert not grasp_of(at(0, 0, 0.1, edge=edge, opening=edge), "object").open_enough
+
+
+def test_fingers_that_touch_the_cube_between_them_hold_it_and_others_do_not():
+    assert rung(at(0, 0, 0, opening=EDGE, touching=True))[0] == "carry"
+    assert rung(at(0, 0, 0, opening=EDGE))[0] != "carry"
+    assert rung(at(0.06, 0, 0, opening=EDGE, touching=True))[0] != "carry"
+    assert rung(at(0, 0, 0.07, opening=EDGE, touching=True))[0] != "carry"
+
+
+@pytest.mark.parametrize(("edge", "holds"), [(0.03, False), (0.07, True)])
+def test_a_larger_cube_is_held_farther_from_its_middle(edge: float, holds: bool):
+    off_its_middle = at(0.03, 0, 0.03, edge=edge, opening=edge, touching=True)
+    assert (rung(off_its_middle)[0] == "carry") == holds
+
+
+def test_a_turned_hand_does_not_close():
+    turned = at(0, 0, 0, AT_GRASP_ANGLE + 0.1)
+    assert rung(turned)[0] == "descend"
+    np.testing.assert_allclose(rung(turned)[1].rotation, hand_down(0.0))
+
+
+def test_over_an_object_that_has_not_settled_the_hand_waits():
+    tilted = at(0, 0, 0.1, tilt=MAX_TILT + 0.1)
+    assert rung(tilted)[1].position[2] >= top(tilted) + CLEAR
+    assert rung(at(0, 0, 0, tilt=MAX_TILT + 0.1))[0] != "grasp"
+
+
+@pytest.mark.parametrize("edge", [0.03, 0.05, 0.07])
+def test_a_held_object_goes_over_the_goal_first_and_then_down(edge: float):
+    (name, far), (other, near) = rung(held((-0.2, 0.1, 0.0), edge)), rung(held((-0.01, 0.0, -0.05), edge))
+    assert name == other == "carry"
+    assert far.opening == near.opening == 0.0
+    hand = held((0, 0, 0), edge).ee.position
+    np.testing.assert_allclose(far.position, hand + [-0.2, 0.1, 0.05])
+    np.testing.assert_allclose(near.position, hand + [-0.01, 0, -0.05])
+
+
+def test_at_the_goal_the_fingers_stay_closed():
+    name, target = rung(held((0.004, 0, -0.004)))
+    assert (name, target.opening) == ("at_goal", 0.0)
+
+
+def test_an_object_off_the_hands_middle_is_carried_by_its_own_centre():
+    world = held((0.0, 0.0, 0.1)).moved(0.01, 0.005, 0.0)
+    np.testing.assert_allclose(rung(world)[1].position - world.ee.position, [0, 0, 0.1])
+
+
+def test_without_an_object_the_hand_goes_to_the_goal():
+    rungs, world = ReachGoal().rungs, at(-0.2, 0.1, 0.2, yaw=0.3)
+    name, target = rung(world, rungs)
+    assert name == "carry"
+    np.testing.assert_array_equal(target.position, world.goal)
+    there = replace(world, ee=Pose(world.goal + 0.005, hand_down(0.3)))
+    assert rung(there, rungs)[0] == "at_goal"
+
+
+@given(st.floats(0, 0.2), st.floats(0, 2 * np.pi), st.floats(-0.02, 0.3), st.floats(0, OPEN), widths, st.booleans())
+def test_no_target_is_in_the_table(
+    off: float, direction: float, height: float, opening: float, edge: float, touching: bool
+):
+    world = at(
+        off * np.cos(direction), off * np.sin(direction), height, opening=opening, edge=edge, touching=touching
+    )  # fmt: skip
+    assert rung(world)[1].position[2] >= LOWEST_EE
+    assert rung(replace(world, goal=np.array([0.5, 0.1, 0.0])))[1].position[2] >= LOWEST_EE
+
+
+@given(
+    st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.02, 0.4), st.floats(0, OPEN), widths, st.floats(-3, 3)
+)  # fmt: skip
+def test_progress_is_a_share_and_holding_is_more_than_any_way_to_it(x, y, z, opening: float, edge: float, yaw: float):
+    free = pick_progress(at(x, y, z, yaw, edge=edge, opening=opening), "object")
+    assert 0 < free < 0.5 <= pick_progress(held((x, y, z), edge), "object") <= 1
+
+
+def test_progress_is_whole_at_the_goal_alone():
+    assert pick_progress(held((0, 0, 0)), "object") == 1
+    assert pick_progress(held((0, 0, 2 * AT_GOAL)), "object") < 1
+    assert pick_progress(replace(held((0, 0, 0)), touching=False), "object") < 0.5
+
+
+@given(st.floats(0, 2), st.floats(0, 2))
+def test_nearness_grows_as_the_way_gets_shorter(one: float, other: float):
+    near, far = (nearness(rest) for rest in sorted((one, other)))
+    assert 0 < far <= near <= 1
+
+
+def test_a_ladder_says_its_rungs_by_different_names_and_ends_with_one_that_always_holds():
+    for rungs in (RUNGS, ReachGoal().rungs):
+        assert len({one.name for one in rungs}) == len(rungs)
+        assert rungs[-1].holds(at(0.5, 0.5, 0.5))
+
+
+@given(st.floats(-np.pi / 4, np.pi / 4), st.floats(-np.pi, np.pi))
+def test_a_grasp_is_one_of_the_cubes_own_and_no_far_turn(object_yaw: float, hand_yaw: float):
+    yaw = grasp_yaw(object_yaw, hand_down(hand_yaw))
+    assert np.exp(4j * yaw) == pytest.approx(np.exp(4j * object_yaw), abs=1e-9)
+    assert abs(yaw) <= 3 * np.pi / 4
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi))
+def test_the_angle_between_two_hands_is_the_difference_of_their_yaws(a: float, b: float):
+    difference = abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+    assert angle_between(hand_down(a), hand_down(b)) == pytest.approx(difference, abs=1e-6)
+
+
+@given(st.floats(-np.pi, np.pi), st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+def test_the_angle_from_a_hand_that_points_down_is_the_angle_between_the_two(yaw: float, numbers: list[float]):
+    assume(np.linalg.norm(numbers) > 0.1)
+    hand = np.empty(9)
+    mujoco.mju_quat2Mat(hand, np.array(numbers) / np.linalg.norm(numbers))
+    assert angle_from_down(hand.reshape(3, 3), yaw) == pytest.approx(
+        angle_between(hand.reshape(3, 3), hand_down(yaw)), abs=1e-6
+    )
+
+
+@given(st.floats(-np.pi, np.pi))
+def test_a_hand_that_points_down_is_a_rotation_whose_z_is_down(yaw: float):
+    rotation = hand_down(yaw)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    np.testing.assert_array_equal(rotation[:, 2], [0, 0, -1])
+
+
+# A cube looks the same on every face.
+
+SYMMETRIES = [
+    np.diag(signs)[list(order)]
+    for order in itertools.permutations(range(3))
+    for signs in itertools.product((1.0, -1.0), repeat=3)
+    if np.linalg.det(np.diag(signs)[list(order)]) > 0
+]
+
+
+def test_a_cube_has_24_rotations():
+    assert len(SYMMETRIES) == 24
+
+
+@given(st.floats(-np.pi, np.pi), st.sampled_from(SYMMETRIES))
+def test_a_resting_cubes_yaw_does_not_know_the_face_it_lies_on(yaw: float, symmetry: np.ndarray):
+    plain, turned = cube_yaw(about((0, 0, 1), yaw)), cube_yaw(about((0, 0, 1), yaw) @ symmetry)
+    assert np.exp(4j * turned[0]) == pytest.approx(np.exp(4j * plain[0]), abs=1e-9)
+    assert np.exp(4j * turned[0]) == pytest.approx(np.exp(4j * yaw), abs=1e-9)
+    assert turned[1] == pytest.approx(0, abs=1e-6)
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(0, 2 * np.pi), st.floats(0, 0.3), st.sampled_from(SYMMETRIES))
+def test_a_tilted_cubes_tilt_does_not_know_its_face_and_its_yaw_hardly(
+    yaw: float, direction: float, tilt: float, symmetry: np.ndarray
+):
+    rotation = about((np.cos(direction), np.sin(direction), 0.0), tilt) @ about((0, 0, 1), yaw)
+    plain, turned = cube_yaw(rotation), cube_yaw(rotation @ symmetry)
+    assert turned[1] == pytest.approx(plain[1], abs=1e-6)
+    assert plain[1] == pytest.approx(tilt, abs=1e-6)
+    apart = np.angle(np.exp(4j * (turned[0] - plain[0]))) / 4
+    between = 2 * np.arctan(np.cos(tilt))  # two sides, a right angle apart, seen from above at worst
+    assert abs(apart) <= np.pi / 2 - between + 1e-6
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-1.5, 1.5))
+def test_yaw_and_tilt_lie_in_their_ranges(yaw: float, tilt: float):
+    seen, off = cube_yaw(about((1, 0, 0), tilt) @ about((0, 0, 1), yaw))
+    assert abs(seen) <= np.pi / 4 + 1e-12
+    assert 0 <= off <= np.arccos(1 / np.sqrt(3)) + 1e-9

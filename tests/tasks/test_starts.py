@@ -1,0 +1,161 @@
+"""Where objects and goals start."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.robots.robot import ROBOTS, get_robot
+from manip_il.seeding import rng_for
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.variation import with_drawn
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.pick_place import OBJECT
+from manip_il.tasks.starts import FROM_HAND, LIFT, draw_until, draw_yaw
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import Start
+
+from ..tables import GRASPING, SCENES, every_robot, every_scene
+
+SEED = 5_000_000
+seeds = st.integers(0, 2**40)
+edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's own [m]
+
+
+@cache
+def world_of(robot: str, task: str, edge: float | None = None) -> World:
+    world = World(build_scene(robot, task))
+    world.vary(with_drawn(world.scene.nominal, {} if edge is None else {"size": edge}))
+    return world
+
+
+def start(world: World, seed: int) -> Start:
+    return world.scene.task.draw(rng_for(seed, "reset"), world)
+
+
+def position(drawn: Start, name: str) -> np.ndarray:
+    return drawn.poses[name][0]
+
+
+@given(st.sampled_from(SCENES), edges, seeds)
+@settings(max_examples=200)
+def test_everything_that_is_drawn_is_within_reach(scene: tuple[str, str], edge: float | None, seed: int):
+    world = world_of(*scene, edge)
+    poses = start(world, seed).poses
+    assert GOAL in poses
+    for name, (at, quaternion) in poses.items():
+        assert world.reach.has(at), f"{name} at {at}"
+        assert np.linalg.norm(quaternion) == pytest.approx(1)
+
+
+@given(st.sampled_from(GRASPING), edges, seeds)
+def test_an_object_rests_on_the_table_and_not_under_the_hand(scene: tuple[str, str], edge: float | None, seed: int):
+    world = world_of(*scene, edge)
+    space, at = world.scene.robot.workspace, position(start(world, seed), OBJECT)
+    from_centre = at[:2] - space.centre
+    assert at[2] == (edge or 0.05) / 2
+    assert np.abs(from_centre).max() <= space.half_width
+    assert np.hypot(*from_centre) >= FROM_HAND
+
+
+@given(st.sampled_from(GRASPING), seeds)
+def test_an_object_is_turned_about_the_vertical_by_an_eighth_turn_at_most(scene: tuple[str, str], seed: int):
+    w, x, y, z = start(world_of(*scene), seed).poses[OBJECT][1]
+    assert x == y == 0
+    assert abs(2 * np.arctan2(z, w)) <= np.pi / 4 + 1e-12
+
+
+@every_scene
+def test_a_start_has_no_contact_but_of_what_rests(robot: str, task: str):
+    env = ManipEnv(robot, task)
+    objects = {one.geom for one in env.scene.objects.values()}
+    for seed in range(SEED, SEED + 20):
+        env.start(seed)
+        for contact in env.data.contact:
+            assert contact.dist > -1e-4
+            table = env.scene.model.geom("table").id
+            bodies = [env.scene.model.geom_bodyid[geom] for geom in contact.geom]
+            on_table = table in contact.geom and objects & set(contact.geom)
+            within_robot = 0 not in bodies and not objects & set(contact.geom)  # fingers that start closed
+            assert on_table or within_robot
+
+
+@every_scene
+def test_a_start_is_the_home_posture_within_its_jitter_and_any_opening(robot: str, task: str):
+    env = ManipEnv(robot, task)
+    openings, gripper = [], env.scene.gripper
+    for seed in range(SEED, SEED + 40):
+        env.start(seed)
+        assert np.abs(env.data.qpos[env.scene.arm_q] - env.scene.robot.home).max() <= 0.03
+        assert env.data.qvel.max() == env.data.qvel.min() == 0
+        openings.append(env.world.opening)
+    share = (np.array(openings) - gripper.least) / (gripper.most - gripper.least)
+    assert -1e-9 <= share.min() < 0.2
+    assert 0.8 < share.max() <= 1 + 1e-9
+
+
+@given(st.sampled_from(sorted(ROBOTS)), edges, seeds)
+def test_a_goal_of_pick_and_place_is_over_the_table(robot: str, edge: float | None, seed: int):
+    world = world_of(robot, "pick_place", edge)
+    space, goal = world.scene.robot.workspace, position(start(world, seed), GOAL)
+    assert np.abs(goal[:2] - space.centre).max() <= space.half_width
+    resting = (edge or 0.05) / 2
+    assert resting <= goal[2] <= resting + space.height
+
+
+@given(st.sampled_from(sorted(ROBOTS)), seeds)
+def test_lifts_goal_is_above_the_object(robot: str, seed: int):
+    drawn = start(world_of(robot, "lift"), seed)
+    np.testing.assert_array_equal(position(drawn, GOAL)[:2], position(drawn, OBJECT)[:2])
+    assert LIFT[0] <= position(drawn, GOAL)[2] - position(drawn, OBJECT)[2] <= LIFT[1]
+
+
+@every_robot
+def test_half_the_goals_of_pick_and_place_are_on_the_table(robot: str):
+    world = world_of(robot, "pick_place")
+    on_table = sum(position(start(world, seed), GOAL)[2] == 0.025 for seed in range(400))
+    assert 150 <= on_table <= 250  # five standard deviations of a fair coin
+
+
+@every_robot
+def test_starts_reach_into_every_quarter_of_the_table(robot: str):
+    world, centre = world_of(robot, "pick_place"), get_robot(robot).workspace.centre
+    quarters = {tuple(position(start(world, seed), OBJECT)[:2] > centre) for seed in range(100)}
+    assert len(quarters) == 4
+
+
+@every_scene
+def test_a_draw_follows_from_its_generator_alone(robot: str, task: str):
+    world = world_of(robot, task)
+    first = {name: np.concatenate(pose).tobytes() for name, pose in start(world, 3).poses.items()}
+    start(world, 4)
+    assert {name: np.concatenate(pose).tobytes() for name, pose in start(world, 3).poses.items()} == first
+
+
+@given(st.floats(0.01, np.pi), seeds)
+def test_a_drawn_turn_is_about_the_vertical_and_no_wider_than_asked(widest: float, seed: int):
+    quaternion, matrix = draw_yaw(np.random.default_rng(seed), widest), np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    assert matrix[8] == pytest.approx(1)
+    assert abs(np.arctan2(matrix[3], matrix[0])) <= widest + 1e-12
+
+
+def test_where_nothing_fits_the_error_names_task_thing_and_robot():
+    scene = SimpleNamespace(task=SimpleNamespace(name="stack"), robot=SimpleNamespace(name="dwarf"))
+    with pytest.raises(UsageError, match="task stack: no place for the goal in reach of dwarf was found"):
+        draw_until(lambda: np.zeros(3), lambda at: False, SimpleNamespace(scene=scene), "the goal")
+
+
+def test_an_unknown_name_answers_with_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'reach'"):
+        get_task("reahc")
+    with pytest.raises(UnknownName, match="known: fetch, panda"):
+        get_robot("ur5")
