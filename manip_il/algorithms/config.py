@@ -81,7 +81,7 @@ class RunConfig:
             raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
-        if self.label == "takeover" and self.query_rule == QueryRule("every"):
+        if self.label == "takeover" and self.query_rule is not None and self.query_rule.kind == "every":
             raise UsageError("label is 'takeover' and query 'every': the expert would drive from the first step on")
         if rule.kind == "ensemble" and self.ensemble < 2:
             raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
