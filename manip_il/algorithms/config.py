@@ -1,4 +1,4 @@
-"""What one run of an algorithm is made of."""
+"""Options of one run of an algorithm, checked against each other."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class RunConfig:
 
     @property
     def steps_of_branch(self) -> int:
-        """Of a branch: what was given, else as many as the policy can learn a whole plan from."""
+        """Return the control steps of a branch: those given, else enough to learn a whole plan from."""
         return self.branch_steps or self.fit.plan_length + self.fit.dropped_frames
 
     @property

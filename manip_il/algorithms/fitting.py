@@ -66,7 +66,7 @@ def fit_table(
 
 
 def round_fit(config: RunConfig, warm: bool) -> FitConfig:
-    """What one round's fit is made of."""
+    """Return the options of one round's fit."""
     fit = config.fit
     if fit.steps is None and not fit.is_mlp:
         fit = replace(fit, steps=CHUNK_STEPS)
@@ -74,7 +74,7 @@ def round_fit(config: RunConfig, warm: bool) -> FitConfig:
 
 
 def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
-    """How often each frame of the datasets is drawn; None where all are alike."""
+    """Return how often each frame of the datasets is drawn, (N,); None where all are alike."""
     if config.sampling.is_even:
         return None
     scale = build_scene(config.env.robot, config.env.task).actions.scale

@@ -1,4 +1,4 @@
-"""What a round is made of: who drives its rollouts, what comes of them, the policy, and how good that is."""
+"""The parts of a round: who drives its rollouts, what comes of them, the policy, and how good that is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Noise = tuple[tuple[float, ...], ...]  # covariance (n, n) of actions
 
 @dataclass(frozen=True)
 class Drive:
-    """What a rollout job says of who drives. beta: the expert's share of the steps. noise: made when it is needed."""
+    """The driver of a rollout job. beta: the expert's share of the steps. noise: made when it is needed."""
 
     driver: Literal["noisy_expert", "policy", "mixture"]
     beta: float = 1.0
@@ -65,7 +65,7 @@ class Fitted:
 
     @property
     def path(self) -> Path:
-        """Of the one that drives."""
+        """Return the checkpoint of the policy that drives."""
         return self.members[0]
 
 

@@ -48,7 +48,7 @@ BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "jour
 
 @dataclass(frozen=True)
 class Watch:
-    """What a caller sees of a run as it goes. Raising in any of them ends the run; what is on disk stays."""
+    """Calls by which a run tells how it goes. Raising in any of them ends the run; what is on disk stays."""
 
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
     on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
@@ -202,7 +202,7 @@ class Run:
             _LOG.warning("round %d: no labels, as the expert was queried in none of its rollouts", job.round)
 
     def _keep(self, round_: int, beta: float, queried_everywhere: bool) -> Rollouts:
-        """What lies on disk of a round's rollouts."""
+        """Return what lies on disk of a round's rollouts."""
         here = self._folder(round_)
         headers = [read_header(path) for path in list_episodes(here / JOURNALS)]
         dataset = here / DATASET if self._is_recorded(round_) else None
@@ -242,5 +242,5 @@ class Run:
 
 
 def round_folder(folder: Path, round_: int) -> Path:
-    """Where a round of the run in `folder` keeps its journals, dataset, policy and evaluation."""
+    """Return the folder of a round: its journals, dataset, policy and evaluation."""
     return folder / f"round_{round_:03d}"

@@ -74,7 +74,7 @@ class Grasp(NamedTuple):
 
 def grasp_of(world: World, name: str) -> Grasp:
     """How the hand stands to an object; worked out once for a state."""
-    return world.remember(name, partial(_grasp, world, name))
+    return world.remember(("grasp", name), partial(_grasp, world, name))
 
 
 def _grasp(world: World, name: str) -> Grasp:
