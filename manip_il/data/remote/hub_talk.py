@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import re
+import threading
 from collections.abc import Iterator
 
 import httpx
@@ -45,6 +46,9 @@ from manip_il.errors import ManipError
 HF = "https://huggingface.co"
 LOGIN = "run `hf auth login`, or set HF_TOKEN"
 _TEMPORARY = (408, 429, 500, 502, 503, 504)
+_one_at_a_time = threading.Lock()
+_talks: list[str] = []  # endpoints talked to now, one for each `quiet`
+_found: list[tuple[bool, int, bool]] = []  # bars, verbosity and no xet, as they were before the first of them
 # What huggingface_hub raises over an answer of the wrong shape: it checks none.
 _NONSENSE = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
 _FULL = (402, 507)  # payment required, insufficient storage
@@ -75,20 +79,26 @@ def talking(place: str, endpoint: str, *, listing: bool = False) -> Iterator[Non
 def quiet(endpoint: str) -> Iterator[None]:
     """No progress bars and warnings of huggingface_hub, and no xet where only the public Hub is known to have it.
 
-    Its warnings name URLs, those of uploads with their signatures.
+    Its warnings name URLs, those of uploads with their signatures. All of it is the process's, so threads that talk
+    at once share it: what was found comes back when the last one is done.
     """
-    shown, level, xet = not are_progress_bars_disabled(), hub_logging.get_verbosity(), constants.HF_HUB_DISABLE_XET
-    if shown:
-        disable_progress_bars()
-    hub_logging.set_verbosity_error()
-    constants.HF_HUB_DISABLE_XET = xet or endpoint != HF
+    with _one_at_a_time:
+        if not _talks:
+            _found.append((not are_progress_bars_disabled(), hub_logging.get_verbosity(), constants.HF_HUB_DISABLE_XET))
+            disable_progress_bars()
+            hub_logging.set_verbosity_error()
+        _talks.append(endpoint)
+        constants.HF_HUB_DISABLE_XET |= endpoint != HF
     try:
         yield
     finally:
-        constants.HF_HUB_DISABLE_XET = xet
-        hub_logging.set_verbosity(level)
-        if shown:
-            enable_progress_bars()
+        with _one_at_a_time:
+            _talks.remove(endpoint)
+            if not _talks:
+                shown, level, constants.HF_HUB_DISABLE_XET = _found.pop()
+                hub_logging.set_verbosity(level)
+                if shown:
+                    enable_progress_bars()
 
 
 def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | None:

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 from huggingface_hub import HfApi, constants
+from huggingface_hub.utils import logging as hub_logging
 
 from manip_il.data.cards import CARD, STRIP
 from manip_il.data.remote.errors import ConflictError
+from manip_il.data.remote.hub_talk import quiet
 from manip_il.data.remote.push import check_source, push
 from manip_il.data.remote.remote import MANIFEST_FILE
 from manip_il.data.remote.scan import scan
@@ -158,6 +160,19 @@ def test_of_two_pushers_one_wins_and_the_other_is_told(hub: Hub, other: Path):
     with pytest.raises(ConflictError, match="changed by another push"):
         remote.publish(scanned.local, scanned.manifest, before, lambda count: None)
     assert repo.refs("heads")["main"] == head == repo.refs("tags")["v3.0"]
+
+
+def test_settings_of_the_client_hold_until_the_last_thread_is_done(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", False)
+    level = hub_logging.get_verbosity()
+    first, second = quiet("http://127.0.0.1:1"), quiet("http://127.0.0.1:1")
+    first.__enter__()
+    with second:
+        first.__exit__(None, None, None)
+        assert constants.HF_HUB_DISABLE_XET
+        assert hub_logging.get_verbosity() == hub_logging.ERROR
+    assert not constants.HF_HUB_DISABLE_XET
+    assert hub_logging.get_verbosity() == level
 
 
 def test_of_two_first_pushes_at_once_one_wins(hub: Hub, other: Path):
