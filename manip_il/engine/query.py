@@ -36,10 +36,10 @@ _STREAM = "ask"  # of random numbers; another name would draw other states
 
 @dataclass(frozen=True)
 class QueryRule:
-    """When the expert is queried, with the rule's parameter; `bound` is nan for those without one."""
+    """When the expert is queried, with the rule's parameter; `bound` is 0 for those without one."""
 
     kind: str = "every"
-    bound: float = math.nan
+    bound: float = 0.0
 
     @classmethod
     def parse(cls, text: str) -> QueryRule:

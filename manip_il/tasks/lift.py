@@ -8,7 +8,7 @@ import numpy as np
 
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT, PickPlace
-from manip_il.tasks.starts import LIFT, UPRIGHT, draw_resting, draw_yaw
+from manip_il.tasks.starts import LIFT, UPRIGHT, draw_resting, draw_until, draw_yaw
 from manip_il.tasks.task import Start
 
 
@@ -22,5 +22,5 @@ class Lift(PickPlace):
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the cube on the table, at any yaw, and the height of the goal over it."""
         at, turn = draw_resting(rng, world, OBJECT), draw_yaw(rng)
-        goal = at + [0.0, 0.0, rng.uniform(*LIFT)]
+        goal = draw_until(lambda: at + [0.0, 0.0, rng.uniform(*LIFT)], world.reach.has, world, "the goal")
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
