@@ -42,11 +42,11 @@ from remote.hub_server import Hub, hub_server  # pyright: ignore[reportMissingIm
 from remote.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
 from remote.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
 
-from manip_il.data.remote.disk import sync_disk
-from manip_il.data.remote.pull import pull
-from manip_il.data.remote.push import push
-from manip_il.data.remote.sftp_connection import quick_transport
-from manip_il.data.remote.url import RemoteUrl, open_remote
+from manip_il.store.disk import sync_disk
+from manip_il.store.pull import pull
+from manip_il.store.push import push
+from manip_il.store.sftp_connection import quick_transport
+from manip_il.store.url import RemoteUrl, open_remote
 
 BUCKET = "benchmark"
 TOKEN = "hf_OfTheBenchmark"

@@ -14,8 +14,8 @@ from manip_il.errors import ManipError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from manip_il.data.doctor.dataset import Dataset
-    from manip_il.data.doctor.finding import Finding
+    from manip_il.doctor.dataset import Dataset
+    from manip_il.doctor.finding import Finding
 
 _MODEL = "model_sha256"
 
@@ -39,9 +39,9 @@ class DoctorOptions:
 
     def run(self) -> None:
         """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
-        from manip_il.data.doctor.examine import has_errors, verdict
-        from manip_il.data.doctor.finding import NotWhole
-        from manip_il.data.doctor.repair import repair
+        from manip_il.doctor.examine import has_errors, verdict
+        from manip_il.doctor.finding import NotWhole
+        from manip_il.doctor.repair import repair
 
         dataset, findings = self._examine()
         if self.repair and any(finding.remedy.name != "NONE" for finding in findings):
@@ -55,8 +55,8 @@ class DoctorOptions:
         say(verdict(dataset, findings))
 
     def _examine(self) -> tuple[Dataset, list[Finding]]:
-        from manip_il.data.doctor.dataset import Dataset
-        from manip_il.data.doctor.examine import CHECKS, examine
+        from manip_il.doctor.dataset import Dataset
+        from manip_il.doctor.examine import CHECKS, examine
 
         findings: list[Finding] = []
         with progress(None, "files examined") as bar:
@@ -70,11 +70,11 @@ class DoctorOptions:
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
     """Joints and state are those of the robot and task as this program has them; so is the compiled model."""
-    from manip_il.data.doctor.finding import error, warning
-    from manip_il.data.doctor.ours import read_spec
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS
     from manip_il.data.lerobot_read import read_fingerprint
+    from manip_il.doctor.finding import error, warning
+    from manip_il.doctor.ours import read_spec
 
     if not dataset.is_ours:
         return

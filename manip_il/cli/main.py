@@ -195,10 +195,10 @@ def _one_line(text: str, words: list[str]) -> str:
 
 def _clean(text: str, words: list[str]) -> str:
     """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library."""
-    from manip_il.data.remote.errors import mask, redact
+    from manip_il.store.errors import mask, redact
 
     if any(":" in word or "@" in word for word in words):
-        from manip_il.data.remote.url import secrets_in
+        from manip_il.store.url import secrets_in
 
         for secret in (one for word in words for one in secrets_in(word)):
             text = mask(text, secret)

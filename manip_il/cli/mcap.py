@@ -15,8 +15,8 @@ from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
 
 if TYPE_CHECKING:
-    from manip_il.data.mcap_import import Import
-    from manip_il.data.mcap_mapping import Mapping
+    from manip_il.mcap.importing import Import
+    from manip_il.mcap.mapping import Mapping
 
 
 @dataclass
@@ -42,7 +42,7 @@ class McapExportOptions:
         """Export every episode; the folder appears when it is whole."""
         from manip_il.data.atomic import new_folder
         from manip_il.data.lerobot_read import dataset_info
-        from manip_il.data.mcap_export import MAPPING, export_dataset, open_source
+        from manip_il.mcap.export import MAPPING, export_dataset, open_source
 
         source = open_source(self.dataset)
         total = dataset_info(self.dataset).episodes
@@ -81,8 +81,8 @@ class McapImportOptions:
 
     def run(self) -> None:
         """Import every file; the dataset appears when it is whole."""
-        from manip_il.data.mcap_import import list_files
-        from manip_il.data.mcap_mapping import load_mapping
+        from manip_il.mcap.importing import list_files
+        from manip_il.mcap.mapping import load_mapping
 
         mapping = load_mapping(self.mapping)
         paths = list_files(self.source)
@@ -97,7 +97,7 @@ class McapImportOptions:
         say(f"imported {episodes:,} episodes, {frames:,} frames to {self.dataset}")
 
     def _import(self, paths: list[Path], mapping: Mapping) -> Iterator[Import]:
-        from manip_il.data.mcap_import import import_files
+        from manip_il.mcap.importing import import_files
 
         with progress(len(paths), "import") as bar:
             for done in import_files(paths, self.dataset, mapping):

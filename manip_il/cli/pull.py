@@ -13,7 +13,7 @@ from manip_il.cli.transfer import going_on, moved
 from manip_il.errors import FolderExistsError, UsageError
 
 if TYPE_CHECKING:
-    from manip_il.data.remote.url import RemoteUrl
+    from manip_il.store.url import RemoteUrl
 
 
 @dataclass
@@ -39,8 +39,8 @@ class PullOptions:
 
     def run(self) -> None:
         """Fetch, verify, rename; say what is there now."""
-        from manip_il.data.remote.pull import pull
-        from manip_il.data.remote.url import open_remote
+        from manip_il.store.pull import pull
+        from manip_il.store.url import open_remote
 
         url = self._url()
         remote = open_remote(url)
@@ -65,7 +65,7 @@ class PullOptions:
             say(f"next: manip-il doctor {self.target}")
 
     def _url(self) -> RemoteUrl:
-        from manip_il.data.remote.url import RemoteUrl
+        from manip_il.store.url import RemoteUrl
 
         url = RemoteUrl.parse(self.remote)
         if self.revision is None:

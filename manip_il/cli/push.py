@@ -12,8 +12,8 @@ from manip_il.cli.progress import bytes_text, say
 from manip_il.cli.transfer import going_on, moved
 
 if TYPE_CHECKING:
-    from manip_il.data.remote.push import Plan
-    from manip_il.data.remote.remote import Published
+    from manip_il.store.push import Plan
+    from manip_il.store.remote import Published
 
 
 @dataclass
@@ -39,15 +39,15 @@ class PushOptions:
 
     def check(self) -> None:
         """Refuse an address that is none, and what is no folder."""
-        from manip_il.data.remote.url import RemoteUrl
+        from manip_il.store.url import RemoteUrl
 
         RemoteUrl.parse(self.remote)
         require_folder(self.source, "the folder of a dataset, a run or a policy")
 
     def run(self) -> None:
         """Examine, list, upload, switch over; say what was done."""
-        from manip_il.data.remote.push import push
-        from manip_il.data.remote.url import RemoteUrl, open_remote
+        from manip_il.store.push import push
+        from manip_il.store.url import RemoteUrl, open_remote
 
         url = RemoteUrl.parse(self.remote)
         remote = open_remote(url, private=self.private)

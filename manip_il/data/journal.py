@@ -27,11 +27,14 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data import foxglove, schema
+from manip_il.data import schema
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.episodes import final_columns, take_final
-from manip_il.data.foxglove_episode import channels, frame_times
-from manip_il.data.mcap_records import (
+from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
+from manip_il.errors import ManipError, OlderSchemaError
+from manip_il.mcap import foxglove
+from manip_il.mcap.foxglove_episode import channels, frame_times
+from manip_il.mcap.records import (
     MIB,
     Budget,
     Record,
@@ -41,8 +44,6 @@ from manip_il.data.mcap_records import (
     to_attachment,
     unpack,
 )
-from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
-from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mdp import Episode
 
 _FORMAT = "2"

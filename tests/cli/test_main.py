@@ -158,7 +158,7 @@ def test_every_command_leads_to_a_dataclass_that_runs(name):
 BUSY = """
 import os, signal, sys, threading, time
 from manip_il.cli import main as program
-from manip_il.data.remote.object_store import in_threads
+from manip_il.store.object_store import in_threads
 
 def work(words):
     threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()

@@ -10,7 +10,7 @@ from manip_il.cli import push as push_command
 from manip_il.cli.main import main
 from manip_il.cli.progress import bytes_text
 
-from ..data.remote.hub_use import DATASET, SAMPLE, a_hub
+from ..store.hub_use import DATASET, SAMPLE, a_hub
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ def test_ctrl_c_says_how_to_go_on(
     def interrupted(*words: object, **more: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("manip_il.data.remote.push.push", interrupted)
+    monkeypatch.setattr("manip_il.store.push.push", interrupted)
     assert main(["push", str(run), url]) == 130
     assert "kept: what has been transferred so far; continue with: the same command" in capsys.readouterr().err
 

@@ -17,17 +17,16 @@ from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, build, local_id
-from manip_il.data.doctor.dataset import Dataset
-from manip_il.data.doctor.repair import repair
 from manip_il.data.lerobot_io import camera_keys, dataset_info, read_frames, read_spec, write_dataset
-from manip_il.data.mcap_export import open_source
+from manip_il.doctor.dataset import Dataset
+from manip_il.doctor.repair import repair
 from manip_il.errors import ManipError, UsageError
+from manip_il.mcap.export import open_source
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import Condition
 
-from .damage import edit_json, findings, lines
-from .pictures import numbered_episodes, with_cameras
-from .test_doctor_repair import digests
+from ..damage import digests, edit_json, findings, lines
+from ..pictures import numbered_episodes, with_cameras
 
 MakeEpisode = Callable[..., Episode]
 HOSTILE = "x/../../../victim/videos/observation.images.front"

@@ -13,9 +13,9 @@ import pytest
 from av.video.codeccontext import VideoCodecContext
 
 from manip_il.data import video_open
-from manip_il.data.doctor import videos
 from manip_il.data.video_open import open_video
 from manip_il.data.video_read import VideoReader, count_frames, count_packets
+from manip_il.doctor import videos
 from manip_il.errors import ManipError
 
 FRAMES, FPS = 6, 10

@@ -28,7 +28,7 @@ from manip_il.data.lerobot_io import new_dataset, read_frames, write_dataset
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from .pictures import numbered_episodes, numbers_of, picture, with_cameras
+from ..pictures import numbered_episodes, numbers_of, picture, with_cameras
 from .test_video import largest_file
 
 MakeEpisode = Callable[..., Episode]

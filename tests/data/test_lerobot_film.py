@@ -23,7 +23,7 @@ from manip_il.data.lerobot_io import (
 )
 from manip_il.mdp import Episode
 
-from .pictures import number_of, numbered_episodes, numbers_of, with_cameras
+from ..pictures import number_of, numbered_episodes, numbers_of, with_cameras
 from .test_lerobot_library import DATA, EPISODES, REPO, add_episode, load
 
 pytestmark = pytest.mark.slow

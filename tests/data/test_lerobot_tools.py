@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.lerobot_io import count_frames, read_episodes, video_rows, write_dataset
+from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 
-from .pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import numbered_episodes, numbers_of, with_cameras
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"

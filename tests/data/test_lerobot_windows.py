@@ -18,7 +18,7 @@ from manip_il.data.lerobot_io import VideoConfig, camera_keys, new_dataset
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-from .pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import numbered_episodes, numbers_of, with_cameras
 
 pytestmark = pytest.mark.slow
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"

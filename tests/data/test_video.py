@@ -18,7 +18,6 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data import video
-from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.lerobot_io import (
     VideoConfig,
     camera_keys,
@@ -35,10 +34,11 @@ from manip_il.data.lerobot_io import (
     write_dataset,
 )
 from manip_il.data.lerobot_stats import pixel_counts
+from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from .pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import numbered_episodes, numbers_of, with_cameras
 
 MakeEpisode = Callable[..., Episode]
 OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": {}}

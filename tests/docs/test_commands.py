@@ -16,9 +16,9 @@ from manip_il.cli.main import load
 from manip_il.cli.options import parse
 from manip_il.tasks.table import TASKS
 
-from ..data.remote.hub_server import Hub, clean_environment, hub_server
-from ..data.remote.hub_use import TOKEN
-from ..data.remote.s3 import KEY, SECRET, running_moto, variables
+from ..store.hub_server import Hub, clean_environment, hub_server
+from ..store.hub_use import TOKEN
+from ..store.s3 import KEY, SECRET, running_moto, variables
 from ..warm import Warm
 from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
 from .sizes import shrink_study

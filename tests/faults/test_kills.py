@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.data.doctor.examine import examine_folder
-from manip_il.data.doctor.finding import Severity
 from manip_il.data.journal import list_episodes, read_episode
+from manip_il.doctor.examine import examine_folder
+from manip_il.doctor.finding import Severity
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from manip_il.data import journal
 from manip_il.data.build import Recording, build
-from manip_il.data.cards import card_for
 from manip_il.data.lerobot_io import (
     dataset_info,
     read_episodes,
@@ -18,8 +17,9 @@ from manip_il.data.lerobot_io import (
     read_table,
     write_dataset,
 )
-from manip_il.data.mcap_import import features_of, frames_of, list_files, read_import
-from manip_il.data.mcap_mapping import load_mapping
+from manip_il.mcap.importing import features_of, frames_of, list_files, read_import
+from manip_il.mcap.mapping import load_mapping
+from manip_il.store.cards import card_for
 
 from .binary import mutate_mcap, mutate_parquet
 from .target import Target, command

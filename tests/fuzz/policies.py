@@ -65,9 +65,9 @@ def _load(folder: Path) -> None:
 
 def _describe(folder: Path) -> None:
     from manip_il.cli.groups import find_policy
-    from manip_il.data.cards import card_for
     from manip_il.engine.describe import policy_sha256
     from manip_il.learn.pretrained import read_interface
+    from manip_il.store.cards import card_for
 
     path = find_policy(folder / "run")
     read_interface(path)

@@ -141,8 +141,8 @@ class HubTalk:
     def around(self, folder: Path) -> Iterator[None]:
         from huggingface_hub.utils import _http
 
-        from ..data.remote.hub_use import POLICY, a_hub, do_push
-        from ..data.remote.hub_wire import Answer
+        from ..store.hub_use import POLICY, a_hub, do_push
+        from ..store.hub_wire import Answer
 
         with a_hub(folder / "hub") as hub, _no_waiting(_http):
             self._script, honest = Script(-1, 0, False), hub.answer
@@ -158,13 +158,13 @@ class HubTalk:
             yield
 
     def pull(self, folder: Path) -> None:
-        from ..data.remote.hub_use import POLICY, do_pull
+        from ..store.hub_use import POLICY, do_pull
 
         self._script = Script.read(folder / "script.json")
         do_pull(folder / "pulled", POLICY)
 
     def push(self, folder: Path) -> None:
-        from ..data.remote.hub_use import do_push
+        from ..store.hub_use import do_push
 
         self._script = Script.read(folder / "script.json")
         kept = {name: repo for name, repo in self._hub.repos.items() if name.endswith("/policy")}
@@ -188,7 +188,7 @@ class S3Talk:
     def around(self, folder: Path) -> Iterator[None]:
         import boto3
 
-        from ..data.remote.s3 import KEY, SECRET, running_moto, running_proxy, variables
+        from ..store.s3 import KEY, SECRET, running_moto, running_proxy, variables
 
         with running_moto() as moto, running_proxy(moto) as proxy, mock.patch.dict("os.environ", variables(proxy.url)):
             client = boto3.client("s3", endpoint_url=moto, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
@@ -199,9 +199,9 @@ class S3Talk:
             yield
 
     def pull(self, folder: Path) -> None:
-        from manip_il.data.remote.pull import pull
+        from manip_il.store.pull import pull
 
-        from ..data.remote.trees import impatient, no_wait, unwatched
+        from ..store.trees import impatient, no_wait, unwatched
 
         self._script = Script.read(folder / "script.json")
         url, remote = impatient("s3://fuzz/policy")
@@ -212,9 +212,9 @@ class S3Talk:
         self._push_to(f"s3://fuzz/push-{self._pushes}", folder / "policy")
 
     def _push_to(self, url: str, source: Path) -> None:
-        from manip_il.data.remote.push import push
+        from manip_il.store.push import push
 
-        from ..data.remote.trees import impatient, unwatched
+        from ..store.trees import impatient, unwatched
 
         parsed, remote = impatient(url)
         push(source, parsed, remote, unwatched)

@@ -8,8 +8,8 @@ import shutil
 import numpy as np
 import pytest
 
-from manip_il.data.doctor.examine import examine_folder, has_errors
 from manip_il.data.lerobot_io import read_table
+from manip_il.doctor.examine import examine_folder, has_errors
 
 pytestmark = pytest.mark.slow
 REPO = "--repo_id=someone/seen"

@@ -1,0 +1,203 @@
+"""MCAP files with named topics as a LeRobot dataset: one episode a file, at the dataset's rate, nothing made up.
+
+An episode lasts from the latest of its topics' first messages to the earliest of their last ones, by log time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.atomic import new_folder
+from manip_il.data.schema import MOST_FRAMES
+from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.mcap.mapping import TEXT, Camera, Mapping, Source, Values
+from manip_il.mcap.read import Topics, read_pictures, read_topics
+from manip_il.mcap.resample import I64, NANOSECONDS, Pick, frame_times, pick
+
+Column = list[str] | NDArray[Any]
+Pictures = dict[str, Iterator[NDArray[np.uint8]]]
+
+
+@dataclass(frozen=True)
+class Import:
+    """One file's episode. columns: of numbers and text, T rows each; used: topic -> messages with a part in it."""
+
+    path: Path
+    frames: int
+    tasks: list[str]
+    columns: dict[str, Column]
+    picks: dict[str, Pick]  # of pictures
+    counts: dict[str, int]  # messages of every topic in the file
+    used: dict[str, int]
+
+
+def list_files(source: Path) -> list[Path]:
+    """The MCAP file, or the folder's in the order of their names. Raises `ManipError` where there are none."""
+    if source.is_dir():
+        paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
+        if not paths:
+            raise ManipError(f"{source} holds no *.mcap files")
+        return paths
+    if not source.is_file():
+        raise ManipError(f"no such file or folder: {source}")
+    return [source]
+
+
+def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Import]:
+    """Write the files as a dataset that appears at `root` when all are in; yield each one's account as it is done.
+
+    Raises `FolderExistsError` where `root` holds something, and what `read_import` and `frames_of` raise.
+    """
+    accounts: list[Import] = []
+    first = read_import(paths[0], mapping)
+    features = features_of(mapping, first)
+    from manip_il.data.lerobot_library import write_with_library  # imports torch
+
+    def episodes() -> Iterator[Iterator[dict[str, Any]]]:
+        for number, path in enumerate(paths):
+            accounts.append(first if number == 0 else read_import(path, mapping))
+            yield frames_of(accounts[-1], mapping, features)
+
+    with new_folder(root) as folder:
+        work = folder / root.name  # LeRobot makes its folder itself
+        for _ in write_with_library(work, mapping.fps, mapping.robot_type, features, episodes()):
+            yield accounts.pop()
+        for path in list(work.iterdir()):
+            path.rename(folder / path.name)
+        work.rmdir()
+
+
+def read_import(path: Path, mapping: Mapping) -> Import:
+    """Read and resample one file, all but its pictures.
+
+    Raises `ManipError` naming file, topic and time for whatever the mapping asks for and the file does not give.
+    """
+    task = {"": mapping.task} if isinstance(mapping.task, Values) else {}
+    values = {**mapping.values, **task}
+    topics = read_topics(path, mapping.topics, values)
+    times = _times(topics, mapping.fps)
+    used: dict[str, I64] = {}
+
+    def choose(source: Source) -> Pick:
+        who = f"{path}, topic {source.topic}"
+        chosen = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
+        used[source.topic] = np.union1d(used.get(source.topic, chosen.left), chosen.used())
+        return chosen
+
+    columns = {key: _column(path, key, source, topics.rows[key], choose(source)) for key, source in values.items()}
+    tasks = columns.pop("", None)
+    return Import(
+        path,
+        len(times),
+        [str(mapping.task)] * len(times) if tasks is None else list(tasks),
+        columns,
+        {key: choose(camera) for key, camera in mapping.cameras.items()},
+        dict(topics.counts),
+        {topic: len(numbers) for topic, numbers in used.items()},
+    )
+
+
+def features_of(mapping: Mapping, first: Import) -> dict[str, dict[str, Any]]:
+    """LeRobot's feature table, shapes that the mapping leaves open as the first file has them."""
+    features: dict[str, dict[str, Any]] = {}
+    for key, source in mapping.features.items():
+        if isinstance(source, Camera):
+            shape = next(read_pictures(first.path, source.topic, first.picks[key].left[:1])).shape
+            dtype = "video" if source.video else "image"
+            features[key] = {"dtype": dtype, "shape": shape, "names": ["height", "width", "channels"]}
+        else:
+            column = first.columns[key]
+            shape = (1,) if isinstance(column, list) else source.shape or column.shape[1:]
+            features[key] = {"dtype": source.dtype, "shape": shape, "names": source.names}
+    return features
+
+
+def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Frames as LeRobot's writer takes them, pictures read as they are needed.
+
+    Raises `MismatchError` where a column's width or a picture's size is not that of the first file.
+    """
+    pictures: Pictures = {}
+    for key, camera in mapping.cameras.items():
+        pictures[key] = read_pictures(episode.path, camera.topic, episode.picks[key].left)
+    columns: dict[str, Column] = {}
+    for key, column in episode.columns.items():
+        if not isinstance(column, list):
+            width, wanted = column.shape[1], int(np.prod(features[key]["shape"]))
+            if width != wanted:
+                raise MismatchError(f"column {key!r}", str(episode.path), width, "the first file", f"{wanted} values")
+            column = column.reshape(-1, *features[key]["shape"])
+        columns[key] = column
+    for number, task in enumerate(episode.tasks):
+        frame: dict[str, Any] = {key: column[number] for key, column in columns.items()}
+        for key, stream in pictures.items():
+            frame[key] = next(stream)
+            if frame[key].shape != features[key]["shape"]:
+                size = features[key]["shape"]
+                raise MismatchError(f"{key!r}", f"{episode.path}", frame[key].shape, "the first file", size)
+        yield {**frame, "task": task}
+
+
+def _times(topics: Topics, fps: int) -> I64:
+    last_to_start = max(topics.stamps, key=lambda topic: topics.stamps[topic][0])
+    first_to_end = min(topics.stamps, key=lambda topic: topics.stamps[topic][-1])
+    start, end = int(topics.stamps[last_to_start][0]), int(topics.stamps[first_to_end][-1])
+    if end < start:
+        raise ManipError(
+            f"{topics.path}: {first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts; "
+            "expected topics that overlap in time"
+        )
+    if (end - start) * fps > MOST_FRAMES * NANOSECONDS:
+        raise ManipError(
+            f"{topics.path}: its topics overlap for {(end - start) / NANOSECONDS:g} s, at {fps} frames a second more "
+            f"than {MOST_FRAMES:,} frames; expected one episode a file"
+        )
+    return frame_times(start, end, fps)
+
+
+def _column(path: Path, key: str, source: Values, rows: list[list[Any]], chosen: Pick) -> Column:
+    who = f"{path}, topic {source.topic}, {key or 'task'}"
+    for number, row in enumerate(rows):
+        if len(row) != len(rows[0]):
+            raise ManipError(f"{who}: message {number} has {len(row)} values, the first one {len(rows[0])}")
+    if source.dtype == TEXT:
+        return [_text(who, rows[number]) for number in chosen.left.tolist()]
+    return chosen.blend(_numbers(who, rows, np.dtype(source.dtype))).astype(source.dtype)
+
+
+def _text(who: str, row: list[Any]) -> str:
+    if len(row) != 1 or not isinstance(row[0], str):
+        raise ManipError(f"{who}: got {row!r}; expected one string")
+    return row[0]
+
+
+def _numbers(who: str, rows: list[list[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Rows (N, width): float64 for a dtype of floats, else the dtype. Every value must be one of the dtype."""
+    is_float = dtype.kind == "f"
+    low, high = _limits(dtype)
+    for number, row in enumerate(rows):
+        for value in row:
+            if not isinstance(value, int | float):
+                raise ManipError(f"{who}: message {number} holds {value!r}; expected a number")
+            if not (low <= value <= high and (is_float or int(value) == value)):  # false for NaN
+                kind = NotFiniteError if isinstance(value, float) and not math.isfinite(value) else ManipError
+                raise kind(f"{who}: message {number} holds {value!r}, which is not a valid {dtype}")
+    if is_float:
+        return np.array(rows, np.float64)
+    return np.array([[int(value) for value in row] for row in rows], dtype)
+
+
+def _limits(dtype: np.dtype[Any]) -> tuple[float, float]:
+    if dtype.kind == "b":
+        return 0, 1
+    if dtype.kind == "f":
+        limit = float(np.finfo(dtype).max)
+        return -limit, limit
+    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)

@@ -1,0 +1,214 @@
+"""A folder of this machine, or one mounted from another: `file:///mnt/store/demos`."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import hashlib
+import itertools
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from manip_il.data.atomic import PARTIAL, exclusive, write_file
+from manip_il.errors import FolderBusyError, UsageError
+from manip_il.store.blobs import OBJECTS, STALE, Stored
+from manip_il.store.disk import copy_file, hash_file, sync_disk
+from manip_il.store.errors import AuthError, NoSpaceError, NotFoundError, RemoteError, TransientError
+from manip_il.store.manifest import LONGEST_TEXT
+from manip_il.store.object_store import ObjectRemote, in_threads
+from manip_il.store.remote import MANIFEST_FILE, Advance
+from manip_il.store.url import RemoteUrl
+
+CHUNK = 2**20  # of what is copied at a time [bytes]
+LOCK_WAIT = 30.0  # how long another push may take to switch over [s]
+
+
+def open_file(url: RemoteUrl) -> ObjectRemote:
+    """The remote of a `file://` URL."""
+    return ObjectRemote(FileBlobs(Path(url.place).expanduser(), str(url)))
+
+
+class FileBlobs:
+    """`Blobs` in a folder; the kernel's locks keep two pushes apart, and let go of what a killed one held."""
+
+    threads = 2  # more of them only wait for Python's lock
+
+    def __init__(self, root: Path, name: str):
+        self.root, self._name = root, name
+        self._folders: set[str] = set()
+        self.warnings: tuple[str, ...] = ()
+
+    def describe(self) -> str:
+        """The URL."""
+        return self._name
+
+    def manifest(self) -> tuple[bytes, str] | None:
+        """Content and its hash."""
+        with self._explained(f"read {self._name}"):
+            try:
+                with (self.root / MANIFEST_FILE).open("rb") as file:
+                    data = file.read(LONGEST_TEXT + 1)
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+            return data, hashlib.sha256(data).hexdigest()
+
+    def prepare(self, size: int) -> None:
+        """Make the folder; refuse one that holds something else, or too little space."""
+        with self._explained(f"write to {self._name}"):
+            if self.root.exists() and not self.root.is_dir():
+                raise UsageError(f"{self._name} is a file; expected a folder, or a name that is free")
+            self.root.mkdir(parents=True, exist_ok=True)
+            names = {name for name in os.listdir(self.root) if not name.startswith(".")}
+            if names and not names & {MANIFEST_FILE, OBJECTS}:
+                raise UsageError(f"{self._name} holds other files; name an empty or a new folder to push to")
+            (self.root / OBJECTS).mkdir(exist_ok=True)
+            free = shutil.disk_usage(self.root).free
+        if size > free:
+            text = f"{self._name} has {free:,} bytes left, {size:,} are to be uploaded"
+            raise NoSpaceError(f"{text}; make room there, or push to another place")
+        self._check_locks()
+
+    def swap(self, data: bytes, before: str | None, needed: Mapping[str, int]) -> str | None:
+        """Replace the manifest where it still has the token `before`; None where it has not."""
+        with self._explained(f"write to {self._name}"), self._locked():
+            found = self.manifest()
+            if (found[1] if found else None) != before:
+                return None
+            for key, size in needed.items():
+                if self._size(key) != size:
+                    raise TransientError(f"{self._name} has lost the object {key[:12]}")
+            sync_disk(self.root)  # what the manifest names lies on the disk before it does
+            write_file(self.root / MANIFEST_FILE, data)
+        return hashlib.sha256(data).hexdigest()
+
+    def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
+        """Copy an object from `offset` on."""
+        with self._explained(f"read {self._name}"):
+            try:
+                handle = os.open(self._path(key), os.O_RDONLY | os.O_NOFOLLOW)
+            except FileNotFoundError:
+                raise NotFoundError(f"{self._name} has no object {key[:12]}") from None
+            with os.fdopen(handle, "rb", buffering=0) as file:
+                file.seek(offset)
+                size = min(CHUNK, os.fstat(handle).st_size)
+                rooms = itertools.cycle([memoryview(bytearray(size)), memoryview(bytearray(size))])
+                # Two by turns: the target still hashes the one before.
+                while count := file.readinto(room := next(rooms)):
+                    target.write(room[:count])
+
+    def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
+        """Copy, read back, rename."""
+        folder = f"{self.root}/{OBJECTS}/{key[:2]}"
+        partial = f"{folder}/.{key[:12]}.{secrets.token_hex(6)}{PARTIAL}"
+        with self._explained(f"write to {self._name}"):
+            if folder not in self._folders:
+                os.makedirs(folder, exist_ok=True)
+                self._folders.add(folder)
+            try:
+                if copy_file(source, partial) != key:
+                    text = f"{source} changed while it was being pushed, or {self._name} did not store it intact"
+                    raise TransientError(text)
+                os.replace(partial, f"{folder}/{key}")
+            except BaseException:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(partial)
+                raise
+        advance(size)
+        return True
+
+    def find(self, keys: Iterable[str]) -> dict[str, Stored]:
+        """Those of `keys` that are there."""
+        now, found = time.time(), dict[str, Stored]()
+        for key in keys:
+            with contextlib.suppress(OSError):
+                stat = self._path(key).lstat()
+                found[key] = Stored(stat.st_size, now - stat.st_mtime)
+        return found
+
+    def list(self) -> dict[str, Stored]:
+        """Every object."""
+        return self.find(path.name for path in self._all() if not path.name.startswith("."))
+
+    def wrong(self, sizes: Mapping[str, int]) -> set[str]:
+        """Those that are missing, or are not what their name says."""
+        with self._explained(f"read {self._name}"):
+            digests = in_threads(self.threads, lambda key: _digest(self._path(key)), sizes)
+        return {key for key, digest in digests.items() if digest != key}
+
+    def remove(self, keys: Iterable[str], token: str) -> None:
+        """Remove objects, and what killed pushes left, unless another push has been."""
+        with self._explained(f"write to {self._name}"), self._locked():
+            found = self.manifest()
+            if found is None or found[1] != token:
+                return
+            for key in keys:
+                self._path(key).unlink(missing_ok=True)
+            for path in self._all():
+                if path.name.startswith(".") and time.time() - path.lstat().st_mtime > STALE:
+                    path.unlink(missing_ok=True)
+
+    def _path(self, key: str) -> Path:
+        return self.root / OBJECTS / key[:2] / key
+
+    def _size(self, key: str) -> int | None:
+        try:
+            return self._path(key).lstat().st_size
+        except FileNotFoundError:
+            return None
+
+    def _all(self) -> Iterator[Path]:
+        return (self.root / OBJECTS).glob("??/*")
+
+    @contextlib.contextmanager
+    def _locked(self) -> Generator[None]:
+        last = time.monotonic() + LOCK_WAIT
+        while True:
+            try:
+                stack = contextlib.ExitStack()
+                stack.enter_context(exclusive(self.root / MANIFEST_FILE))
+                break
+            except FolderBusyError:
+                if time.monotonic() > last:
+                    raise RemoteError(f"another push is updating {self._name}; wait, and push again") from None
+                time.sleep(0.05)
+        with stack:
+            yield
+
+    def _check_locks(self) -> None:
+        handle = os.open(self.root, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH)
+        except OSError:
+            text = f"{self._name} is on a file system without locks: two pushes at once can overwrite each other"
+            self.warnings = (*self.warnings, text)
+        finally:
+            os.close(handle)
+
+    @contextlib.contextmanager
+    def _explained(self, what: str) -> Generator[None]:
+        try:
+            yield
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise NoSpaceError(f"cannot {what}: the disk is full; make room there and push again") from None
+            if isinstance(error, PermissionError) or error.errno == errno.EROFS:
+                text = f"cannot {what}: {error.strerror}; ask its owner for permission, or choose another place"
+                raise AuthError(text) from None
+            if error.errno in (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EINTR):
+                raise TransientError(f"cannot {what}: {error.strerror}") from None
+            raise RemoteError(f"cannot {what}: {error.strerror or error}; check that folder") from None
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    try:
+        hash_file(path, digest)
+    except FileNotFoundError:
+        return ""
+    return digest.hexdigest()

@@ -1,0 +1,234 @@
+"""A remote to a folder: fetched beside it, verified, and then renamed in one step.
+
+What has come is kept in the hidden folder `.<name>.pulling` between tries, so that the next one goes on from there.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from manip_il.data import atomic
+from manip_il.errors import FolderExistsError, UsageError
+from manip_il.store.disk import sync_disk
+from manip_il.store.errors import NoSpaceError, NotFoundError
+from manip_il.store.front import without_front
+from manip_il.store.landing import Landing, is_whole
+from manip_il.store.manifest import FileEntry, Manifest
+from manip_il.store.object_store import in_threads
+from manip_il.store.push import Progress
+from manip_il.store.remote import Advance, Remote, Snapshot
+from manip_il.store.retry import Retry
+from manip_il.store.scan import CHECKPOINTS, HASHERS, JOURNALS, LAST, newest
+from manip_il.store.url import RemoteUrl
+
+RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """What a pull did, or would do. kept: bytes that an earlier try had brought."""
+
+    manifest: Manifest
+    kept: int = 0
+
+
+def pull(
+    url: RemoteUrl,
+    remote: Remote,
+    target: Path,
+    progress: Progress,
+    *,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    retry: Retry | None = None,
+) -> Pulled:
+    """Have `target` hold what readers of the remote see now, whole, or leave it as it is.
+
+    overwrite: what is there is replaced, in one step. Raises `FolderExistsError` where something is there otherwise,
+    `NotFoundError` where the remote holds nothing, and the errors of `manip_il.store.errors`.
+    """
+    target = target.absolute()
+    snapshot = _read(url, remote)
+    _check_target(target, snapshot.manifest, overwrite)
+    staging = target.with_name(f".{target.name}.pulling")
+    if dry_run:
+        return Pulled(snapshot.manifest)
+    with atomic.exclusive(staging):
+        for _ in range(RESTARTS):
+            stage = _Stage(remote, snapshot, staging, retry or Retry())
+            try:
+                kept = stage.fill(progress)
+                break
+            except NotFoundError:
+                now = _read(url, remote)
+                if now.token == snapshot.token:
+                    raise
+                snapshot = now  # pushed to twice meanwhile: what of it is the same stays
+        else:
+            raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
+        _land(stage.tree, target, snapshot.manifest, overwrite)
+        shutil.rmtree(staging, ignore_errors=True)
+    return Pulled(snapshot.manifest, kept)
+
+
+@dataclass
+class _Stage:
+    """The folder beside the target. parts: by hash, unfinished. tree: verified, as it will be."""
+
+    remote: Remote
+    snapshot: Snapshot
+    folder: Path
+    retry: Retry
+    tree: Path = field(init=False)
+    parts: Path = field(init=False)
+    _folders: set[Path] = field(default_factory=set[Path])
+
+    def __post_init__(self) -> None:
+        self.tree, self.parts = self.folder / "tree", self.folder / "parts"
+
+    def fill(self, progress: Progress) -> int:
+        """Bring and verify every file; return how many bytes were there already."""
+        manifest = self.snapshot.manifest
+        if self.folder.is_symlink():
+            self.folder.unlink()
+        for folder in (self.tree, self.parts):
+            folder.mkdir(parents=True, exist_ok=True)
+        missing = self._missing()
+        self._clear_parts(set(missing))
+        wanted = sum(entries[0].size * len(entries) for entries in missing.values())
+        had = sum(path.stat().st_size for path in self.parts.iterdir())
+        _check_space(self.folder, wanted - had)
+        whole = manifest.size - wanted
+        with progress(manifest.size, "pull") as advance:
+            advance(whole)
+            # The largest first, else the last one runs alone.
+            order = sorted(missing, key=lambda key: -missing[key][0].size)
+            in_threads(self.remote.threads, lambda key: self._bring(missing[key], advance), order)
+        sync_disk(self.folder)
+        return whole + had
+
+    def _missing(self) -> dict[str, list[FileEntry]]:
+        """Entries by hash that the tree has not; what else it holds is removed."""
+        by_path = self.snapshot.manifest.by_path
+        there = {path.relative_to(self.tree).as_posix(): path for path in _leaves(self.tree)}
+        known = [path for path in there if path in by_path]
+        whole = in_threads(HASHERS, lambda path: is_whole(by_path[path], there[path]), known)
+        for path, place in there.items():
+            if not whole.get(path):
+                place.unlink()
+        for folder in sorted((path for path in self.tree.rglob("*") if path.is_dir()), reverse=True):
+            if not any(folder.iterdir()):  # else a file of the new version may want the name
+                folder.rmdir()
+        missing: dict[str, list[FileEntry]] = defaultdict(list)
+        for entry in self.snapshot.manifest.files:
+            if not whole.get(entry.path):
+                missing[entry.key].append(entry)
+        return missing
+
+    def _clear_parts(self, wanted: set[str]) -> None:
+        for path in self.parts.iterdir():
+            if path.name not in wanted or path.is_symlink():
+                path.unlink()
+
+    def _bring(self, entries: list[FileEntry], advance: Advance) -> None:
+        """One file's bytes, to all places that have them."""
+        first, *others = entries
+        part = self.parts / first.key
+        landing = Landing(first, part, advance)
+        self.retry(lambda: landing.once(lambda file, offset: self.remote.fetch(self.snapshot, first, file, offset)))
+        for entry in others:
+            shutil.copyfile(part, self._place(entry))
+            advance(entry.size)
+        part.replace(self._place(first))
+
+    def _place(self, entry: FileEntry) -> Path:
+        path = self.tree / entry.path
+        if path.parent not in self._folders:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._folders.add(path.parent)
+        return path
+
+
+def _read(url: RemoteUrl, remote: Remote) -> Snapshot:
+    snapshot = remote.read()
+    if snapshot is None:
+        text = f"{remote.describe()} holds nothing that can be pulled"
+        raise NotFoundError(f"{text}: check the name, or push there first")
+    if url.kind not in (None, snapshot.manifest.kind):
+        raise UsageError(f"{remote.describe()} holds a {snapshot.manifest.kind}, not a {url.kind}; check the name")
+    return replace(snapshot, manifest=without_front(snapshot.manifest)) if url.scheme == "hf" else snapshot
+
+
+def _check_target(target: Path, manifest: Manifest, overwrite: bool) -> None:
+    if not target.name:
+        raise UsageError(f"{target} cannot be pulled to; name a new folder")
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise UsageError(f"{target} is not a folder; name a new one to pull to")
+    if target.exists() and any(target.iterdir()) and not overwrite:
+        raise FolderExistsError(target)
+    beside = _journals(target)
+    if _has_journals(manifest) and beside.exists() and not overwrite and not _holds(beside, manifest):
+        raise FolderExistsError(beside)
+    target.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _check_space(folder: Path, size: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        text = f"{folder.parent} has {free:,} bytes left, {size:,} are to be pulled"
+        raise NoSpaceError(f"{text}; make room there, or pull to another disk: what has been transferred is kept")
+
+
+def _land(tree: Path, target: Path, manifest: Manifest, overwrite: bool) -> None:
+    """Give the finished folder its name; a dataset's journals first, as the dataset's name says that all is there."""
+    for checkpoints in [path for path in tree.rglob(CHECKPOINTS) if path.is_dir()]:
+        name = newest(checkpoints)
+        if name and not (checkpoints / LAST).exists():
+            (checkpoints / LAST).symlink_to(name)
+    if _has_journals(manifest):
+        beside = _journals(target)
+        if _holds(beside, manifest):  # of a try that was killed right here
+            shutil.rmtree(tree / JOURNALS)
+        else:
+            _rename(tree / JOURNALS, beside, overwrite)
+    _rename(tree, target, overwrite)
+    atomic.sync(target.parent)
+
+
+def _rename(folder: Path, target: Path, overwrite: bool) -> None:
+    if overwrite and target.is_dir():
+        atomic._exchange(folder, target)  # pyright: ignore[reportPrivateUsage]
+    else:
+        atomic._rename(folder, target)  # pyright: ignore[reportPrivateUsage]
+
+
+def _journals(target: Path) -> Path:
+    return target.with_name(f"{target.name}.{JOURNALS}")
+
+
+def _has_journals(manifest: Manifest) -> bool:
+    return manifest.kind == "dataset" and any(entry.path.startswith(f"{JOURNALS}/") for entry in manifest.files)
+
+
+def _holds(beside: Path, manifest: Manifest) -> bool:
+    """Whether a folder holds exactly the manifest's journals."""
+    if not beside.is_dir():
+        return False
+    wanted = {path: entry for path, entry in manifest.by_path.items() if path.startswith(f"{JOURNALS}/")}
+    found = {f"{JOURNALS}/{path.relative_to(beside).as_posix()}" for path in _leaves(beside)}
+    return found == wanted.keys() and all(
+        is_whole(entry, beside / path.removeprefix(f"{JOURNALS}/")) for path, entry in wanted.items()
+    )
+
+
+def _leaves(folder: Path) -> list[Path]:
+    """Everything below that is not a folder; links are not followed."""
+    return [Path(base) / name for base, folders, names in os.walk(folder) for name in _names(base, folders, names)]
+
+
+def _names(base: str, folders: list[str], names: list[str]) -> list[str]:
+    return names + [name for name in folders if os.path.islink(os.path.join(base, name))]

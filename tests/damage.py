@@ -1,0 +1,75 @@
+"""Ways to damage a dataset, and what the doctor says then."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.doctor.dataset import Dataset
+from manip_il.doctor.examine import examine
+from manip_il.doctor.finding import Finding
+
+DATA = layout.DATA_PATH.format(chunk_index=0, file_index=0)
+EPISODES = layout.EPISODES_PATH.format(chunk_index=0, file_index=0)
+
+
+def findings(root: Path) -> list[Finding]:
+    return list(examine(Dataset(root)))
+
+
+def lines(root: Path) -> list[str]:
+    return [str(finding) for finding in findings(root)]
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def edit_table(path: Path, change: Callable[[dict[str, list[Any]]], None]) -> None:
+    """Change columns, given as lists of rows, under the file's own schema."""
+    table = pq.ParquetFile(path).read()
+    columns = table.to_pydict()
+    change(columns)
+    pq.write_table(pa.table(columns, schema=table.schema), path)
+
+
+def cut(path: Path, keep: float) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * keep)])
+
+
+def damage_at_random(root: Path, rng: np.random.Generator) -> tuple[str, Path]:
+    """Cut, flip, fill or delete one file; which way and which file."""
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    path = files[rng.integers(len(files))]
+    data = bytearray(path.read_bytes())
+    way = ["cut", "flip", "fill", "delete", "swap"][rng.integers(5)]
+    if way == "delete":
+        path.unlink()
+        return way, path
+    if way == "cut":
+        data = data[: rng.integers(len(data))]
+    elif way == "swap":
+        data = bytearray(files[rng.integers(len(files))].read_bytes())
+    else:
+        start = int(rng.integers(len(data)))
+        stop = start + 1 if way == "flip" else start + int(rng.integers(1, 200))
+        for place in range(start, min(stop, len(data))):
+            data[place] ^= int(rng.integers(1, 256))
+    path.write_bytes(data)
+    return way, path
+
+
+def digests(root: Path) -> dict[str, str]:
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -1,0 +1,177 @@
+"""Repair: what journals or the data give comes back; what is replaced is kept; the rest is said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.atomic import exclusive
+from manip_il.data.build import build
+from manip_il.data.fingerprint import environment_fingerprint
+from manip_il.data.journal import write_episode
+from manip_il.doctor import repair as module
+from manip_il.doctor.dataset import Dataset
+from manip_il.doctor.repair import repair
+from manip_il.errors import FolderBusyError, ManipError
+from manip_il.mdp import Episode
+
+from ..damage import DATA, cut, digests, edit_json, edit_table, findings, lines
+
+MakeEpisode = Callable[..., Episode]
+FINGERPRINT = environment_fingerprint(b"", {})
+
+
+@pytest.fixture
+def journals(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    for episode in episodes:
+        write_episode(tmp_path / "lift.journals", episode, spec, FINGERPRINT)
+    return tmp_path / "lift.journals"
+
+
+@pytest.fixture
+def root(journals: Path) -> Path:
+    build(journals, journals.with_name("lift"))
+    return journals.with_name("lift")
+
+
+@pytest.fixture
+def alone(root: Path, journals: Path) -> Path:
+    """The dataset without its journals."""
+    journals.rename(journals.with_name("elsewhere"))
+    return root
+
+
+def mend(root: Path) -> list[str]:
+    return list(repair(Dataset(root), findings(root)))
+
+
+def test_a_damaged_dataset_is_built_again_and_the_old_one_is_kept(root: Path) -> None:
+    whole = digests(root)
+    cut(root / DATA, 0.5)
+    damaged = digests(root)
+    said = mend(root)
+    assert said == [f"built again from lift.journals: 3 episodes; what was there is kept in {root}.before-repair"]
+    assert digests(root) == whole
+    assert digests(root.with_name("lift.before-repair")) == damaged
+    assert lines(root) == []
+
+
+def test_a_second_repair_keeps_a_second_copy(root: Path) -> None:
+    for name in ("lift.before-repair", "lift.before-repair-2"):
+        (root / layout.TASKS).unlink()
+        mend(root)
+        assert root.with_name(name).is_dir()
+    assert lines(root) == []
+
+
+def test_episodes_that_only_the_journals_hold_are_added(
+    root: Path, journals: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
+) -> None:
+    write_episode(journals, make_episode(99), spec, FINGERPRINT)
+    mend(root)
+    assert json.loads((root / layout.INFO).read_text())["total_episodes"] == 4
+    assert lines(root) == []
+
+
+def test_a_damaged_journal_is_left_out_and_named_where_nothing_better_is_left(root: Path, journals: Path) -> None:
+    cut(journals / "episode-000000000006.mcap", 0.5)
+    (root / DATA).write_bytes(b"")
+    said = mend(root)
+    assert said[0].startswith("left out: ")
+    assert "episode-000000000006.mcap" in said[0]
+    assert "2 episodes" in said[1]
+
+
+def test_journals_that_hold_less_than_the_dataset_replace_nothing(root: Path, journals: Path) -> None:
+    cut(journals / "episode-000000000006.mcap", 0.5)
+    (root / layout.TASKS).unlink()
+    before = digests(root)
+    said = mend(root)
+    assert any("lift.journals makes 2 episodes and the dataset's files still hold 3" in line for line in said)
+    assert digests(root) == before
+    assert not root.with_name("lift.before-repair").exists()
+
+
+def test_a_build_that_fails_leaves_everything_as_it_was(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (root / layout.TASKS).unlink()
+    before = digests(root)
+
+    def fails(journals: Path, root: Path) -> None:
+        raise ManipError("disk full")
+
+    monkeypatch.setattr(module, "build", fails)
+    with pytest.raises(ManipError, match="disk full"):
+        mend(root)
+    assert digests(root) == before
+
+
+def test_statistics_are_computed_again(alone: Path) -> None:
+    whole = json.loads((alone / layout.STATS).read_text())
+    edit_json(alone / layout.STATS, lambda stats: stats[s.ACTION].update(mean=[0, 0, 0], q10=[9, 9, 9]))
+    wrong = (alone / layout.STATS).read_bytes()
+    said = mend(alone)
+    assert said[0] == "recomputed from the data: meta/stats.json, 20 columns"
+    assert json.loads((alone / layout.STATS).read_text()) == whole
+    assert (alone.with_name("lift.before-repair") / layout.STATS).read_bytes() == wrong
+    assert lines(alone) == []
+
+
+def test_statistics_come_back_where_there_are_none(alone: Path) -> None:
+    whole = json.loads((alone / layout.STATS).read_text())
+    (alone / layout.STATS).unlink()
+    mend(alone)
+    assert json.loads((alone / layout.STATS).read_text()) == whole
+
+
+def test_statistics_of_a_matrix_are_those_over_its_last_axis(alone: Path) -> None:
+    table = pq.read_table(alone / DATA)
+    grid = np.random.default_rng(0).normal(size=(20, 2, 3))
+    table = table.append_column("grid", pa.array(grid.tolist(), pa.list_(pa.list_(pa.float64()))))
+    pq.write_table(table, alone / DATA)
+    edit_json(
+        alone / layout.INFO,
+        lambda info: info["features"].update(grid={"dtype": "float64", "shape": [2, 3], "names": None}),
+    )
+    (alone / layout.STATS).unlink()
+    mend(alone)
+    stats = json.loads((alone / layout.STATS).read_text())["grid"]
+    np.testing.assert_allclose(stats["mean"], grid.mean(axis=(0, 1)))
+    assert stats["count"] == [20]
+    assert not any(line.startswith("error") for line in lines(alone))
+
+
+def test_leftovers_are_moved_and_not_deleted(alone: Path) -> None:
+    places = ["images/front/episode-000001/frame-000000.png", "data/chunk-000/notes.txt", "../.lift.abc.partial/x"]
+    for place in places:
+        (alone / place).parent.mkdir(parents=True, exist_ok=True)
+        (alone / place).write_bytes(place.encode())
+    mend(alone)
+    kept = alone.with_name("lift.before-repair")
+    for place in places:
+        assert not (alone / place).exists()
+        assert (kept / place.removeprefix("../")).read_bytes() == place.encode()
+    assert lines(alone) == []
+
+
+def test_what_cannot_be_repaired_is_said(alone: Path) -> None:
+    edit_table(alone / DATA, lambda table: table[s.ACTION].__setitem__(4, [float("nan")] * 3))
+    before = digests(alone)
+    reason = "there are no journals in lift.journals to build it from"
+    assert mend(alone) == [f"not repaired, as {reason}: data: action"]
+    assert digests(alone) == before
+
+
+def test_a_dataset_that_is_being_written_is_left_alone(root: Path) -> None:
+    (root / layout.TASKS).unlink()
+    found: list[Any] = findings(root)
+    with exclusive(root), pytest.raises(FolderBusyError):
+        list(repair(Dataset(root), found))

@@ -1,0 +1,114 @@
+"""Messages keep every bit, in the schemas that Foxglove and LeRobot know."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
+from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from manip_il.data import schema as s
+from manip_il.errors import ManipError
+from manip_il.mcap import foxglove, foxglove_episode
+from manip_il.mcap.records import Budget, chunk_records
+from manip_il.mdp import Episode
+
+SPEC = s.RobotTaskSpec("r", "t", 30, ("a", "b"), ("ee.x",), 1, "", cameras=("front", "wrist"), image_size=(2, 3))
+
+
+def written(channels: list[foxglove.Channel], times: list[int]) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    foxglove.add_channels(writer, channels, times)
+    writer.finish()
+    return stream.getvalue()
+
+
+def read(data: bytes) -> list[tuple[str, int, Any]]:
+    return [
+        (
+            channel.topic,
+            message.log_time,
+            (DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads)(message.data),
+        )
+        for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages()
+    ]
+
+
+@given(hnp.arrays(np.float64, (3, 2), elements=st.floats(allow_nan=False, allow_infinity=False)))
+def test_numbers_keep_every_bit(values: np.ndarray) -> None:
+    times = [0, 1, 2**62]
+    places = {"ee": (np.hstack([values, values[:, :1]]), np.hstack([values, values]))}
+    data = written(
+        [
+            foxglove.joint_states("/joints", ["a", "b % c"], values, times),
+            foxglove.scalars("/scalars", ["a", 'b "% c'], values.tolist()),
+            foxglove.frame_transforms("/tf", places, times),
+        ],
+        times,
+    )
+    found = {(topic, time): message for topic, time, message in read(data)}
+    for time, row in zip(times, values, strict=True):
+        joints = found["/joints", time].joints
+        assert np.array([joint.position for joint in joints]).tobytes() == row.tobytes()
+        assert [joint.name for joint in joints] == ["a", "b % c"]
+        scalars = found["/scalars", time]["scalars"]
+        assert np.array([scalar["value"] for scalar in scalars], np.float64).tobytes() == row.tobytes()
+        assert scalars[1]["label"] == 'b "% c'
+        transform = found["/tf", time].transforms[0]
+        rotation = [transform.rotation.w, transform.rotation.x, transform.rotation.y, transform.rotation.z]
+        assert np.array(rotation).tobytes() == np.tile(row, 2).tobytes()
+        assert transform.timestamp.ToNanoseconds() == time
+
+
+def test_whole_numbers_stay_whole() -> None:
+    big = 2**63 - 1
+    (_, _, message), *_ = read(written([foxglove.scalars("/seed", ["seed"], [[big]])], [0]))
+    assert message == {"scalars": [{"label": "seed", "value": big}]}
+
+
+@settings(max_examples=30)
+@given(hnp.arrays(np.uint8, st.tuples(st.integers(1, 4), st.integers(1, 5), st.integers(1, 5), st.just(3))))
+def test_pictures_come_back_bit_for_bit(pictures: np.ndarray) -> None:
+    columns = {s.IMAGES + "front": pictures, s.IMAGES + "wrist": pictures[:, ::-1]}
+    episode = Episode(1, columns, True, True)
+    data = written(list(foxglove_episode.channels(episode, SPEC)), foxglove_episode.frame_times(episode, SPEC))
+    chunks = (one for one in StreamReader(io.BytesIO(data), emit_chunks=True).records if isinstance(one, Chunk))
+    unpacked = (get_chunk_data_stream(chunk)[0].read(2**30) for chunk in chunks)
+    records = (one for data in unpacked for one in chunk_records(data, Budget(0, 2**30, 0)))
+    found = foxglove.read_images(records, ("front", "wrist"), pictures.shape)
+    assert list(found) == ["front", "wrist"]
+    for camera, frames in found.items():
+        assert frames.dtype == np.uint8
+        np.testing.assert_array_equal(frames, columns[s.IMAGES + camera])
+
+
+@pytest.mark.slow
+def test_a_label_may_be_any_text() -> None:
+    labels = ["\0", "%r", "%", '"', "{}"]
+    (message,) = foxglove.scalars("/scalars", labels, [range(5)]).messages
+    assert json.loads(message)["scalars"] == [{"label": label, "value": n} for n, label in enumerate(labels)]
+
+
+def test_the_scalars_schema_is_lerobots() -> None:
+    from lerobot.utils import foxglove_visualization as lerobots
+
+    assert foxglove.SCALARS == lerobots._SCALARS_SCHEMA
+    assert lerobots._foxglove_topic(s.IMAGES + "front", is_image=True) == foxglove.IMAGE_TOPICS + "front"
+
+
+@pytest.mark.parametrize("pictures", [np.zeros((2, 4, 4, 3)), np.zeros((2, 4, 4, 1), np.uint8), np.zeros(2, np.uint8)])
+def test_pictures_of_another_kind_are_refused(pictures: np.ndarray) -> None:
+    with pytest.raises(ManipError, match=r"column 'observation\.images\.front' is .*expected pictures"):
+        list(foxglove_episode.channels(Episode(1, {s.IMAGES + "front": pictures}, True, True), SPEC))

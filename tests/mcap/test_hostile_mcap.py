@@ -1,0 +1,537 @@
+"""What an MCAP file may unpack to is bounded, whatever it declares; nothing is allocated on its word."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.records import Attachment, McapRecord, Metadata
+
+from manip_il.data import journal
+from manip_il.data import schema as s
+from manip_il.doctor.journals import readable_episodes
+from manip_il.errors import ManipError
+from manip_il.mcap import read as mcap_read
+from manip_il.mcap import records as mcap_records
+from manip_il.mcap.foxglove import IMAGE_TOPICS
+from manip_il.mcap.importing import features_of, frames_of, read_import
+from manip_il.mcap.mapping import Mapping, load_mapping
+from manip_il.mcap.records import LARGEST_CHUNK, LARGEST_NOTE
+from manip_il.mdp import Episode
+
+from ..pictures import numbered_episodes, with_cameras
+from . import mcap_forgery as forge
+
+MIB = 1024 * 1024
+BOMB = LARGEST_CHUNK + 32 * MIB
+AtMost = Callable[[int], AbstractContextManager[None]]
+MakeEpisode = Callable[..., Episode]
+
+
+@pytest.fixture
+def at_most() -> AtMost:
+    """Memory that what is read may take [MiB]."""
+
+    @contextmanager
+    def within(limit: int) -> Iterator[None]:
+        tracemalloc.start()
+        try:
+            yield
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < limit * MIB, f"{peak / MIB:.0f} MiB"
+
+    return within
+
+
+@pytest.fixture
+def small() -> s.RobotTaskSpec:
+    return with_cameras(s.RobotTaskSpec("r", "t", 20, ("a",), ("x",), 1, ""), "front")
+
+
+def about(made_for: s.RobotTaskSpec, frames: int = 2, **changes: str) -> Metadata:
+    said = {"format": "2", "seed": "1", "success": "true", "success_at_end": "true", "frames": str(frames)}
+    return forge.note(said | {"spec": json.dumps(made_for.to_json()), "fingerprint": "{}"} | changes)
+
+
+def action(frames: int = 2) -> Attachment:
+    return forge.column(s.ACTION, forge.npy(np.zeros((frames, 1), np.float32)))
+
+
+def forged(tmp_path: Path, *records: McapRecord | bytes, **how: Any) -> Path:
+    return forge.write_mcap(journal.episode_path(tmp_path / "d.journals", 1), *records, **how)
+
+
+def refuse(path: Path, words: str) -> None:
+    with pytest.raises(ManipError) as error:
+        journal.read_journal(path)
+    assert words in str(error.value)
+    assert path.name in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+def picture(spec: s.RobotTaskSpec, height: int | None = None) -> bytes:
+    rows, columns = spec.image_size
+    rows = height or rows
+    return RawImage(height=rows, width=columns, data=bytes(rows * columns * 3)).SerializeToString()
+
+
+def filmed(spec: s.RobotTaskSpec, pictures: list[bytes], camera: str = "front") -> McapRecord:
+    channel = forge.json_channel(IMAGE_TOPICS + camera)
+    return forge.messages_chunk([forge.message(one) for one in pictures], channel)
+
+
+def test_a_forged_journal_that_keeps_to_the_rules_is_read(tmp_path: Path, small: s.RobotTaskSpec) -> None:
+    path = forged(tmp_path, about(small), action(), filmed(small, [picture(small)] * 2))
+    header, episode = journal.read_journal(path)
+    assert header.spec == small
+    assert episode.columns["observation.images.front"].shape == (2, *small.image_size, 3)
+    assert episode.columns[s.ACTION].flags.writeable
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize(
+    ("declares", "in_frame", "words"),
+    [
+        (BOMB, True, "expected at most 134,217,728"),
+        (MIB, True, "a chunk"),  # the two declarations differ
+        (MIB, False, "a chunk"),  # and here it is longer than the one there is
+        (2**63, True, "expected at most"),
+    ],
+)
+def test_a_chunk_unpacks_to_what_it_may_and_declares(
+    tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost, compression: str, declares: int, in_frame: bool, words: str
+) -> None:
+    bomb = forge.chunk(compression, forge.zeros(compression, BOMB, declared=in_frame), declares)
+    path = forged(tmp_path, about(small), action(), bomb)
+    assert path.stat().st_size < 3 * MIB
+    with at_most(20):
+        refuse(path, words)
+
+
+def test_the_size_in_a_frame_is_not_believed(tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost) -> None:
+    """A zstd frame that declares 100 MiB and holds nothing of it."""
+    frame = bytes.fromhex("28b52ffda0") + (100 * MIB).to_bytes(4, "little") + bytes.fromhex("010000")
+    path = forged(tmp_path, about(small), action(), forge.chunk("zstd", frame, MIB))
+    with at_most(20):
+        refuse(path, "declares 1,048,576 bytes, its zstd frame 104,857,600")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_every_compression_is_read(tmp_path: Path, small: s.RobotTaskSpec, compression: str) -> None:
+    messages = [forge.message(picture(small))] * 2
+    packed = forge.messages_chunk(messages, forge.json_channel(IMAGE_TOPICS + "front"), compression=compression)
+    path = forged(tmp_path, about(small), action(), packed)
+    assert len(journal.read_episode(path)) == 2
+
+
+def test_chunks_together_may_unpack_to_so_much(
+    tmp_path: Path, small: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal, "LARGEST_EPISODE", MIB)
+    monkeypatch.setattr(journal, "_LARGEST_RATIO", 1)
+    one = forge.messages_chunk([], forge.schema("x", bytes(MIB // 2)))
+    assert len(journal.read_episode(forged(tmp_path, about(small), action(), *[one] * 3))) == 2
+    refuse(forged(tmp_path, about(small), action(), *[one] * 9), "it unpacks to more than 2,097,152 bytes")
+
+
+@pytest.mark.parametrize(
+    ("descr", "shape", "words"),
+    [
+        ("'<f8'", "(1000000, 1000000)", "declares shape (1000000, 1000000) of float64 and has 64 bytes"),
+        ("'<f8'", "(7,)", "declares shape (7,)"),
+        ("'<f8'", "(-8,)", "declares shape"),
+        ("'<U0'", "(1000000000000,)", "expected numbers"),
+        ("'|O'", "(8,)", "expected numbers"),
+        ("'<f8'", "'x'", "shape"),
+        ("['" + "x" * 100 + "']", "(1,)", "not a complete episode"),
+    ],
+)
+def test_a_column_is_not_allocated_on_its_word(
+    tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost, descr: str, shape: str, words: str
+) -> None:
+    path = forged(tmp_path, about(small), forge.column(s.ACTION, forge.npy_header(descr, shape) + bytes(64)))
+    with at_most(10):
+        refuse(path, words)
+
+
+def test_pictures_are_not_allocated_on_the_headers_word(
+    tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost
+) -> None:
+    frames = s.MOST_FRAMES
+    path = forged(tmp_path, about(small, frames), action(), filmed(small, [picture(small)]))
+    with at_most(10):
+        refuse(path, "it unpacks to more than 671,088,640 bytes")
+
+
+@pytest.mark.parametrize(
+    ("pictures", "camera", "words"),
+    [
+        (1, "front", "it holds 1 pictures of front; expected 2"),
+        (3, "front", "picture 2 of front, 72 x 96, is not one of 2"),
+        (2, "wrist", "it holds pictures of 'wrist'; its header names ('front',)"),
+        (2, "x/../../y", "it holds pictures of 'x/../../y'"),
+        (0, "front", ""),
+    ],
+)
+def test_a_journal_holds_the_pictures_that_its_header_says(
+    tmp_path: Path, small: s.RobotTaskSpec, pictures: int, camera: str, words: str
+) -> None:
+    path = forged(tmp_path, about(small), action(), filmed(small, [picture(small)] * pictures, camera))
+    if words:
+        refuse(path, words)
+    else:
+        assert list(journal.read_episode(path).columns) == [s.ACTION]
+
+
+def test_neither_size_nor_count_of_messages_is_free(
+    tmp_path: Path, small: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse(forged(tmp_path, about(small), action(), filmed(small, [picture(small, 5)] * 2)), "5 x 96, is not one of")
+    empty = forge.messages_chunk([forge.message(b"", channel=9)] * 100)
+    monkeypatch.setattr(mcap_records, "MOST_RECORDS", 99)
+    refuse(forged(tmp_path, about(small), action(), empty), "it holds more than 99 messages")
+
+
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        (forge.framed(0x0C, bytes(LARGEST_NOTE + 1)), "a metadata record has 1,048,577 bytes; expected at most"),
+        (forge.framed(0x09, bytes(10), 2**62), "it ends too early"),
+        (forge.framed(0x09, bytes(16 + 8) + b"\xff" * 20), "whose sizes do not fit its record"),
+        (forge.framed(0x09, bytes(16) + b"\xff" * 20), "can't decode"),
+        (forge.chunk("zip", b"", 0), "compressed by 'zip'; expected zstd, lz4 or none"),
+        (forge.chunk("", forge.filler(100), 109), "a chunk unpacks to 9 bytes or more; it declares 109"),
+        (forge.chunk("", forge.filler(100), 9), "a chunk ends too early"),
+        (forge.chunk("", b"abc", 3), "a chunk ends too early"),
+        (forge.chunk("", forge.framed(5, b"x"), 10), "a message record ends too early"),
+        (forge.chunk("zstd", b"\x28\xb5\x2f\xfdx", 3), "cannot be unpacked"),
+        (forge.chunk("lz4", b"nothing", 3), "cannot be unpacked"),
+    ],
+)
+def test_a_record_keeps_to_its_size(
+    tmp_path: Path, small: s.RobotTaskSpec, record: McapRecord | bytes, words: str
+) -> None:
+    before = filmed(small, [picture(small)] * 2)
+    path = forged(tmp_path, about(small), action(), before, record)
+    refuse(path, words)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"frames": "0"}, "its number of frames is 0"),
+        ({"frames": "3"}, "its header counts 3 frames, its columns 2"),
+        ({"frames": "1" * 5_000}, "its frames is not valid JSON"),
+        ({"seed": "-5"}, "its seed is -5"),
+        ({"seed": '"1"'}, "its seed is '1'"),
+        ({"success": "1"}, "its success is 1; expected true or false"),
+        ({"spec": "[" * 100_000}, "nested too deeply"),
+        ({"fingerprint": "null"}, "its fingerprint is None"),
+        ({"format": "9"}, "its format is '9'"),
+    ],
+)
+def test_a_header_is_checked(tmp_path: Path, small: s.RobotTaskSpec, changes: dict[str, str], words: str) -> None:
+    plain = s.RobotTaskSpec("r", "t", 20, ("a",), ("x",), 1, "")
+    refuse(forged(tmp_path, about(plain, **changes), action()), words)
+
+
+def test_no_more_columns_than_so_many(tmp_path: Path, small: s.RobotTaskSpec) -> None:
+    columns = [forge.column(f"c{number}", forge.npy(np.zeros(2))) for number in range(1_002)]
+    refuse(forged(tmp_path, about(small), *columns), "it holds more than 1000 columns")
+
+
+def test_a_header_is_read_without_unpacking_anything(tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost) -> None:
+    bomb = forge.raw(forge.chunk("zstd", forge.zeros("zstd", BOMB), BOMB))
+    path = forged(tmp_path, about(small), action(), bomb, summary=bomb)
+    with at_most(10):
+        assert journal.read_header(path).spec == small
+        assert journal.check_header(path).spec == small
+
+
+def test_a_resumed_recording_sets_a_bomb_aside(tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost) -> None:
+    path = forged(tmp_path, about(small), action(), forge.chunk("zstd", forge.zeros("zstd", BOMB), BOMB))
+    with at_most(20):
+        wrong = journal.set_aside_damaged(path.parent)
+    assert len(wrong) == 1
+    assert journal.list_episodes(path.parent) == []
+
+
+def test_the_doctor_reads_no_more_than_headers(tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost) -> None:
+    path = forged(tmp_path, about(small), action(), forge.chunk("zstd", forge.zeros("zstd", BOMB), BOMB))
+    with at_most(20):
+        assert readable_episodes(path.parent) == 1
+
+
+@pytest.mark.slow
+def test_thousands_of_frames_of_two_cameras_are_read(tmp_path: Path) -> None:
+    spec = s.RobotTaskSpec("r", "t", 20, ("a",), ("x",), 1, "", cameras=("front", "wrist"), image_size=(128, 128))
+    frames = 2_000
+    level = np.zeros((frames, 128, 128, 3), np.uint8)
+    level[:, :, :64] = np.random.default_rng(0).integers(0, 255, (frames, 1, 64, 3), np.uint8)
+    columns = {s.ACTION: np.zeros((frames, 1), np.float32)} | {s.IMAGES + name: level for name in spec.cameras}
+    path = journal.write_episode(tmp_path, Episode(1, columns, True, True), spec, {})
+    found = journal.read_episode(path)
+    assert (found.columns[s.IMAGES + "wrist"] == level).all()
+
+
+# ---- import
+
+
+@pytest.fixture
+def mapping(tmp_path: Path) -> Mapping:
+    path = tmp_path / "m.yaml"
+    how = {"topic": "/a", "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 1e9}
+    path.write_text(yaml.safe_dump({"fps": 10, "task": "t", "features": {"x": how}}))
+    return load_mapping(path)
+
+
+@pytest.fixture
+def seeing(tmp_path: Path) -> Mapping:
+    path = tmp_path / "s.yaml"
+    how = {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 1.0}
+    path.write_text(yaml.safe_dump({"fps": 10, "task": "t", "features": {"observation.images.a": how}}))
+    return load_mapping(path)
+
+
+def topic(tmp_path: Path, *contents: bytes, compression: str = "zstd", step: int = 100_000_000) -> Path:
+    messages = [forge.message(content, number * step) for number, content in enumerate(contents)]
+    packed = forge.messages_chunk(messages, forge.json_channel(), compression=compression)
+    return forge.write_mcap(tmp_path / "a.mcap", packed)
+
+
+def imported(path: Path, mapping: Mapping) -> list[dict[str, Any]]:
+    done = read_import(path, mapping)
+    return list(frames_of(done, mapping, features_of(mapping, done)))
+
+
+def refuse_import(path: Path, mapping: Mapping, words: str) -> None:
+    with pytest.raises(ManipError) as error:
+        imported(path, mapping)
+    assert words in str(error.value)
+    assert path.name in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_messages_of_every_compression_and_of_none_are_imported(
+    tmp_path: Path, mapping: Mapping, compression: str
+) -> None:
+    assert read_import(topic(tmp_path, b'{"x": 1}', b'{"x": 2}', compression=compression), mapping).frames == 2
+    loose = [forge.message(b'{"x": 1}', stamp) for stamp in (0, 100_000_000)]
+    assert read_import(forge.write_mcap(tmp_path / "b.mcap", forge.json_channel(), *loose), mapping).frames == 2
+    stream = forge.messages_chunk(loose, forge.json_channel())
+    packer = forge.zstandard.ZstdCompressor().compressobj()  # a frame that does not say how long it is
+    data = forge.zstandard.decompress(stream.data)
+    open_ended = forge.chunk("zstd", packer.compress(data) + packer.flush(), len(data))
+    assert read_import(forge.write_mcap(tmp_path / "c.mcap", open_ended), mapping).frames == 2
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("declares", [BOMB, MIB])
+def test_an_import_unpacks_no_bomb(
+    tmp_path: Path, mapping: Mapping, at_most: AtMost, compression: str, declares: int
+) -> None:
+    bomb = forge.chunk(compression, forge.zeros(compression, BOMB, declared=False), declares)
+    with at_most(20):
+        refuse_import(forge.write_mcap(tmp_path / "a.mcap", bomb), mapping, "a chunk")
+
+
+def test_an_import_unpacks_so_much_in_all(tmp_path: Path, mapping: Mapping, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_read, "LARGEST_FILE", MIB)
+    monkeypatch.setattr(mcap_read, "_LARGEST_RATIO", 1)
+    one = forge.messages_chunk([], forge.schema("x", bytes(MIB // 2)))
+    refuse_import(forge.write_mcap(tmp_path / "a.mcap", *[one] * 3), mapping, "it unpacks to more than 1,048,576 bytes")
+
+
+def test_a_message_that_would_grow_is_refused_before_it_is_decoded(
+    tmp_path: Path, mapping: Mapping, at_most: AtMost
+) -> None:
+    """A list of empty lists takes twenty times its text."""
+    path = topic(tmp_path, b'{"x": [' + b"[]," * 3_000_000 + b"[]]}")
+    assert path.stat().st_size < MIB
+    with at_most(60):
+        refuse_import(path, mapping, "a message of 9,000,011 bytes; expected at most 8,388,608")
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [
+        ("LARGEST_DECODED", "it unpacks to more than 2 bytes"),
+        ("LARGEST_ROWS", "its values take more than 0 MiB"),
+    ],
+)
+def test_messages_and_values_have_limits(
+    tmp_path: Path, mapping: Mapping, monkeypatch: pytest.MonkeyPatch, limit: str, words: str
+) -> None:
+    monkeypatch.setattr(mcap_read, limit, 2)
+    refuse_import(topic(tmp_path, *[b'{"x": 1}'] * 3), mapping, words)
+
+
+@pytest.mark.parametrize("content", [b'{"x": {"y": 1}}', b'{"x": [[1], [2]]}', b'{"x": null}', b'{"x": [{}]}'])
+def test_a_value_is_a_number_or_text(tmp_path: Path, mapping: Mapping, content: bytes) -> None:
+    refuse_import(topic(tmp_path, content, content), mapping, "/a")
+
+
+def test_stamps_that_span_centuries_make_no_frames(tmp_path: Path, mapping: Mapping, at_most: AtMost) -> None:
+    path = topic(tmp_path, b'{"x": 1}', b'{"x": 2}', step=2**62)
+    with at_most(10):
+        refuse_import(path, mapping, "more than 1,000,000 frames; expected one episode a file")
+
+
+def test_schemas_and_channels_have_a_limit_together(tmp_path: Path, mapping: Mapping, at_most: AtMost) -> None:
+    notes = [forge.schema("x", bytes(MIB - 100), number) for number in range(1, 60)]
+    path = forge.write_mcap(tmp_path / "a.mcap", *[forge.messages_chunk([], note) for note in notes])
+    with at_most(40):
+        refuse_import(path, mapping, "its schemas and channels together")
+    same = [forge.schema("x", bytes(MIB - 100), 1)] * 60  # a writer may repeat one
+    message = forge.messages_chunk([forge.message(b'{"x": 1}')], forge.json_channel())
+    path = forge.write_mcap(tmp_path / "b.mcap", *[forge.messages_chunk([], note) for note in same], message)
+    assert read_import(path, mapping).frames == 1
+
+
+def test_messages_of_nobody_are_refused(tmp_path: Path, mapping: Mapping) -> None:
+    path = forge.write_mcap(tmp_path / "a.mcap", forge.message(b"{}", channel=7))
+    refuse_import(path, mapping, "a message of channel 7, which it does not define")
+    path = forge.write_mcap(tmp_path / "b.mcap", forge.json_channel(schema=5), forge.message(b"{}"))
+    refuse_import(path, mapping, "has schema 5, which it does not define")
+
+
+def test_an_attachment_is_never_held(tmp_path: Path, mapping: Mapping, at_most: AtMost) -> None:
+    large = forge.column("x", bytes(50 * MIB))
+    channel = forge.messages_chunk([forge.message(b'{"x": 1}')], forge.json_channel())
+    path = forge.write_mcap(tmp_path / "a.mcap", large, channel)
+    del large
+    with at_most(10):
+        assert read_import(path, mapping).frames == 1
+
+
+def image_file(tmp_path: Path, name: str, descriptor: bytes, *contents: bytes) -> Path:
+    channel = forge.Channel(id=1, topic="/a", message_encoding="protobuf", metadata={}, schema_id=1)
+    messages = [forge.message(content, number * 100_000_000) for number, content in enumerate(contents)]
+    return forge.write_mcap(
+        tmp_path / "a.mcap", forge.messages_chunk(messages, forge.schema(name, descriptor), channel)
+    )
+
+
+def test_a_picture_is_decoded_by_our_schema_and_not_by_the_files(tmp_path: Path, seeing: Mapping) -> None:
+    message = RawImage(height=1, width=2, encoding="rgb8", step=6, data=bytes(6)).SerializeToString()
+    path = image_file(tmp_path, "foxglove.RawImage", b"no descriptor", message, message)
+    assert imported(path, seeing)[0]["observation.images.a"].shape == (1, 2, 3)
+
+
+def test_pictures_count_as_what_they_are_decoded_to(
+    tmp_path: Path, seeing: Mapping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    message = RawImage(height=500, width=1000, encoding="rgb8", step=3000, data=bytes(1_500_000)).SerializeToString()
+    path = image_file(tmp_path, "foxglove.RawImage", b"", message, message)
+    monkeypatch.setattr(mcap_read, "_LARGEST_RATIO", 1)
+    monkeypatch.setattr(mcap_read, "LARGEST_FILE", 3_100_000)
+    assert len(imported(path, seeing)) == 2
+    monkeypatch.setattr(mcap_read, "LARGEST_FILE", 1_400_000)
+    refuse_import(path, seeing, "it unpacks to more than 1,400,000 bytes")
+
+
+_MEASURED = """
+import sys
+from pathlib import Path
+from manip_il.cli.main import main
+code = main(sys.argv[1:])
+status = Path("/proc/self/status").read_text()  # the most that this process held, not the one that started it
+print(code, int(status.partition("VmHWM:")[2].split()[0]) // 1024, file=sys.stderr)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["build", "doctor", "import"])
+def test_a_bomb_takes_less_than_a_gigabyte(
+    tmp_path: Path, small: s.RobotTaskSpec, mapping: Mapping, command: str
+) -> None:
+    """Nine gigabytes in a file of less than half a megabyte."""
+    size = LARGEST_CHUNK // MIB * MIB
+    one = forge.zstandard.compress(forge.filler(size))
+    bomb = [forge.chunk("zstd", one, size)] * 72
+    journals, dataset = tmp_path / "d.journals", tmp_path / "d"
+    if command == "import":
+        path = forge.write_mcap(tmp_path / "a.mcap", *bomb)
+        words = ["mcap", "import", str(path), str(dataset), f"--mapping={tmp_path / 'm.yaml'}"]
+    else:
+        path = forged(tmp_path, about(small), action(), *bomb)
+        words = [command, *([str(journals)] if command == "build" else []), str(dataset)]
+        if command == "doctor":
+            dataset.mkdir()
+            words.append("--repair=true")
+    assert path.stat().st_size < 2 * MIB
+    done = subprocess.run([sys.executable, "-c", _MEASURED, *words], capture_output=True, text=True, check=True)
+    *said, last = done.stderr.strip().splitlines()
+    code, peak = map(int, last.split())
+    assert code == 1
+    assert sum(line.startswith("manip-il: error: ") for line in said) == 1, done.stderr
+    assert len(said) <= 2  # and how far it had come
+    assert peak < 1024, f"{peak} MiB"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("LARGEST_EPISODE", 1_000, r"it unpacks to more than [\d,]+ bytes"),
+        ("_MOST_COLUMNS", 3, "it holds more than 3 columns"),
+        ("MOST_FRAMES", 8, "its number of frames is 9; expected a whole number from 1 to 8"),
+    ],
+)
+def test_what_could_not_be_read_is_not_written(
+    tmp_path: Path,
+    make_episode: MakeEpisode,
+    spec: s.RobotTaskSpec,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    value: int,
+    words: str,
+) -> None:
+    monkeypatch.setattr(journal, "_LARGEST_RATIO", 0)
+    journal.write_episode(tmp_path / "within", make_episode(7), spec, {})
+    monkeypatch.setattr(journal, name, value)
+    with pytest.raises(
+        ManipError, match=f"^the journal of the episode with seed 7 could not be read: {words}; record "
+    ):
+        journal.write_episode(tmp_path / "beyond", make_episode(7), spec, {})
+    assert not (tmp_path / "beyond").exists()
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "words"),
+    [
+        ("LARGEST_CHUNK", 100, "a chunk, unpacked, has [0-9,]+ bytes; expected at most 100"),
+        ("MOST_RECORDS", 5, "it holds more than 5 messages"),
+    ],
+)
+def test_pictures_that_could_not_be_read_are_not_written(
+    make_episode: MakeEpisode,
+    spec: s.RobotTaskSpec,
+    monkeypatch: pytest.MonkeyPatch,
+    limit: str,
+    value: int,
+    words: str,
+) -> None:
+    filmed = with_cameras(spec, "front")
+    episode = numbered_episodes(make_episode, filmed)[0]
+    journal.encode_episode(episode, filmed, {})
+    monkeypatch.setattr(mcap_records, limit, value)
+    with pytest.raises(ManipError, match=words):
+        journal.encode_episode(episode, filmed, {})
+
+
+def test_a_fingerprint_that_could_not_be_read_is_not_written(make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> None:
+    with pytest.raises(ManipError, match=r"a metadata record has [\d,]+ bytes; expected at most 1,048,576"):
+        journal.encode_episode(make_episode(7), spec, {"text": "x" * 2**20})

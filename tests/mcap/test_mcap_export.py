@@ -1,0 +1,267 @@
+"""Out to MCAP and in again: equal numbers, equal pictures, whoever wrote the dataset."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.lerobot_io import dataset_info, read_table, write_dataset
+from manip_il.errors import ManipError, NotFiniteError
+from manip_il.mcap.export import MAPPING, export_dataset, open_source
+from manip_il.mcap.importing import features_of, frames_of, import_files, list_files, read_import
+from manip_il.mcap.mapping import INDEX_COLUMNS, load_mapping
+from manip_il.mdp import Episode
+
+# As another program's dataset may have them.
+FEATURES: dict[str, dict[str, Any]] = {
+    "observation.state": {"dtype": "float32", "shape": (3,), "names": {"motors": ["a", "b", "c"]}},
+    "action": {"dtype": "float32", "shape": (2,), "names": ["x", "y"]},
+    "count": {"dtype": "int64", "shape": (1,), "names": None},
+    "bytes": {"dtype": "uint8", "shape": (2,), "names": ["same", "same"]},
+    "byte": {"dtype": "uint8", "shape": (1,), "names": ["same", "same"]},
+    "flag": {"dtype": "bool", "shape": (1,), "names": None},
+    "fine": {"dtype": "float64", "shape": (4,), "names": None},
+    "note": {"dtype": "string", "shape": (1,), "names": None},
+    "matrix": {"dtype": "float32", "shape": (2, 3), "names": None},
+    "observation.images.top": {"dtype": "image", "shape": (8, 12, 3), "names": ["height", "width", "channels"]},
+    "observation.images.side": {"dtype": "video", "shape": (64, 64, 3), "names": ["height", "width", "channels"]},
+}
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    root = tmp_path_factory.mktemp("ours") / "d"
+    write_dataset(episodes, root, spec, repo_id="local/d", fingerprint={})
+    return root
+
+
+@pytest.fixture(scope="module")
+def lerobots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Several tasks within an episode, odd features, both kinds of camera, no robot."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root = tmp_path_factory.mktemp("lerobots") / "d"
+    dataset = LeRobotDataset.create("local/d", 30, FEATURES, root=root, robot_type=None)
+    rng = np.random.default_rng(0)
+    for length in (4, 5):
+        for frame in range(length):
+            dataset.add_frame(lerobot_frame(rng, frame))
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def lerobot_frame(rng: np.random.Generator, frame: int) -> dict[str, Any]:
+    return {
+        "observation.state": rng.normal(size=3).astype(np.float32),
+        "action": (rng.normal(size=2) * 1e-30).astype(np.float32),
+        "count": np.array([2**63 - 1 - frame]),
+        "bytes": rng.integers(0, 256, 2, np.uint8),
+        "byte": rng.integers(0, 256, 1, np.uint8),
+        "flag": np.array([frame % 2 == 0]),
+        "fine": rng.normal(size=4),
+        "note": f"é\n{frame}",
+        "matrix": rng.normal(size=(2, 3)).astype(np.float32),
+        "observation.images.top": rng.integers(0, 256, (8, 12, 3), np.uint8),
+        "observation.images.side": np.full((64, 64, 3), 30 * frame, np.uint8),
+        "task": "wipe" if frame < 2 else "fold, 100 %",
+    }
+
+
+def export(root: Path, folder: Path) -> list[Path]:
+    folder.mkdir()
+    return list(export_dataset(open_source(root), folder))
+
+
+def topics(path: Path) -> dict[str, list[Any]]:
+    reader = make_reader(io.BytesIO(path.read_bytes()), validate_crcs=True)
+    found: dict[str, list[Any]] = {}
+    for schema, channel, message in reader.iter_messages():
+        decoder = DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads
+        found.setdefault(channel.topic, []).append(decoder(message.data))
+    return found
+
+
+def test_an_export_read_by_mcap_holds_the_datasets_values(ours: Path, tmp_path: Path) -> None:
+    paths = export(ours, tmp_path / "out")
+    assert [path.name for path in paths] == [f"episode_{number:06d}.mcap" for number in range(3)]
+    table = read_table(ours)
+    start = 0
+    for path in paths:
+        found = topics(path)
+        stop = start + len(found["/task"])
+        states = [[joint.position for joint in message.joints] for message in found["/observation/state"]]
+        assert states == table[s.STATE][start:stop].tolist()
+        assert [joint.name for joint in found["/action"][0].joints] == ["shoulder", "elbow", "gripper"]
+        for key, topic in ((s.SIM_STATE, "/sim_state"), (s.SEED, "/seed"), (s.REWARD, "/next/reward")):
+            values = [[scalar["value"] for scalar in message["scalars"]] for message in found[topic]]
+            assert values == table[key][start:stop].reshape(stop - start, -1).tolist()
+        labels = [scalar["label"] for scalar in found["/sim_state"][0]["scalars"]]
+        assert labels == [f"sim_state_{number}" for number in range(7)]  # as LeRobot labels them
+        start = stop
+    assert start == len(table[s.SEED])
+
+
+def test_an_exports_metadata_says_what_the_dataset_was(ours: Path, tmp_path: Path) -> None:
+    path = export(ours, tmp_path / "out")[2]
+    with path.open("rb") as stream:
+        (record,) = make_reader(stream).iter_metadata()
+    info = json.loads((ours / layout.INFO).read_text())
+    kept = {key: feature for key, feature in info["features"].items() if key not in INDEX_COLUMNS}
+    assert (record.name, json.loads(record.metadata.pop("features"))) == ("lerobot", kept)
+    assert record.metadata == {
+        "codebase_version": "v3.0",
+        "fps": "20",
+        "robot_type": "panda",
+        "episode_index": "2",
+        "frames": "12",
+        "tasks": '["Lift the cube, 100 %."]',
+    }
+
+
+def test_the_same_dataset_gives_the_same_bytes(ours: Path, tmp_path: Path) -> None:
+    first, second = export(ours, tmp_path / "a"), export(ours, tmp_path / "b")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_an_export_reads_back_equal(ours: Path, tmp_path: Path) -> None:
+    paths = export(ours, tmp_path / "out")
+    mapping = load_mapping(tmp_path / "out" / MAPPING)
+    table = read_table(ours)
+    read = [read_import(path, mapping) for path in paths]
+    for key in mapping.features:
+        values = np.concatenate([np.asarray(episode.columns[key]) for episode in read])
+        assert values.dtype == table[key].dtype
+        assert values.reshape(table[key].shape).tobytes() == table[key].tobytes()
+
+
+def test_a_number_that_is_not_finite_is_refused_by_name(
+    make_episode: Callable[..., Episode], spec: s.RobotTaskSpec, tmp_path: Path
+) -> None:
+    root = tmp_path / "d"
+    write_dataset([make_episode(1, 4)], root, spec, repo_id="local/d", fingerprint={})
+    (path,) = root.glob(layout.DATA_FILES)
+    table = pq.read_table(path)
+    place = table.column_names.index(s.REWARD)
+    broken = pa.array([0.0, 1.0, np.nan, 1.0], pa.float32())
+    pq.write_table(table.set_column(place, table.schema.field(s.REWARD), broken), path)
+    with pytest.raises(NotFiniteError, match=r"column 'next\.reward': nan at index 2"):
+        export(root, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"dtype": "language"}, "is language, which is not exported"),
+        ({"dtype": "image", "info": {"is_depth_map": True}}, "depth"),
+    ],
+)
+def test_a_column_without_a_place_in_mcap_is_refused(
+    ours: Path, tmp_path: Path, change: dict[str, Any], why: str
+) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data").symlink_to(ours / "data")
+    info = json.loads((ours / layout.INFO).read_text())
+    info["features"]["odd"] = {"shape": [4, 4, 1], "names": None, **change}
+    for path in (ours / "meta").iterdir():
+        (tmp_path / "meta" / path.name).symlink_to(path)
+    (tmp_path / layout.INFO).unlink()
+    (tmp_path / layout.INFO).write_text(json.dumps(info))
+    with pytest.raises(ManipError, match=f"column 'odd' .*{why}"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize("numbers", [[[0]], ["0"], [None], [{"a": 1}]])
+def test_tasks_without_numbers_are_refused(ours: Path, tmp_path: Path, numbers: list[Any]) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "data").symlink_to(ours / "data")
+    (tmp_path / layout.INFO).symlink_to(ours / layout.INFO)
+    pq.write_table(pa.table({layout.TASK_INDEX: numbers, "task": ["Lift."]}), tmp_path / layout.TASKS)
+    with pytest.raises(
+        ManipError, match=r"tasks\.parquet: column 'task_index' holds values that are not whole numbers"
+    ):
+        list(export_dataset(open_source(tmp_path), tmp_path))
+
+
+def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ManipError, match="is not a LeRobot dataset"):
+        open_source(tmp_path)
+
+
+@pytest.mark.slow
+def test_ours_comes_back_as_an_equal_dataset(ours: Path, tmp_path: Path) -> None:
+    export(ours, tmp_path / "out")
+    mapping = load_mapping(tmp_path / "out" / MAPPING)
+    done = list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))
+    assert [episode.frames for episode in done] == [7, 1, 12]
+    assert all(episode.used == episode.counts for episode in done)
+    left, right = read_table(ours), read_table(tmp_path / "new")
+    assert list(left) == list(right)
+    for key, values in left.items():
+        assert (right[key].dtype, right[key].tobytes()) == (values.dtype, values.tobytes()), key
+    assert dataset_info(tmp_path / "new").instruction == "Lift the cube, 100 %."
+    features = [json.loads((root / layout.INFO).read_text())["features"] for root in (ours, tmp_path / "new")]
+    assert features[0] == features[1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "out"]
+
+
+@pytest.mark.slow
+def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(lerobots: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    export(lerobots, tmp_path / "out")
+    mapping = load_mapping(tmp_path / "out" / MAPPING)
+    assert len(list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))) == 2
+    left, right = (LeRobotDataset("local/d", root=root) for root in (lerobots, tmp_path / "new"))
+    assert (len(right), right.num_episodes, right.fps, right.meta.robot_type) == (9, 2, 30, None)
+    assert {*left.features} == {*right.features}
+    for mine, theirs in zip(right, left, strict=True):
+        for key in (*FEATURES, "task", *INDEX_COLUMNS[:-1]):
+            assert np.array_equal(np.asarray(mine[key]), np.asarray(theirs[key])), key
+
+
+@pytest.mark.slow
+def test_a_camera_may_become_a_video(lerobots: Path, tmp_path: Path) -> None:
+    export(lerobots, tmp_path / "out")
+    text = (tmp_path / "out" / MAPPING).read_text()
+    path = tmp_path / "m.yaml"
+    path.write_text(text.replace("side\n    video: false", "side\n    video: true"))
+    mapping = load_mapping(path)
+    assert mapping.cameras["observation.images.side"].video
+    assert len(list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))) == 2
+    assert len(list((tmp_path / "new").rglob("*.mp4"))) == 1
+    assert not (tmp_path / "new" / "images").exists()
+
+
+@pytest.mark.slow
+def test_an_import_that_fails_leaves_nothing(ours: Path, tmp_path: Path) -> None:
+    paths = export(ours, tmp_path / "out")
+    paths[2].write_bytes(paths[2].read_bytes()[:1000])
+    mapping = load_mapping(tmp_path / "out" / MAPPING)
+    with pytest.raises(ManipError, match=r"cannot read .*episode_000002\.mcap"):
+        list(import_files(paths, tmp_path / "new", mapping))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+
+
+@pytest.mark.slow
+def test_pictures_are_exported_pixel_for_pixel(lerobots: Path, tmp_path: Path) -> None:
+    path = export(lerobots, tmp_path / "out")[1]
+    mapping = load_mapping(tmp_path / "out" / MAPPING)
+    episode = read_import(path, mapping)
+    rng = np.random.default_rng(0)
+    wanted = [lerobot_frame(rng, frame) for frame in (*range(4), *range(5))][4:]
+    for mine, theirs in zip(frames_of(episode, mapping, features_of(mapping, episode)), wanted, strict=True):
+        np.testing.assert_array_equal(mine["observation.images.top"], theirs["observation.images.top"])
+        assert abs(int(mine["observation.images.side"].mean()) - int(theirs["observation.images.side"].mean())) <= 3

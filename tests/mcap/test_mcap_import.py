@@ -1,0 +1,267 @@
+"""MCAP to episodes: every value from a message that the mapping allows, or an error that says where and when."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import Writer
+from mcap_protobuf.schema import register_schema
+from PIL import Image
+
+from manip_il.data.journal import write_episode
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mcap.importing import Import, features_of, frames_of, list_files, read_import
+from manip_il.mcap.mapping import Mapping, load_mapping
+from manip_il.mdp import Episode
+
+MS = 1_000_000
+JSON = "json"
+Messages = Iterable[tuple[int, Any]]  # stamp [ms], content
+
+
+def write(path: Path, topics: dict[str, Messages], encoding: str = JSON) -> Path:
+    """Topics of JSON or protobuf messages, in the order of their stamps."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, messages in topics.items():
+            channel = None
+            for stamp, content in messages:
+                is_json = isinstance(content, dict)
+                if channel is None:
+                    schema = 0 if is_json else register_schema(writer, type(content))
+                    channel = writer.register_channel(topic, encoding if is_json else "protobuf", schema)
+                data = json.dumps(content).encode() if is_json else content.SerializeToString()
+                writer.add_message(channel, stamp * MS, data, stamp * MS)
+        writer.finish()
+    return path
+
+
+def feature(topic: str = "/a", **changes: Any) -> dict[str, Any]:
+    return {"topic": topic, "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 0.02, **changes}
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Callable[..., Mapping]:
+    def mapping(features: dict[str, Any], fps: int = 10, task: Any = "t") -> Mapping:
+        path = tmp_path / "m.yaml"
+        path.write_text(yaml.safe_dump({"fps": fps, "task": task, "features": features}))
+        return load_mapping(path)
+
+    return mapping
+
+
+def frames(path: Path, mapping: Mapping) -> tuple[Import, list[dict[str, Any]]]:
+    episode = read_import(path, mapping)
+    return episode, list(frames_of(episode, mapping, features_of(mapping, episode)))
+
+
+def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:
+    return [(stamp, {"x": float(stamp)}) for stamp in stamps]
+
+
+def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+    fast, slow, whole = range(0, 1001, 10), range(45, 900, 50), range(5, 990, 7)
+    topics = {"/fast": ramp(fast), "/slow": ramp(slow), "/whole": [(s, {"x": s}) for s in whole], "/rest": ramp([0])}
+    path = write(tmp_path / "a.mcap", topics)
+    mapping = load(
+        {
+            "near": feature("/fast"),
+            "between": feature("/slow", resample="interpolate", tolerance=0.05),
+            "held": feature("/whole", resample="hold", dtype="int64"),
+        }
+    )
+    episode, rows = frames(path, mapping)
+    times = list(range(45, 896, 100))  # from the latest first message to the earliest last one
+    assert episode.frames == len(rows) == len(times)
+    assert [row["between"].item() for row in rows] == times
+    assert all(abs(row["near"].item() - time) <= 5 for row, time in zip(rows, times, strict=True))
+    assert [row["held"].item() for row in rows] == [max(s for s in whole if s <= time) for time in times]
+    assert {row["task"] for row in rows} == {"t"}
+    assert episode.counts == {"/fast": 101, "/slow": 18, "/whole": 141, "/rest": 1}
+    assert episode.used == {"/fast": 9, "/slow": 9, "/whole": 9}
+
+
+def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+    big, small = 2**63 - 1, 5e-324
+    contents = [{"i": big - n, "f": [small * n, -0.0], "b": n == 1, "s": f"é\n{n}"} for n in range(3)]
+    path = write(tmp_path / "a.mcap", {"/a": [(n * 100, content) for n, content in enumerate(contents)]})
+    mapping = load(
+        {
+            "i": feature(field="i", dtype="int64"),
+            "f": feature(field=["f[:]", "f[0]"], shape=[3, 1], names=None),
+            "b": feature(field="b", dtype="bool"),
+            "s": feature(field="s", dtype="string"),
+        },
+        task={"topic": "/a", "field": "s", "resample": "hold", "tolerance": 0},
+    )
+    _, rows = frames(path, mapping)
+    for n, row in enumerate(rows):
+        assert (row["i"].item(), row["b"].item(), row["s"], row["task"]) == (big - n, n == 1, f"é\n{n}", f"é\n{n}")
+        assert row["f"].tobytes() == np.array([small * n, -0.0, small * n]).tobytes()
+        assert row["f"].shape == (3, 1)
+
+
+def picture(number: int) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, (4, 6, 3), np.uint8)
+
+
+def raw(number: int, encoding: str = "rgb8") -> RawImage:
+    pixels = picture(number) if encoding == "rgb8" else picture(number)[:, :, ::-1]
+    padded = np.pad(pixels.reshape(4, 18), ((0, 0), (0, 2)))  # rows may be longer than their pixels
+    return RawImage(width=6, height=4, step=20, encoding=encoding, data=padded.tobytes())
+
+
+def png(number: int) -> CompressedImage:
+    stream = io.BytesIO()
+    Image.fromarray(picture(number)).save(stream, "PNG")
+    return CompressedImage(format="png", data=stream.getvalue())
+
+
+def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+    stamps = range(0, 500, 33)
+    topics = {
+        "/a": ramp(range(0, 500, 100)),
+        "/raw": [(stamp, raw(n)) for n, stamp in enumerate(stamps)],
+        "/bgr": [(stamp, raw(n, "bgr8")) for n, stamp in enumerate(stamps)],
+        "/png": [(stamp, png(n)) for n, stamp in enumerate(stamps)],
+    }
+    path = write(tmp_path / "a.mcap", topics)
+    camera = {"resample": "nearest", "tolerance": 0.02, "video": False}
+    mapping = load({"a": feature(), **{name: {**camera, "topic": f"/{name}"} for name in ("raw", "bgr", "png")}})
+    episode, rows = frames(path, mapping)
+    for time, row in zip(range(0, 500, 100), rows, strict=True):
+        wanted = picture(min(range(len(stamps)), key=lambda n: abs(stamps[n] - time)))
+        for name in ("raw", "bgr", "png"):
+            np.testing.assert_array_equal(row[name], wanted)
+    assert features_of(mapping, episode)["raw"] == {
+        "dtype": "image",
+        "shape": (4, 6, 3),
+        "names": ["height", "width", "channels"],
+    }
+
+
+STEADY = range(0, 1000, 100)
+
+
+@pytest.mark.parametrize(
+    ("messages", "changes", "why"),
+    [
+        (
+            ramp([*range(0, 500, 100), *range(700, 1000, 100)]),
+            {},
+            r"topic /a: a gap at 0\.5 s .*0\.1 s before and 0\.2",
+        ),
+        (ramp([0, 200, 100]), {}, r"topic /a: message 2 is stamped 100000000 ns, the one before it 200000000 ns"),
+        (ramp([0, 100, 100]), {}, "expected ascending log times"),
+        ([(0, {"x": "1"})], {}, "message 0 holds '1'; expected a number"),
+        ([(0, {"x": None})], {}, "message 0 holds None; expected a number"),
+        ([(0, {"x": 1}), (100, {"x": float("nan")})], {}, "message 1 holds nan, which is not a valid float64"),
+        ([(0, {"x": 1e39})], {"dtype": "float32"}, r"message 0 holds 1e\+39, which is not a valid float32"),
+        ([(0, {"x": 1.5})], {"dtype": "int64"}, "holds 1.5, which is not a valid int64"),
+        ([(0, {"x": 300})], {"dtype": "uint8"}, "holds 300, which is not a valid uint8"),
+        ([(0, {"x": float("inf")})], {"dtype": "int64"}, "holds inf, which is not a valid int64"),
+        ([(0, {"x": 2})], {"dtype": "bool"}, "holds 2, which is not a valid bool"),
+        ([(0, {"x": 2})], {"dtype": "string"}, r"got \[2\]; expected one string"),
+        ([(0, {"x": [1, 2]})], {"names": ["a"]}, "topic /a at 0 ns: 2 values, f has 1"),
+        ([(0, {"x": [1, 2]}), (100, {"x": [1]})], {}, "message 1 has 1 values, the first one 2"),
+        ([(0, {"x": 1}), (100, {"y": 1})], {}, "topic /a at 100000000 ns: x: no field 'x'"),
+        (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a"),
+        (ramp(STEADY), {"topic": "/late"}, r"/a ends 4\.1 s before /late starts"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_file_topic_and_time(
+    tmp_path: Path, load: Callable[..., Mapping], messages: Messages, changes: dict[str, Any], why: str
+) -> None:
+    late = ramp([5000, 5100]) if changes.get("topic") == "/late" else ramp(STEADY)
+    path = write(tmp_path / "bad.mcap", {"/a": messages, "/late" if len(late) == 2 else "/steady": late})
+    steady = "/a" if len(late) == 2 else "/steady"
+    with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
+        read_import(path, load({"f": feature(**changes), "g": feature(steady)}))
+
+
+def test_an_encoding_that_cannot_be_read_is_refused(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+    path = write(tmp_path / "ros.mcap", {"/a": ramp(STEADY)}, "cdr")
+    with pytest.raises(ManipError, match=r"ros\.mcap, topic /a: its messages are encoded as 'cdr'; expected protobuf"):
+        read_import(path, load({"f": feature()}))
+
+
+@pytest.mark.parametrize("keep", [0, 5, 0.3, 0.9, 0.99])
+def test_a_file_that_is_cut_is_refused(tmp_path: Path, load: Callable[..., Mapping], keep: float) -> None:
+    path = write(tmp_path / "cut.mcap", {"/a": ramp(range(1000))})
+    data = path.read_bytes()
+    path.write_bytes(data[: keep if isinstance(keep, int) else int(len(data) * keep)])
+    with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: .*; expected a complete MCAP file"):
+        read_import(path, load({"f": feature()}))
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (raw(0, "mono8"), "encoded as 'mono8'; expected rgb8 or bgr8"),
+        (
+            RawImage(width=6, height=4, step=18, encoding="rgb8", data=b"12"),
+            "a picture of 4 x 6 with 2 bytes, 18 a row",
+        ),
+        (CompressedImage(format="png", data=b"no"), "a picture that cannot be decoded"),
+        ({"x": 1}, "a message of no schema; pictures are read from foxglove.RawImage"),
+    ],
+)
+def test_what_is_no_picture_is_refused(tmp_path: Path, load: Callable[..., Mapping], message: Any, why: str) -> None:
+    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]})
+    mapping = load({"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
+    with pytest.raises(ManipError, match=rf"p\.mcap, topic /a at 0 ns: .*{why}"):
+        frames(path, mapping)
+
+
+def test_files_that_do_not_fit_each_other_are_refused(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+    mapping = load({"f": feature()})
+    first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
+    second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
+    features = features_of(mapping, read_import(first, mapping))
+    with pytest.raises(MismatchError, match=r"column 'f' differs: .*b\.mcap has 3, the first file has 2 values"):
+        list(frames_of(read_import(second, mapping), mapping, features))
+
+
+def test_our_journals_come_in_by_a_mapping_of_their_topics(
+    tmp_path: Path, make_episode: Callable[..., Episode], spec: RobotTaskSpec, load: Callable[..., Mapping]
+) -> None:
+    episode = make_episode(3, 6)
+    path = write_episode(tmp_path, episode, spec, {})
+    joints = [f"joints[name={name}].position" for name in spec.joint_names]
+    places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
+    mapping = load(
+        {
+            STATE: feature("/joint_states", field=joints, dtype="float32", names=list(spec.joint_names)),
+            ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="hold"),
+            "place": feature("/tf", field=places, resample="interpolate", tolerance=0.1),
+            SUCCESS: feature("/scalars", field="scalars[label=next.success].value", dtype="bool"),
+        },
+        fps=spec.fps,
+    )
+    found = read_import(path, mapping).columns
+    for key in (STATE, ACTION, SUCCESS):
+        np.testing.assert_array_equal(found[key], episode.columns[key])
+    np.testing.assert_array_equal(found["place"], episode.columns[ENVIRONMENT_STATE][:, :3])
+
+
+def test_files_are_taken_in_the_order_of_their_names(tmp_path: Path) -> None:
+    for name in ("b.mcap", "a.mcap", ".c.mcap", "d.txt"):
+        (tmp_path / name).touch()
+    assert [path.name for path in list_files(tmp_path)] == ["a.mcap", "b.mcap"]
+    assert list_files(tmp_path / "b.mcap") == [tmp_path / "b.mcap"]
+    with pytest.raises(ManipError, match="no such file or folder"):
+        list_files(tmp_path / "x")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ManipError, match=r"holds no \*\.mcap files"):
+        list_files(tmp_path / "empty")

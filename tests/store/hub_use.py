@@ -1,0 +1,81 @@
+"""What the tests of the Hub share: a server, somebody who is logged in, a dataset, and folders to compare."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from huggingface_hub import constants
+
+from manip_il.store.pull import Pulled, pull
+from manip_il.store.push import push
+from manip_il.store.remote import Published
+from manip_il.store.retry import Retry
+from manip_il.store.url import RemoteUrl, open_remote
+
+from ..learn.tiny_policies import write_checkpoint
+from .hub_server import Hub, hub_server
+
+TOKEN = "hf_NobodyMayEverReadThisToken"
+DATASET = "hf://datasets/user/demos"
+POLICY = "hf://user/policy"
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+
+
+@contextlib.contextmanager
+def a_hub(folder: Path, token: str = TOKEN) -> Iterator[Hub]:
+    """A Hub that this process talks to, with the token of `user`."""
+    with hub_server(folder) as hub, pytest.MonkeyPatch.context() as patch:
+        hub.add_token(TOKEN, "user")
+        patch.setattr(constants, "ENDPOINT", hub.url)
+        patch.setattr(constants, "HF_HUB_OFFLINE", False)
+        patch.setattr(constants, "HF_TOKEN_PATH", str(folder / "no_token"))
+        patch.setenv("HF_TOKEN", token)
+        yield hub
+
+
+@contextlib.contextmanager
+def silent(total: int, what: str) -> Iterator:
+    yield lambda count: None
+
+
+def do_push(source: Path, url: str = DATASET, *, private: bool = False) -> Published:
+    parsed = RemoteUrl.parse(url)
+    published = push(source, parsed, open_remote(parsed, private=private), silent)[1]
+    assert published is not None
+    return published
+
+
+def do_pull(target: Path, url: str = DATASET) -> Pulled:
+    parsed = RemoteUrl.parse(url)
+    return pull(parsed, open_remote(parsed), target, silent, retry=Retry(first=0.01))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Path -> bytes of every file."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def copy_sample(target: Path) -> Path:
+    """The sample, to be changed."""
+    shutil.copytree(SAMPLE, target)
+    return target
+
+
+def other_version(target: Path) -> Path:
+    """A dataset that differs from the sample in every data file: its first seven episodes."""
+    from manip_il.data.lerobot_io import read_episodes, read_fingerprint, read_spec, write_dataset
+
+    episodes = list(read_episodes(SAMPLE))[:7]
+    write_dataset(episodes, target, read_spec(SAMPLE), repo_id="local/sample", fingerprint=read_fingerprint(SAMPLE))
+    return target
+
+
+def make_policy(target: Path) -> Path:
+    """A small ACT for the sample, as LeRobot writes it."""
+    from manip_il.data.lerobot_io import read_spec
+
+    return write_checkpoint(target, "act", read_spec(SAMPLE))

@@ -1,0 +1,125 @@
+"""A run on a Hub: LeRobot finds its policy at the root, and a pull gives back the run as it was."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from manip_il.store.cards import CARD
+from manip_il.store.front import policy_folder, with_front, without_front
+from manip_il.store.manifest import FileEntry, Manifest
+from manip_il.store.scan import Scanned, scan
+
+from .hub_server import Hub
+from .hub_use import POLICY, contents, do_pull, do_push
+
+RUN = {
+    "config.yaml": b"# manip-il\n",
+    "checkpoints/000200/pretrained_model/config.json": b"old",
+    "checkpoints/001000/pretrained_model/config.json": b"{}",
+    "checkpoints/001000/pretrained_model/model.safetensors": b"weights",
+    "checkpoints/001000/pretrained_model/README.md": b"its own card",
+    "checkpoints/001000/training_state/optimizer_state.safetensors": b"state",
+}
+
+
+def manifest(files: dict[str, bytes]) -> Manifest:
+    entries = (FileEntry(path, len(data), hashlib.sha256(data).hexdigest()) for path, data in files.items())
+    return Manifest("policy", tuple(entries))
+
+
+def fronted(files: dict[str, bytes]) -> Scanned:
+    return with_front(Scanned(manifest(files), {path: Path(path) for path in files}))
+
+
+@pytest.fixture
+def run(tmp_path: Path, tiny_policy: Path) -> Path:
+    """As DAgger leaves it: the best policy, and the same as a round's checkpoint."""
+    folder = tmp_path / "run"
+    for place in ("best", "round_00/policy/checkpoints/000200"):
+        (folder / place / "pretrained_model").mkdir(parents=True)
+        for file in tiny_policy.iterdir():
+            (folder / place / "pretrained_model" / file.name).write_bytes(file.read_bytes())
+    (folder / "round_00" / "policy" / "checkpoints" / "last").symlink_to("000200")
+    (folder / "config.yaml").write_text("# manip-il 0.1.0: resolved options (DaggerOptions)\nseed: 3\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("paths", "folder"),
+    [
+        (["config.json", "best/pretrained_model/config.json"], ""),
+        (["best/pretrained_model/config.json", "checkpoints/7/pretrained_model/config.json"], "best/pretrained_model"),
+        (
+            ["checkpoints/900/pretrained_model/config.json", "checkpoints/1000/pretrained_model/config.json"],
+            "checkpoints/1000/pretrained_model",
+        ),
+        (["round_00/policy/checkpoints/7/pretrained_model/config.json"], None),
+        (["best/pretrained_model/model.safetensors"], None),
+    ],
+)
+def test_where_the_policy_of_a_run_lies(paths: list[str], folder: str | None):
+    assert policy_folder(paths) == folder
+
+
+def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
+    scanned = fronted(RUN)
+    new = scanned.manifest.by_path.keys() - RUN.keys()
+    assert new == {"config.json", "model.safetensors"}
+    assert scanned.local["config.json"] == Path("checkpoints/001000/pretrained_model/config.json")
+    assert without_front(scanned.manifest) == manifest(RUN)
+
+
+@pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
+def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
+    files = {**RUN, there: b"its own"}
+    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+
+
+@pytest.mark.parametrize("changed", ["config.json", "model.safetensors"])
+def test_a_front_that_is_not_the_policy_any_more_comes_along(changed: str):
+    files = {**RUN, "config.json": b"{}", "model.safetensors": b"weights", changed: b"edited on the website"}
+    assert without_front(manifest(files)) == manifest(files)
+
+
+def test_a_policy_that_lies_at_the_root_stays_as_it_is():
+    files = {"config.json": b"{}", "model.safetensors": b"weights"}
+    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+
+
+def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):
+    do_push(run, POLICY)
+    repo = hub.repo("models/user/policy")
+    tree = repo.tree(repo.refs("heads")["main"])
+    for path, data in contents(tiny_policy).items():
+        assert repo.read(tree[path]) == data
+        assert repo.read(tree[f"best/pretrained_model/{path}"]) == data
+    large = {hashlib.sha256(path.read_bytes()).hexdigest() for path in tiny_policy.glob("*.safetensors")}
+    sent = [one.path.rpartition("/")[2] for one in hub.requests("^PUT ")]
+    assert sorted(sent) == sorted(large)
+
+
+def test_a_run_comes_back_as_it_was_however_often_it_goes_there(hub: Hub, run: Path, tmp_path: Path):
+    first = do_push(run, POLICY)
+    do_pull(tmp_path / "back", POLICY)
+    back = contents(tmp_path / "back")
+    card = back.pop(CARD)
+    assert back == contents(run)
+    assert (tmp_path / "back" / "round_00" / "policy" / "checkpoints" / "last").readlink() == Path("000200")
+    again = do_push(tmp_path / "back", POLICY)
+    assert (again.token, again.uploaded, again.removed) == (first.token, 0, 0)
+    assert b"lerobot-eval --policy.path=user/policy" in card
+    assert scan(tmp_path / "back", "policy").manifest.size == sum(map(len, back.values())) + len(card)
+
+
+def test_a_better_policy_takes_the_place_of_the_one_in_front(hub: Hub, run: Path, tmp_path: Path):
+    do_push(run, POLICY)
+    better = run / "best" / "pretrained_model" / "config.json"
+    better.write_bytes(better.read_bytes() + b"\n")
+    assert do_push(run, POLICY).uploaded == 2  # where it lies, and in front
+    repo = hub.repo("models/user/policy")
+    assert repo.read(repo.tree(repo.refs("heads")["main"])["config.json"]) == better.read_bytes()
+    do_pull(tmp_path / "back", POLICY)
+    assert not (tmp_path / "back" / "config.json").exists()
