@@ -49,13 +49,13 @@ class State:
         require_finite("State.variation", self.variation)
 
     def to_vector(self) -> F64:
-        """One flat float64 vector, (p + v + 4,): the dataset's `sim_state`."""
+        """Return one flat float64 vector, (p + v + 4,): the dataset's `sim_state`."""
         tail = [len(self.variation), self.step, self.streak, self.ever]
         return np.concatenate([self.physics, self.variation, tail])
 
     @classmethod
     def from_vector(cls, vector: F64) -> State:
-        """The inverse of `to_vector`, bit for bit. Raises `ManipError` for a vector that is none of its."""
+        """Return the inverse of `to_vector`, bit for bit. Raises `ManipError` for a vector that is none of its."""
         vector = np.asarray(vector, dtype=np.float64)
         end = len(vector) - STATE_EXTRAS
         count, step, streak, ever = vector[end:] if end >= 0 else (-1, 0, 0, 0)
@@ -149,7 +149,7 @@ class Episode:
         return len(next(iter(self.columns.values())))
 
     def without_pictures(self) -> Episode:
-        """The same without its columns of pictures (T, height, width, 3)."""
+        """Return the same without its columns of pictures (T, height, width, 3)."""
         columns = {key: column for key, column in self.columns.items() if column.ndim < 4}
         if len(columns) == len(self.columns):
             return self

@@ -151,7 +151,7 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
 
 
 def check_journals(journals: Path, job: RolloutJob) -> list[str]:
-    """Whether journals that are there already may be gone on with: `MismatchError`, or warnings to show.
+    """Return whether journals that are there already may be gone on with: `MismatchError`, or warnings to show.
 
     Every file is read; one that is damaged is set aside, so that its seed runs again.
     """

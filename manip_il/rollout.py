@@ -45,7 +45,7 @@ class Environment(Protocol):
         ...
 
     def get_state(self) -> State:
-        """Everything that the future depends on."""
+        """Return everything that the future depends on."""
         ...
 
 
@@ -53,7 +53,7 @@ class Labeller(Protocol):
     """Answers what the expert would do."""
 
     def label(self, state: State) -> Label:
-        """The expert's action in `state`."""
+        """Return the expert's action in `state`."""
         ...
 
 
@@ -61,7 +61,7 @@ class Driver(Protocol):
     """Chooses the executed action of every running episode."""
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """An action (n,) and who chose it, for every turn."""
+        """Return an action (n,) and who chose it, for every turn."""
         ...
 
 
@@ -73,7 +73,7 @@ class Intruder(Protocol):
         ...
 
     def action(self, action: F64) -> F64:
-        """The action as it reaches the robot, (n,)."""
+        """Return the action as it reaches the robot, (n,)."""
         ...
 
 
@@ -90,7 +90,10 @@ class Turn:
     progress: float = 0.0
 
     def ask(self) -> Label:
-        """The expert's label of this state, from now on the turn's. Raises `ManipError` where there is no expert."""
+        """Return the expert's label of this state, from now on the turn's.
+
+        Raises `ManipError` where there is no expert.
+        """
         if self.label is None:
             self.label = self.peek()
         return self.label

@@ -33,7 +33,7 @@ def stream_base(stream: str, seed: int = 0) -> int:
 
 
 def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
-    """The first `count` seeds of a named stream."""
+    """Return the first `count` seeds of a named stream."""
     if not 0 <= count <= BLOCK:
         raise UsageError(f"{count} seeds asked of stream {stream!r}; expected 0 to {BLOCK}")
     base = stream_base(stream, seed)
@@ -41,7 +41,7 @@ def stream_seeds(stream: str, count: int, seed: int = 0) -> range:
 
 
 def rng_for(seed: int, purpose: str) -> np.random.Generator:
-    """A generator for one purpose within one episode (`reset`, `mixture`, `noise`, ...)."""
+    """Return a generator for one purpose within one episode (`reset`, `mixture`, `noise`, ...)."""
     return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
 
 

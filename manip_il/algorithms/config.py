@@ -89,7 +89,7 @@ class RunConfig:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
 
     def episodes(self, round_: int) -> int:
-        """Episodes of a round."""
+        """Return episodes of a round."""
         return self.demonstrations if round_ == 0 else self.episodes_per_round
 
     @property

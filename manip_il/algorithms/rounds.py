@@ -89,7 +89,7 @@ class RoundResult:
     seconds: dict[str, float]
 
     def to_json(self) -> dict[str, Any]:
-        """One line of `metrics.jsonl`."""
+        """Return one line of `metrics.jsonl`."""
         success = self.validation.success
         first = ("round", "beta", "labels", "queries", "episodes", "rollout_success")
         return {name: getattr(self, name) for name in first} | {
@@ -101,5 +101,5 @@ class RoundResult:
 
 
 def best_round(results: Sequence[RoundResult]) -> RoundResult:
-    """The highest validation success; of equals the later, which has seen more."""
+    """Return the highest validation success; of equals the later, which has seen more."""
     return max(results, key=lambda result: (result.validation.success.rate, result.round))

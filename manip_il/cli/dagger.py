@@ -180,7 +180,7 @@ class DaggerOptions:
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
-        """The options of the policy that `--policy.type` names."""
+        """Return the options of the policy that `--policy.type` names."""
         return policy_help(words)
 
 
@@ -266,7 +266,7 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
-    """Validation success over labels, episodes and wall-clock, one point a round. name: what made the rounds."""
+    """Return validation success over labels, episodes and wall-clock, one point a round. name: what made the rounds."""
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.evaluation.rounds import curve_points, history
 

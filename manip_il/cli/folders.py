@@ -78,7 +78,7 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """Every record, without a torn last line; none where there is no file. A number that is not finite is None.
+    """Return every record, without a torn last line; none where there is no file. A number that is not finite is None.
 
     Raises `ManipError` for any other line that is not a JSON object.
     """

@@ -35,7 +35,7 @@ TRUST_HELP = (
 
 
 def option(default: Any, text: str) -> Any:
-    """A field with one line of help."""
+    """Return a field with one line of help."""
     return field(default=default, metadata={"help": text})
 
 
@@ -82,7 +82,7 @@ class EnvGroup:
     success_steps: int = option(5, "consecutive control steps within the tolerance that count as success")
 
     def config(self, robot: str, task: str, control_hz: int = DEFAULT_HZ) -> EnvConfig:
-        """The environment; `UnknownName` for a robot or task, `UsageError` for a value."""
+        """Return the environment; `UnknownName` for a robot or task, `UsageError` for a value."""
         from manip_il.robots.robot import get_robot
         from manip_il.sim.env import EnvConfig
         from manip_il.tasks.table import get_task
@@ -116,7 +116,7 @@ class LookGroup:
     light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
 
     def config(self) -> Look:
-        """The look; `UsageError` for a value out of range."""
+        """Return the look; `UsageError` for a value out of range."""
         from manip_il.sim.look import Look
 
         return Look(self.shadows, self.brightness, self.light_turn)
@@ -142,7 +142,7 @@ class PolicyGroup:
 
 
 def policy_help(words: Iterable[str]) -> str:
-    """The options of the policy that `--policy.type=` in a command's words names; nothing where none does."""
+    """Return the options of the policy that `--policy.type=` in a command's words names; nothing where none does."""
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     if not kind:
         return ""
@@ -161,7 +161,7 @@ def warn(lines: Iterable[str]) -> None:
 
 
 def command_line(name: str, options: Any) -> str:
-    """The command with every option that is not its default, to copy."""
+    """Return the command with every option that is not its default, to copy."""
     words = ["manip-il", name]
     for known in options_of(type(options)):
         value = _value(options, known.name)
@@ -200,7 +200,7 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
 
 
 def find_policy(path: Path) -> Path:
-    """The `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run.
+    """Return the `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run.
 
     Of a run it is the best policy, else the newest checkpoint.
     """

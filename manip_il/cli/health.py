@@ -122,7 +122,7 @@ def _renderer() -> str:
 
 
 def describe_torch() -> str:
-    """Torch's version, and how many graphics cards CUDA's driver sees; `ManipError` where torch is missing.
+    """Return Torch's version, and how many graphics cards CUDA's driver sees; `ManipError` where torch is missing.
 
     Torch itself is not imported: it would double the memory of a health check.
     """

@@ -86,7 +86,7 @@ class StopRequest:
 
 
 def resume_command(words: Sequence[str], program: str = "manip-il") -> str:
-    """The command line that was given, with `--resume=true` and without `--overwrite`."""
+    """Return the command line that was given, with `--resume=true` and without `--overwrite`."""
     kept: list[str] = []
     rest = list(words)
     while rest:

@@ -25,7 +25,7 @@ class KeptEpisodes:
 
     @classmethod
     def open(cls, folder: Path, job: RolloutJob, suite: str, name: str) -> KeptEpisodes:
-        """The file in `folder`, begun where there is none.
+        """Return the file in `folder`, begun where there is none.
 
         Raises `MismatchError` where its episodes are those of another policy, environment or version of this program.
         """

@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def script() -> NoReturn:
-    """The program: `main`, and then the end, which after Ctrl-C does not wait for threads that still send or receive.
+    """Run `main` and exit; after Ctrl-C without waiting for threads that still send or receive.
 
     Nothing is lost by that: what every command writes outlives a kill.
     """
@@ -103,7 +103,7 @@ def script() -> NoReturn:
 
 
 def load(name: str) -> type:
-    """The dataclass of options of a command; `UnknownName` (exit code 2) names the known ones."""
+    """Return the dataclass of options of a command; `UnknownName` (exit code 2) names the known ones."""
     if name not in COMMANDS:
         raise UnknownName("command", name, COMMANDS)
     module, _, options_class = COMMANDS[name].target.partition(":")

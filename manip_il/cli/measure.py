@@ -49,7 +49,7 @@ class Trial:
         return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees), trust)
 
     def job(self, policy: Path) -> RolloutJob:
-        """The rollouts of one policy."""
+        """Return the rollouts of one policy."""
         from manip_il.engine.jobs import RolloutJob
         from manip_il.evaluation.runner import HOLD
 
@@ -57,7 +57,7 @@ class Trial:
         return replace(job, trust=self.trust)
 
     def file(self, folder: Path, policy: Path) -> Path:
-        """Where the evaluation of `policy` lies: named after its files, the environment and the episodes.
+        """Return where the evaluation of `policy` lies: named after its files, the environment and the episodes.
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
@@ -98,7 +98,7 @@ def check_policies(trial: Trial, policies: dict[str, Path], folder: Path, engine
 def measure(
     trial: Trial, policy: Path, name: str, folder: Path, engine: Engine, stages: Stages
 ) -> tuple[EvalResult, Path]:
-    """The evaluation of one policy and its file: read where it is there, else made."""
+    """Return the evaluation of one policy and its file: read where it is there, else made."""
     from manip_il.evaluation.runner import evaluate
 
     file = trial.file(folder, policy)
@@ -117,12 +117,12 @@ def measure(
 def measured(
     source: Source, rule: Rule, limit: float | None, trial: Trial, folder: Path, engine: Engine, stages: Stages
 ) -> Measured:
-    """The policy that `rule` takes of `source`, with its evaluation."""
+    """Return the policy that `rule` takes of `source`, with its evaluation."""
     policy, chosen = source.chosen(rule, limit)
     result, file = measure(trial, policy, source.name, folder, engine, stages)
     return Measured(source.name, result, file, source.training_seed, policy, chosen, source.history)
 
 
 def rule_json(rule: Rule, limit: float | None) -> dict[str, Any]:
-    """The rule as `compare.json` and `study.json` hold it."""
+    """Return the rule as `compare.json` and `study.json` hold it."""
     return {"checkpoint": rule.checkpoint, "at": str(rule), "limit": limit}

@@ -20,7 +20,7 @@ _LONGEST = 100  # [characters] of a name that is compared
 
 
 def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: str, command: str) -> UsageError:
-    """The error for an option or a key that is not there: the nearest few, and what lists all.
+    """Return the error for an option or a key that is not there: the nearest few, and what lists all.
 
     kind: `option`, or which file's key. dashes: what stands before the names. command: empty where no one is known.
     """
@@ -35,7 +35,7 @@ def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: st
 
 
 def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> UsageError:
-    """The error for a word that is neither an option nor a value: how it may have been meant."""
+    """Return the error for a word that is neither an option nor a value: how it may have been meant."""
     text = f"unexpected {shorten(word)}"
     name = word.lstrip("-").partition("=")[0]
     if name in known or (word.startswith("-") and nearest_options(name, known)):

@@ -64,7 +64,7 @@ class _Given:
 
 
 def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
-    """Every option of a dataclass, depth first, in the order of definition.
+    """Return every option of a dataclass, depth first, in the order of definition.
 
     field metadata: `help`, one line; `positional=True` for a value without a name (`manip-il doctor DATASET`);
     `command_line_only=True` for what no file may say, and none that is written does.
@@ -112,7 +112,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]
 
 
 def dump_yaml(options: Any) -> str:
-    """The resolved options as YAML: `from_yaml` gives them back equal."""
+    """Return the resolved options as YAML: `from_yaml` gives them back equal."""
     import yaml
 
     header = f"{CONFIG_HEADER} {__version__}: resolved options ({type(options).__name__})\n"

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 def check_policy(
     path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
 ) -> CameraConfig | None:
-    """The cameras that the policy looks at, None for none; warns where it was trained on something else than `env`.
+    """Return the cameras that the policy looks at, None for none.
+
+    Warns where it was trained on something else than `env`.
 
     draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
     `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what

@@ -255,7 +255,10 @@ def _read_timings(path: Path) -> dict[str, float]:
 
 
 def told_verdict(rows: Sequence[PolicyRow], shown: bool) -> str:
-    """The first sentence of the report. shown: whether DAgger and cloning with as many labels are shown to differ."""
+    """Return the first sentence of the report.
+
+    shown: whether DAgger and cloning with as many labels are shown to differ.
+    """
     from manip_il.evaluation.report_data import format_percent
 
     _, cloned, more, dagger = rows

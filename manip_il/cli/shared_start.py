@@ -20,7 +20,7 @@ _LATER = (
 
 
 def same_start(left: DaggerOptions, right: DaggerOptions) -> bool:
-    """Whether two runs have the same round 0."""
+    """Return whether two runs have the same round 0."""
     names = [one.name for one in fields(DaggerOptions) if one.name not in _LATER]
     return all(getattr(left, name) == getattr(right, name) for name in names)
 

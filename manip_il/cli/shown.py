@@ -55,13 +55,13 @@ def show(job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages, co
 
 
 def chosen_seeds(result: EvalResult, count: int) -> list[int]:
-    """The first `count` seeds that failed, then as many that succeeded."""
+    """Return the first `count` seeds that failed, then as many that succeeded."""
     by_outcome = [[one.seed for one in result.episodes if one.success == outcome] for outcome in (False, True)]
     return [seed for seeds in by_outcome for seed in seeds[:count]]
 
 
 def film_episode(job: RolloutJob, episode: Episode) -> Film:
-    """The episode as it looked. Raises `RenderError` where there is no OpenGL."""
+    """Return the episode as it looked. Raises `RenderError` where there is no OpenGL."""
     from manip_il.evaluation.film import film, make_film
     from manip_il.sim.conditions import NOMINAL, draw
 
@@ -80,7 +80,7 @@ def caption(job: RolloutJob, episode: Episode) -> str:
 
 
 def run_curve(policy: Path | None) -> LearningCurve | None:
-    """The learning curve of the DAgger run that a policy lies in; None where it lies in none."""
+    """Return the learning curve of the DAgger run that a policy lies in; None where it lies in none."""
     from manip_il.algorithms.table import ALGORITHMS
     from manip_il.cli.dagger import METRICS_FILE, DaggerOptions, learning_curve
     from manip_il.cli.groups import CONFIG_FILE

@@ -47,7 +47,7 @@ class Source:
         return str(self.path)
 
     def chosen(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
-        """The policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
+        """Return the policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
         if self.policy is not None:
             return self.policy, None
         round_ = choose(rule, self.history, limit, self.name)
@@ -79,7 +79,7 @@ def read_side(path: Path) -> Side:
 
 
 def matched(left: Side, right: Side) -> tuple[Side, Side, list[str]]:
-    """Both sides with the training seeds that both have, and a line for each side that loses some.
+    """Return both sides with the training seeds that both have, and a line for each side that loses some.
 
     Raises `UsageError` where a single policy meets several training seeds, or none is shared.
     """
@@ -107,7 +107,10 @@ def matched(left: Side, right: Side) -> tuple[Side, Side, list[str]]:
 
 
 def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
-    """The amount of `rule.axis` that every run may have used; `UsageError` where a source has no rounds to choose."""
+    """Return the amount of `rule.axis` that every run may have used.
+
+    `UsageError` where a source has no rounds to choose.
+    """
     sources = list(sources)
     for source in sources:
         if rule.axis != END and not source.history:
@@ -117,7 +120,7 @@ def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
 
 
 def common_env(sources: Sequence[Source], group: EnvGroup, robot: str | None, task: str | None) -> EnvConfig:
-    """The environment that all are tested in: the runs' own, else `--env.*` with the policies' robot and task.
+    """Return the environment that all are tested in: the runs' own, else `--env.*` with the policies' robot and task.
 
     Raises `MismatchError` naming the first setting in which two differ.
     """
@@ -141,25 +144,25 @@ def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) ->
 
 
 def seed_folders(path: Path) -> dict[int, Path]:
-    """Training seed -> its folder in `path`."""
+    """Return training seed -> its folder in `path`."""
     named = ((SEED_FOLDER.fullmatch(folder.name), folder) for folder in path.iterdir() if folder.is_dir())
     return {int(match.group(1)): folder for match, folder in named if match}
 
 
 def run_history(folder: Path) -> History:
-    """The rounds of a DAgger run so far."""
+    """Return the rounds of a DAgger run so far."""
     return history(read_jsonl(folder / METRICS_FILE), str(folder))
 
 
 def round_policy(folder: Path, round_: int) -> Path:
-    """The `pretrained_model` folder of a run's round."""
+    """Return the `pretrained_model` folder of a run's round."""
     from manip_il.algorithms.run import round_folder
 
     return find_policy(round_folder(folder, round_) / "policy")
 
 
 def run_finished(folder: Path) -> bool:
-    """Whether all rounds of a run are done: the best policy is put beside them last."""
+    """Return whether all rounds of a run are done: the best policy is put beside them last."""
     return (folder / "best" / "pretrained_model" / "config.json").is_file()
 
 

@@ -50,7 +50,7 @@ class Contestant:
     labels: int | None = None
 
     def job(self, env: EnvConfig, suite: str = "nominal") -> RolloutJob:
-        """Its rollouts."""
+        """Return its rollouts."""
         driver: Literal["expert", "policy"] = "expert" if self.policy is None else "policy"
         conditions = suite_conditions(suite, env.task, sees=False)
         return RolloutJob(env, driver, policy=self.policy, hold=HOLD, label="last", conditions=conditions)
@@ -80,7 +80,7 @@ def clone_with_labels(
 def measure(
     contestants: Sequence[Contestant], env: EnvConfig, seeds: range, folder: Path, engine: Engine, stages: Stages
 ) -> dict[str, EvalResult]:
-    """Key -> evaluation on the same seeds, in the suite that `folder` stands for.
+    """Return key -> evaluation on the same seeds, in the suite that `folder` stands for.
 
     What an earlier run has written is read instead.
     """
@@ -97,7 +97,7 @@ def measure(
 
 
 def compare(results: Mapping[str, EvalResult], pairs: Sequence[tuple[Contestant, Contestant]], words: str) -> list[str]:
-    """One sentence a pair."""
+    """Return one sentence a pair."""
     return [
         f"{words}: {compare_results(results[left.key], results[right.key], (left.name, right.name)).verdict}"
         for left, right in pairs
@@ -105,7 +105,7 @@ def compare(results: Mapping[str, EvalResult], pairs: Sequence[tuple[Contestant,
 
 
 def telling_seed(loser: EvalResult, winner: EvalResult) -> int:
-    """The first seed on which only the winner succeeds, else the first of all."""
+    """Return the first seed on which only the winner succeeds, else the first of all."""
     won = {episode.seed for episode in winner.episodes if episode.success}
     telling = (episode.seed for episode in loser.episodes if not episode.success and episode.seed in won)
     return next(telling, loser.episodes[0].seed)

@@ -60,7 +60,7 @@ class Plan:
 
 
 def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
-    """The study in `path`; training_seeds: in place of the file's; trust: what the file may not say of its runs.
+    """Return the study in `path`; training_seeds: in place of the file's; trust: what the file may not say of its runs.
 
     Raises `UsageError` in one line for what is not sound.
     """

@@ -23,7 +23,7 @@ SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensi
 
 
 def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, ...]:
-    """The conditions of a suite, in the order in which seeds take turns.
+    """Return the conditions of a suite, in the order in which seeds take turns.
 
     Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera.
     Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where nothing is left.
@@ -58,7 +58,7 @@ def _read(name: str) -> Condition:
 
 
 def read_condition(path: Path) -> Condition:
-    """A YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
+    """Return a YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
     from manip_il.sim.conditions import Condition
     from manip_il.yaml_file import read_yaml
 

@@ -197,7 +197,7 @@ class TrainOptions:
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
-        """The options of the policy that `--policy.type` names."""
+        """Return the options of the policy that `--policy.type` names."""
         return policy_help(words)
 
 

@@ -191,7 +191,7 @@ def _remove_leftovers(root: Path) -> None:
 
 
 def umask() -> int:
-    """The mask that new files are made with."""
+    """Return the mask that new files are made with."""
     mask = os.umask(0o077)  # there is no way to only read it
     os.umask(mask)
     return mask

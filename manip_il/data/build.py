@@ -60,7 +60,7 @@ class Recording:
     def open(
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
     ) -> AbstractContextManager[DatasetWriter]:
-        """The dataset's writer; raises what `new_dataset` raises."""
+        """Return the dataset's writer; raises what `new_dataset` raises."""
         video = VideoConfig.from_json(self.video)
         return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
 
@@ -71,7 +71,7 @@ class Recording:
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """The folder's own; where it has none, one that takes every episode."""
+        """Return the folder's own; where it has none, one that takes every episode."""
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
@@ -158,7 +158,7 @@ class Builder:
 
 
 def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> BuildResult:
-    """The LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
+    """Return the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
 
     Files that cannot be read are left out and named in the result. Raises `ManipError` where no episode is left,
     `FolderExistsError` where `root` holds something, unless `replace` is to swap it for the new one at the end.

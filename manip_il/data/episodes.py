@@ -33,7 +33,7 @@ def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transitio
 def to_episode(
     frames: Sequence[Transition], round_: int = 0, beta: float = 1.0, *, labelled: bool = True, path: int | None = None
 ) -> Episode:
-    """An episode with the schema's columns.
+    """Return an episode with the schema's columns.
 
     labelled: with the columns of labels; where nobody asked, `label_valid` is 0, the phase 0, and the label the
     executed action. path: the first so many frames decide whether it succeeded; by default all.
@@ -111,12 +111,12 @@ def _final(shown: dict[str, NDArray[Any]]) -> Observation:
 
 
 def count_labels(episode: Episode) -> int:
-    """Its sound labels."""
+    """Return its sound labels."""
     return int(episode.columns[schema.LABEL_VALID].sum()) if schema.LABEL_VALID in episode.columns else 0
 
 
 def first_labels(episode: Episode, most: int) -> Episode:
-    """The episode with `label_valid` 0 behind its first `most` sound labels."""
+    """Return the episode with `label_valid` 0 behind its first `most` sound labels."""
     valid = episode.columns[schema.LABEL_VALID].astype(np.int64)
     kept = valid * (np.cumsum(valid).reshape(valid.shape) <= most)
     return replace(episode, columns=episode.columns | {schema.LABEL_VALID: kept})

@@ -30,7 +30,7 @@ _MEANING = {
 
 
 def environment_fingerprint(model_bytes: bytes, config: Mapping[str, Any]) -> dict[str, str]:
-    """Versions of what computes, the processor, and SHA-256 of the compiled model and of the config's canonical JSON.
+    """Return versions of what computes, the processor, and SHA-256 of the compiled model and of the config.
 
     Two equal fingerprints promise equal bytes. No package is imported for it: a missing one is `absent`. Raises
     `ManipError` for a config that JSON cannot hold.
@@ -62,7 +62,7 @@ def processor() -> str:
 def compare_fingerprints(
     left_name: str, left: Mapping[str, Any], right_name: str, right: Mapping[str, Any]
 ) -> list[str]:
-    """One warning, naming both sides, for every entry that differs; an empty list where nothing does."""
+    """Return one warning, naming both sides, for every entry that differs; an empty list where nothing does."""
     warnings: list[str] = []
     for key in [*left, *(key for key in right if key not in left)]:
         left_value, right_value = left.get(key, "nothing"), right.get(key, "nothing")
@@ -74,7 +74,7 @@ def compare_fingerprints(
 
 
 def canonical_json(value: Any) -> str:
-    """JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
+    """Return JSON with sorted keys and no spaces: equal configs give equal text, whatever their order.
 
     Takes dataclasses, enums, paths and numpy numbers and arrays as well. Raises `ManipError` for anything else.
     """

@@ -95,7 +95,10 @@ class FrameSource:
         return self.frames * 3 * self.size[0] * self.size[1]
 
     def read(self, part: Part) -> Iterator[Rows]:
-        """A part's pictures. Raises `ManipError` where one is missing, `MismatchError` where one has another size."""
+        """Yield a part's pictures.
+
+        Raises `ManipError` where one is missing, `MismatchError` where one has another size.
+        """
         for row, pictures in part.read(self.root, self.key, self.fps):
             if pictures.shape[1:] != (*self.size, 3):
                 there = f"{layout.INFO} of {self.root}"

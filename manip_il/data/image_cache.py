@@ -36,7 +36,7 @@ Frames = NDArray[np.uint8]  # (N, 3, height, width)
 
 
 def cache_folder() -> Path:
-    """Where decoded pictures are kept: `manip_il/frames` in the user's cache folder."""
+    """Return where decoded pictures are kept: `manip_il/frames` in the user's cache folder."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "manip_il" / "frames"
 
@@ -50,7 +50,9 @@ def open_frame_cache(
     workers: int | None = None,
     on_frames: Callable[[int], None] | None = None,
 ) -> dict[str, Frames] | None:
-    """The decoded pictures of a dataset's cameras, read-only (N, 3, height, width); row i is the frame of `index` i.
+    """Return the decoded pictures of a dataset's cameras, read-only (N, 3, height, width).
+
+    Row i is the frame of `index` i.
 
     They are the ones that LeRobot decodes, bit by bit (of 10-bit video those of its backend pyav; torchcodec's differ).
     What `folder` lacks is decoded by `workers` processes (one a core by default), after what was not used for longest

@@ -88,7 +88,7 @@ class JournalKeep:
     fingerprint: dict[str, Any]
 
     def pack(self, episode: Episode) -> bytes:
-        """The file's content."""
+        """Return the file's content."""
         return encode_episode(episode, self.spec, self.fingerprint)
 
     def store(self, seed: int, packed: bytes) -> None:
@@ -113,7 +113,7 @@ def write_episode(folder: Path, episode: Episode, spec: RobotTaskSpec, fingerpri
 
 
 def read_episode(path: Path) -> Episode:
-    """The episode as it was written, bit for bit; every checksum of the file is checked.
+    """Return the episode as it was written, bit for bit; every checksum of the file is checked.
 
     Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
     """
@@ -152,17 +152,17 @@ def read_header(path: Path) -> Header:
 
 
 def episode_path(folder: Path, seed: int) -> Path:
-    """Where the episode of a seed lies."""
+    """Return where the episode of a seed lies."""
     return folder / f"episode-{seed:012d}.mcap"
 
 
 def list_seeds(folder: Path) -> list[int]:
-    """The seeds of the folder's finished episodes, in order; none where the folder does not exist."""
+    """Return the seeds of the folder's finished episodes, in order; none where the folder does not exist."""
     return sorted(int(match[1]) for path in folder.glob("episode-*.mcap") if (match := _NAME.fullmatch(path.name)))
 
 
 def list_episodes(folder: Path) -> list[Path]:
-    """The folder's finished episodes in the order of their seeds; none where the folder does not exist."""
+    """Return the folder's finished episodes in the order of their seeds; none where the folder does not exist."""
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
@@ -192,7 +192,7 @@ def clean_temporary(folder: Path) -> list[Path]:
 
 
 def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> bytes:
-    """A journal file's content; the same episode gives the same bytes.
+    """Return a journal file's content; the same episode gives the same bytes.
 
     Raises `ManipError` for an episode that `read_episode` would refuse for its size.
     """

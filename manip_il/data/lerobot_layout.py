@@ -51,7 +51,7 @@ STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
 def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """Our features and LeRobot's own five, in the order of the columns."""
+    """Return our features and LeRobot's own five, in the order of the columns."""
     own = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}
     return {**features(spec), **own}
 
@@ -64,7 +64,7 @@ def table_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 def info_json(
     spec: RobotTaskSpec, episodes: int, frames: int, file_sizes: tuple[float, float], videos: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
-    """Content of `meta/info.json`, keys in LeRobot's order.
+    """Return content of `meta/info.json`, keys in LeRobot's order.
 
     file_sizes: of data and video files [MB]. videos: camera column -> what LeRobot says of its video files.
     """
@@ -89,7 +89,7 @@ def info_json(
 
 
 def data_schema(spec: RobotTaskSpec) -> pa.Schema:
-    """Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
+    """Return Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 
     Its metadata holds the Hugging Face features that `datasets` reads.
     """
@@ -109,7 +109,7 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
 
 
 def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
-    """Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
+    """Return Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
     whole = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
     return pa.schema(
         [
@@ -133,7 +133,7 @@ def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
 
 
 def tasks_table(instruction: str) -> pa.Table:
-    """The one task, as pandas would write it with `task` for its index: LeRobot looks tasks up by that index."""
+    """Return the one task, as pandas would write it with `task` for its index: LeRobot looks tasks up by that index."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
         for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))

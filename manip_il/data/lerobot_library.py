@@ -81,7 +81,7 @@ class Metadata(LeRobotDatasetMetadata):
 
 
 def read_metadata(*roots: Path) -> Metadata:
-    """LeRobot's own description of a dataset, or of several as one, from which its factories build policies.
+    """Return LeRobot's own description of a dataset, or of several as one, from which its factories build policies.
 
     The cameras' statistics are ImageNet's, as `lerobot-train` takes them by default. Raises `ManipError` for a folder
     that is no dataset, `MismatchError` for several of different features or tasks.
@@ -123,7 +123,7 @@ def lerobot_windows(
     delta_timestamps: Mapping[str, Sequence[float]] | None,
     episodes: Sequence[int] | None = None,
 ) -> LeRobotDataset:
-    """LeRobot's own reading of a dataset, for a `DataLoader`: decodes as it goes, and never asks the Hub.
+    """Return LeRobot's own reading of a dataset, for a `DataLoader`: decodes as it goes, and never asks the Hub.
 
     A picture is uint8 (3, height, width), the same bytes as in the frame cache, and (K, 3, height, width) where
     `delta_timestamps` [s] asks for a window; episodes: the ones to read, all by default. Raises `ManipError` for a

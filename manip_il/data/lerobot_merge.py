@@ -36,7 +36,7 @@ def merge_datasets(
     fingerprint: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> DatasetInfo:
-    """One dataset of all episodes of several, in order: equal to `write_dataset` of them.
+    """Return one dataset of all episodes of several, in order: equal to `write_dataset` of them.
 
     The fingerprint is the first one's unless given; where theirs differ, a warning is logged. The provenance says
     what came from where, beside what is given. Datasets with cameras are joined by LeRobot, which copies their videos;

@@ -69,7 +69,7 @@ def read_table(
 
 
 def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """The columns of several datasets one after the other, with frames and episodes numbered throughout.
+    """Return the columns of several datasets one after the other, with frames and episodes numbered throughout.
 
     Raises what `read_table` raises.
     """
@@ -84,7 +84,7 @@ def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDAr
 
 
 def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
-    """The dataset's episodes in order, scalars as (T, 1) columns, pictures decoded unless they are not wanted.
+    """Yield the dataset's episodes in order, scalars as (T, 1) columns, pictures decoded unless they are not wanted.
 
     An episode's success is what `next.success` has. One data file is held at a time. Raises what `read_table` and
     `read_frames` raise.
@@ -108,7 +108,7 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
 
 
 def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
-    """One camera's decoded frames of one episode, (T, height, width, 3). key: `observation.images.<camera>`.
+    """Return one camera's decoded frames of one episode, (T, height, width, 3). key: `observation.images.<camera>`.
 
     Raises `UnknownName` for a column that is no camera, `UsageError` for an episode that is not there, `ManipError`
     for a video file that cannot be read or lacks frames.
@@ -120,7 +120,7 @@ def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
 
 
 def video_rows(root: Path) -> dict[Path, int]:
-    """Every video file that `meta/episodes` names, with the number of frames that it says are in it."""
+    """Return every video file that `meta/episodes` names, with the number of frames that it says are in it."""
     pictures = _pictures(root, camera_keys(root))
     rows: Counter[Path] = Counter()
     for key, episode in itertools.product(camera_keys(root), range(len(pictures.lengths))):
@@ -129,7 +129,7 @@ def video_rows(root: Path) -> dict[Path, int]:
 
 
 def read_spec(root: Path) -> s.RobotTaskSpec:
-    """The spec that the dataset was written with.
+    """Return the spec that the dataset was written with.
 
     LeRobot's tools drop our file beside theirs; then the spec comes from LeRobot's own, the task `unknown`.
     """
@@ -153,17 +153,17 @@ def read_spec(root: Path) -> s.RobotTaskSpec:
 
 
 def read_fingerprint(root: Path) -> dict[str, Any]:
-    """The environment's fingerprint; empty for a dataset that another program wrote."""
+    """Return the environment's fingerprint; empty for a dataset that another program wrote."""
     return _read_ours(root).get("fingerprint", {})
 
 
 def read_provenance(root: Path) -> dict[str, Any]:
-    """Where the episodes came from; empty for a dataset that another program wrote."""
+    """Return where the episodes came from; empty for a dataset that another program wrote."""
     return _read_ours(root).get("provenance", {})
 
 
 def dataset_info(root: Path) -> DatasetInfo:
-    """Counts and names. Raises `ManipError` for a folder that is no dataset."""
+    """Return counts and names. Raises `ManipError` for a folder that is no dataset."""
     info = _read_info(root)
     ours = _read_ours(root)
     spec = _spec(root, ours) if ours else None
@@ -187,7 +187,7 @@ def dataset_info(root: Path) -> DatasetInfo:
 
 
 def camera_keys(root: Path) -> list[str]:
-    """Names of the columns that are pictures."""
+    """Return names of the columns that are pictures."""
     return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in _PICTURES]
 
 

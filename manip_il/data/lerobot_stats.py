@@ -39,7 +39,7 @@ class RunningStats:
         self._lengths: list[int] = []
 
     def add(self, columns: Mapping[str, NDArray[Any]]) -> Stats:
-        """Statistics of one episode's columns, {column: {min, max, mean, std, count, q01, ...: one a dimension}}.
+        """Return {column: {min, max, mean, std, count, q01, ...}} of one episode, one value a dimension.
 
         columns: name -> (T,) or (T, d) numbers or booleans, all of the same T; the same names and d every time.
         """
@@ -52,7 +52,7 @@ class RunningStats:
         return self._named(_row_stats(rows), len(matrix))
 
     def result(self) -> Stats:
-        """The same of all frames so far."""
+        """Return the same of all frames so far."""
         self._numbers.flush()
         frames, width = sum(self._lengths), sum(self._widths.values())
         step = max(1, _BLOCK_BYTES // (8 * frames))
@@ -86,7 +86,7 @@ class RunningStats:
 
 
 def pixel_counts(frames: NDArray[np.uint8]) -> I64:
-    """How often every channel has every level, (3, 256), in frames (T, height, width, 3).
+    """Return how often every channel has every level, (3, 256), in frames (T, height, width, 3).
 
     Those of several episodes add up to those of all of them.
     """
@@ -97,7 +97,7 @@ def pixel_counts(frames: NDArray[np.uint8]) -> I64:
 
 
 def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
-    """Statistics of pictures from their `pixel_counts`: levels in [0, 1], one a channel as (3, 1, 1)."""
+    """Return statistics of pictures from their `pixel_counts`: levels in [0, 1], one a channel as (3, 1, 1)."""
     total = int(counts[0].sum())
     stats: dict[str, list[float]] = {name: [] for name in STAT_NAMES if name != "count"}
     for channel in counts:

@@ -74,7 +74,7 @@ class ParquetFiles:
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
-    """Columns (T,) and (T, d) as an Arrow table, vectors as lists of fixed size."""
+    """Return columns (T,) and (T, d) as an Arrow table, vectors as lists of fixed size."""
     arrays: list[pa.Array] = []
     for field in schema:
         values = np.ascontiguousarray(columns[field.name])

@@ -84,7 +84,7 @@ class RobotTaskSpec:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
-        """The inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
+        """Return the inverse of `to_json`; raises `ManipError` for a key that is missing or unknown."""
         checks.mapping("a robot-task spec", data)
         if (found := data.get("schema", 1)) != VERSION:
             raise OlderSchemaError(checks.shorten(found), VERSION)
@@ -113,7 +113,7 @@ def check_picture_size(what: str, size: object, least: int = 1) -> tuple[int, in
 
 
 def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
+    """Return LeRobot's feature table for our columns (LeRobot adds its own index columns)."""
     joints = list(spec.joint_names)
     return {
         STATE: _feature("float32", joints),
@@ -155,7 +155,7 @@ def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right:
 
 
 def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[Any]]:
-    """The episode's columns in the order of `features(spec)`.
+    """Return the episode's columns in the order of `features(spec)`.
 
     (T,) for scalars, (T, d) for vectors, uint8 (T, height, width, 3) for pictures. Raises
     `UnknownName` for a column too many, `MismatchError` for one missing or of another dtype or shape,

@@ -81,7 +81,7 @@ class VideoConfig:
         return cls(**data)
 
     def options(self) -> dict[str, str]:
-        """The codec's own options. One thread: a second saves no work, and of h264 it changes the bytes."""
+        """Return the codec's own options. One thread: a second saves no work, and of h264 it changes the bytes."""
         named = {"g": self.g, "crf": self.crf, "preset": self.preset}
         options = {name: str(value) for name, value in named.items() if value is not None}
         if self.vcodec == "libsvtav1":

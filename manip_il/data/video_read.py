@@ -66,7 +66,7 @@ class DatasetPictures:
         return self._columns["length"]
 
     def place(self, key: str, episode: int) -> tuple[Path, int]:
-        """The file that holds an episode's frames, and the number of the first one in it."""
+        """Return the file that holds an episode's frames, and the number of the first one in it."""
         if not 0 <= episode < len(self.lengths):
             raise UsageError(f"{self._root} has no episode {episode}; it has 0 to {len(self.lengths) - 1}")
         chunk, file, start, _ = (self._columns[f"videos/{key}/{name}"][episode] for name in layout.VIDEO_COLUMNS)

@@ -44,7 +44,7 @@ def writing(path: Path) -> Generator[None]:
 
 
 def disk_errno(error: BaseException) -> int | None:
-    """The number of the disk's refusal that an error tells of; None where it tells of something else."""
+    """Return the number of the disk's refusal that an error tells of; None where it tells of something else."""
     if isinstance(error, OSError):
         number = error.errno
     else:

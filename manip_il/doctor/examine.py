@@ -41,7 +41,10 @@ CHECKS: tuple[Check, ...] = (
 
 
 def examine(dataset: Dataset, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
-    """Every finding, as it is found; none for a dataset that is whole. Raises nothing, whatever the folder holds."""
+    """Yield every finding, as it is found; none for a dataset that is whole.
+
+    Raises nothing, whatever the folder holds.
+    """
     for check in checks:
         try:
             yield from check(dataset)
@@ -52,7 +55,7 @@ def examine(dataset: Dataset, checks: Sequence[Check] = CHECKS) -> Iterator[Find
 
 
 def verdict(dataset: Dataset, findings: Sequence[Finding]) -> str:
-    """One line: what is there and whole, or how much is wrong."""
+    """Return one line: what is there and whole, or how much is wrong."""
     counts = count_text(findings)
     if has_errors(findings) or dataset.info is None:
         return f"{dataset.root}: {counts}"
@@ -61,10 +64,10 @@ def verdict(dataset: Dataset, findings: Sequence[Finding]) -> str:
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:
-    """Whether anything is wrong."""
+    """Return whether anything is wrong."""
     return any(finding.severity is Severity.ERROR for finding in findings)
 
 
 def examine_folder(root: Path) -> list[Finding]:
-    """All findings about a folder."""
+    """Return all findings about a folder."""
     return list(examine(Dataset(root)))

@@ -45,12 +45,12 @@ class NotWhole(ManipError):
 
 
 def error(place: str, text: str, remedy: Remedy = Remedy.REBUILD) -> Finding:
-    """Something wrong, which a rebuild from journals cures unless said otherwise."""
+    """Return something wrong, which a rebuild from journals cures unless said otherwise."""
     return Finding(Severity.ERROR, place, text, remedy)
 
 
 def warning(place: str, text: str, remedy: Remedy = Remedy.NONE) -> Finding:
-    """Something to know."""
+    """Return something to know."""
     return Finding(Severity.WARNING, place, text, remedy)
 
 

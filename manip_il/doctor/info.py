@@ -75,12 +75,12 @@ class Info:
     video_path: str
 
     def of_dtype(self, *dtypes: str) -> list[Feature]:
-        """Features of these dtypes."""
+        """Return features of these dtypes."""
         return [feature for feature in self.features.values() if feature.dtype in dtypes]
 
 
 def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
-    """The file's content, or None where nothing else can be read by it; and what is wrong with it."""
+    """Return the file's content, or None where nothing else can be read by it; and what is wrong with it."""
     try:
         raw = read_object(root / layout.INFO)
     except FileNotFoundError:
@@ -109,7 +109,7 @@ def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """A JSON object. Raises `OSError`, or `ValueError` for anything else."""
+    """Return a JSON object. Raises `OSError`, or `ValueError` for anything else."""
     with path.open("rb") as file:
         content = file.read(LARGEST_META + 1)
     if len(content) > LARGEST_META:

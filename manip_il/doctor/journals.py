@@ -14,7 +14,7 @@ from manip_il.errors import ManipError
 
 
 def check_journals(dataset: Dataset) -> Iterator[Finding]:
-    """Every journal is whole, and the dataset holds the episodes that they make."""
+    """Yield every journal is whole, and the dataset holds the episodes that they make."""
     folder = dataset.journals
     if not folder.is_dir():
         return
@@ -37,13 +37,13 @@ def check_journals(dataset: Dataset) -> Iterator[Finding]:
 
 
 def expected_seeds(headers: list[Header], recording: Recording) -> list[int]:
-    """The seeds of the episodes that a dataset of these journals holds, in order."""
+    """Return the seeds of the episodes that a dataset of these journals holds, in order."""
     taken = [one.seed for one in headers if one.success or not recording.only_successes]
     return taken if recording.episodes is None else taken[: recording.episodes]
 
 
 def readable_episodes(folder: Path) -> int:
-    """How many episodes a dataset of these journals would hold."""
+    """Return how many episodes a dataset of these journals would hold."""
     headers = [header for path in list_episodes(folder) if isinstance(header := _read(path), Header)]
     return len(expected_seeds(headers, Recording.read(folder)))
 

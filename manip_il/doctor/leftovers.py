@@ -36,7 +36,7 @@ def check_stale_files(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
-    """No temporary files or folders, in the dataset or beside it."""
+    """Yield no temporary files or folders, in the dataset or beside it."""
     root = dataset.root
     if pictures := len(_files(root, IMAGES)):
         text = f"{plural(pictures, 'picture')} that LeRobot's recorder had not encoded or not removed when it died"

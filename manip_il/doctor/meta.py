@@ -22,7 +22,7 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_footers(dataset: Dataset) -> Iterator[Finding]:
-    """Every parquet file of data and of episodes is there and has a readable footer."""
+    """Yield every parquet file of data and of episodes is there and has a readable footer."""
     info = dataset.info
     for pattern, shards in ((layout.DATA_FILES, dataset.data_shards), (layout.EPISODES_FILES, dataset.episode_shards)):
         if not shards and info is not None and info.episodes:
@@ -71,7 +71,7 @@ def check_tasks(dataset: Dataset) -> Iterator[Finding]:
 
 
 def read_tasks(dataset: Dataset) -> tuple[list[int], list[str]]:
-    """Numbers and names of the tasks. Raises one of `UNREADABLE`."""
+    """Return numbers and names of the tasks. Raises one of `UNREADABLE`."""
     path = dataset.root / layout.TASKS
     if not path.is_file():
         raise FileNotFoundError(path)

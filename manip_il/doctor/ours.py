@@ -42,7 +42,7 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
-    """The versions that the dataset was recorded with are those installed here."""
+    """Yield the versions that the dataset was recorded with are those installed here."""
     if not dataset.is_ours:
         return
     try:
@@ -59,7 +59,10 @@ def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
 
 
 def read_spec(dataset: Dataset) -> s.RobotTaskSpec:
-    """The spec in our own file. Raises `OSError`, `ValueError`, `TypeError` or `ManipError` for anything else."""
+    """Return the spec in our own file.
+
+    Raises `OSError`, `ValueError`, `TypeError` or `ManipError` for anything else.
+    """
     ours = read_object(dataset.root / layout.OURS)
     if missing := _NEEDED - ours.keys():
         raise ValueError(f"it lacks {some(sorted(missing))}")

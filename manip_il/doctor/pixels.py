@@ -35,7 +35,7 @@ class Brightness:
 
 
 def check_brightness(dataset: Dataset, feature: Feature, brightness: Brightness) -> Iterator[Finding]:
-    """The stored mean is about that of the pictures, and lies between the stored minimum and maximum."""
+    """Yield the stored mean is about that of the pictures, and lies between the stored minimum and maximum."""
     stats = dataset.stats
     if stats is None or not isinstance(stats.get(feature.key), dict) or feature.details.get("is_depth_map"):
         return

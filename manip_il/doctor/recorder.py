@@ -11,7 +11,7 @@ from manip_il.doctor.shards import NO_FOOTER
 
 
 def check_recorder(dataset: Dataset) -> Iterator[Finding]:
-    """No recorder died here. LeRobot counts episodes as it goes, but closes its files only in the end."""
+    """Yield no recorder died here. LeRobot counts episodes as it goes, but closes its files only in the end."""
     info = dataset.info
     if info is None or dataset.is_ours:
         return

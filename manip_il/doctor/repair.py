@@ -142,7 +142,7 @@ def _move(source: Path, target: Path) -> None:
 
 
 def free_name(root: Path) -> Path:
-    """The first of `<root>.before-repair`, `<root>.before-repair-2`, ... that is not there."""
+    """Return the first of `<root>.before-repair`, `<root>.before-repair-2`, ... that is not there."""
     first = root.with_name(f"{root.name}.before-repair")
     number, path = 1, first
     while path.exists():

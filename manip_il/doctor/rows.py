@@ -17,7 +17,7 @@ _DATA = "data"
 
 
 def check_columns(dataset: Dataset) -> Iterator[Finding]:
-    """Every data file has the columns of info.json, and no other: LeRobot loads none that has."""
+    """Yield every data file has the columns of info.json, and no other: LeRobot loads none that has."""
     if dataset.info is None:
         return
     wanted = {feature.key for feature in dataset.info.features.values() if feature.dtype != "video"}
@@ -31,7 +31,7 @@ def check_columns(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
-    """Rows count as info.json, `meta/episodes` and their own index columns say."""
+    """Yield rows count as info.json, `meta/episodes` and their own index columns say."""
     yield from dataset.scan.findings
     info, episodes = dataset.info, dataset.episodes
     if info is None:

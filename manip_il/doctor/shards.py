@@ -40,7 +40,10 @@ class Shard:
         return list(self.schema.names) if self.schema else []
 
     def tables(self, columns: Sequence[str] | None = None, rows: int = _ROWS) -> Iterator[pa.Table]:
-        """The rows in order, about `rows` at a time. Raises one of `UNREADABLE`; checksums of pages are compared."""
+        """Yield the rows in order, about `rows` at a time. Raises one of `UNREADABLE`.
+
+        Checksums of pages are compared.
+        """
         with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
             groups: list[int] = []
             held = 0
@@ -52,20 +55,20 @@ class Shard:
                     groups, held = [], 0
 
     def batches(self, column: str, rows: int) -> Iterator[pa.Array]:
-        """One column, at most `rows` at a time: pictures need not fit in memory."""
+        """Yield one column, at most `rows` at a time: pictures need not fit in memory."""
         with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
             for batch in file.iter_batches(rows, columns=[column], use_threads=False):
                 yield batch.column(0)
 
 
 def find_shards(root: Path, pattern: str) -> list[Shard]:
-    """Every parquet file that matches, in LeRobot's order; none of them has to be readable."""
+    """Return every parquet file that matches, in LeRobot's order; none of them has to be readable."""
     paths = sorted(path for path in root.glob(pattern) if path.is_file())
     return [open_shard(path.relative_to(root).as_posix(), path) for path in paths]
 
 
 def open_shard(name: str, path: Path) -> Shard:
-    """The file with its footer read."""
+    """Return the file with its footer read."""
     try:
         with path.open("rb") as stream:
             size = stream.seek(0, 2)
@@ -87,7 +90,7 @@ def open_shard(name: str, path: Path) -> Shard:
 
 
 def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
-    """Rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
+    """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
     array: Any = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if isinstance(array, pa.ChunkedArray):  # what combining no chunk at all gives
         array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.array([], array.type)
@@ -108,7 +111,7 @@ def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int
 
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
-    """A column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
+    """Return a column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
     if name not in table.column_names:
         raise BadColumn(f"has no column {name!r}")
     column = table.column(name)
@@ -118,7 +121,7 @@ def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
 
 
 def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
-    """A column of numbers, (T,). Raises `BadColumn` as `integers` does."""
+    """Return a column of numbers, (T,). Raises `BadColumn` as `integers` does."""
     if name not in table.column_names:
         raise BadColumn(f"has no column {name!r}")
     column = table.column(name)

@@ -15,7 +15,7 @@ F64 = NDArray[np.float64]
 
 
 def stored(stats: Mapping[str, Any] | None, key: str, name: str) -> F64 | None:
-    """One statistic of one feature, flat; None where it is missing or holds something else than finite numbers."""
+    """Return one statistic of one feature, flat; None where it is missing or not of finite numbers."""
     table = (stats or {}).get(key)
     if not isinstance(table, dict) or name not in table:
         return None
@@ -27,7 +27,7 @@ def stored(stats: Mapping[str, Any] | None, key: str, name: str) -> F64 | None:
 
 
 def stored_quantiles(stats: Mapping[str, Any] | None, features: Iterable[Feature]) -> dict[str, F64]:
-    """Column -> its quantiles, (Q, numbers of a frame), where all of them are there."""
+    """Return column -> its quantiles, (Q, numbers of a frame), where all of them are there."""
     found: dict[str, F64] = {}
     for feature in features:
         rows = [stored(stats, feature.key, name) for name in QUANTILES]

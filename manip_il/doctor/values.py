@@ -22,7 +22,7 @@ _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}
 
 
 def check_finite(dataset: Dataset) -> Iterator[Finding]:
-    """No NaN and no infinity in any column."""
+    """Yield no NaN and no infinity in any column."""
     for key, moments in dataset.scan.moments.items():
         if moments.first_bad is not None:
             row, value = moments.first_bad

@@ -17,7 +17,7 @@ class Brancher:
         self._env, self._expert, self._rules = env, expert, Rules(steps)
 
     def from_labelled(self, frames: Iterable[Transition]) -> Iterator[Transition]:
-        """The branches of all frames that have a sound label, one after the other; each ends with `done`."""
+        """Yield the branches of all frames that have a sound label, one after the other; each ends with `done`."""
         for frame in frames:
             if frame.label is not None and frame.label.valid:
                 yield from self.branch(frame.seed, frame.state)

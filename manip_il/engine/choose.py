@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # torch only where a learner drives
 
 
 def choose_driver(job: RolloutJob, env: ManipEnv) -> Driver:
-    """The driver of a job, with its gate. Raises what loading a policy raises."""
+    """Return the driver of a job, with its gate. Raises what loading a policy raises."""
     if job.driver == "expert":
         return ExpertDriver()
     if job.driver == "noisy_expert":

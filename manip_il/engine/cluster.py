@@ -50,7 +50,7 @@ class RayCluster:
         self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
     def has_room(self) -> bool:
-        """Whether fewer tasks run than may."""
+        """Return whether fewer tasks run than may."""
         return len(self._running) < self.workers
 
     def submit(self, task: Task) -> None:
@@ -60,7 +60,7 @@ class RayCluster:
         self._running[remote.remote(task, self._ship(task.job.policy))] = task
 
     def wait(self) -> list[Event]:
-        """One event of every task that has something to say."""
+        """Return one event of every task that has something to say."""
         ready, _ = ray.wait(list(self._running), num_returns=1, fetch_local=False)
         return [self._next(answers) for answers in ready]
 

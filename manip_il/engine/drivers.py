@@ -21,7 +21,7 @@ class ExpertDriver:
     """Executes the expert's label."""
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The label of every episode."""
+        """Return the label of every episode."""
         return [(turn.ask().action, Actor.EXPERT) for turn in turns]
 
 
@@ -33,7 +33,7 @@ class NoisyExpertDriver:
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The label plus a draw from each episode's own generator."""
+        """Return the label plus a draw from each episode's own generator."""
         return [(turn.ask().action + self._draw(turn.seed), Actor.NOISY_EXPERT) for turn in turns]
 
     def _draw(self, seed: int) -> F64:
@@ -48,7 +48,7 @@ class LearnerDriver:
         self._policy = policy
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The policy's action in every episode."""
+        """Return the policy's action in every episode."""
         if started := [turn.seed for turn in turns if turn.step == 0]:
             self._policy.reset(started)
         actions = self._policy.act(*seen(turns, self._policy.cameras), [turn.seed for turn in turns])
@@ -63,7 +63,7 @@ class MixtureDriver:
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The learner's or the expert's action, drawn from each episode's own generator."""
+        """Return the learner's or the expert's action, drawn from each episode's own generator."""
         chosen = self._learner.act(turns)
         for i, turn in enumerate(turns):
             rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "mixture"))
@@ -95,7 +95,7 @@ class TakeoverDriver:
         self._taken: set[int] = set()
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """The learner's action, or the expert's in episodes that it has taken over."""
+        """Return the learner's action, or the expert's in episodes that it has taken over."""
         rolling = [turn for turn in turns if turn.seed not in self._taken]
         chosen = dict(zip([turn.seed for turn in rolling], self._learner.act(rolling), strict=True)) if rolling else {}
         wanted = self._gate(rolling, [chosen[turn.seed][0] for turn in rolling]) if rolling else []
@@ -111,7 +111,7 @@ class RandomDriver:
         self._rngs: dict[int, np.random.Generator] = {}
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """A drawn action for every episode."""
+        """Return a drawn action for every episode."""
         return [(self._draw(turn), Actor.LEARNER) for turn in turns]
 
     def _draw(self, turn: Turn) -> F64:

@@ -65,7 +65,7 @@ class Place(Protocol):
         ...
 
     def has_room(self) -> bool:
-        """Whether another task can start at once."""
+        """Return whether another task can start at once."""
         ...
 
     def submit(self, task: Task) -> None:
@@ -181,7 +181,7 @@ def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
 
 
 def portable(error: Exception) -> Exception:
-    """The error as it can travel between processes: ours as they are, others in words."""
+    """Return the error as it can travel between processes: ours as they are, others in words."""
     return error if isinstance(error, ManipError) else ManipError(f"{type(error).__name__}: {error}")
 
 

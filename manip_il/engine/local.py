@@ -60,7 +60,7 @@ class LocalProcesses:
         self._busy: dict[Connection, _Worker] = {}
 
     def has_room(self) -> bool:
-        """Whether a worker is free or may be started."""
+        """Return whether a worker is free or may be started."""
         return len(self._busy) < self.workers
 
     def submit(self, task: Task) -> None:
@@ -71,7 +71,7 @@ class LocalProcesses:
         worker.start(task)
 
     def wait(self) -> list[Event]:
-        """One event of every worker that has something to say."""
+        """Return one event of every worker that has something to say."""
         events: list[Event] = []
         for ready in wait(list(self._busy)):
             assert isinstance(ready, Connection)

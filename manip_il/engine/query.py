@@ -76,12 +76,12 @@ Gate = Callable[[Sequence[Turn], Sequence[F64]], list[bool]]
 
 
 def action_gap(left: F64, right: F64, scale: F64) -> F64:
-    """The largest difference over the dimensions of two actions (..., n), in units of `scale` (n,)."""
+    """Return the largest difference over the dimensions of two actions (..., n), in units of `scale` (n,)."""
     return np.abs((left - right) / scale).max(axis=-1)
 
 
 def drawn_step(seed: int, steps: int) -> int:
-    """One step of `steps`, the same for the same episode."""
+    """Return one step of `steps`, the same for the same episode."""
     return int(rng_for(seed, _STREAM).integers(steps))
 
 
@@ -143,7 +143,7 @@ def where_unsure(bound: float, learner: Policy) -> Gate:
 
 
 def seen(turns: Sequence[Turn], cameras: Sequence[str]) -> tuple[F32, F32, dict[str, NDArray[np.uint8]]]:
-    """The turns' observations as a policy takes them: (B, n), (B, k), camera -> (B, H, W, 3)."""
+    """Return the turns' observations as a policy takes them: (B, n), (B, k), camera -> (B, H, W, 3)."""
     observations = [turn.observation for turn in turns]
     return (
         np.stack([one.state for one in observations]),

@@ -142,7 +142,7 @@ def render_episodes(
 def render_states(
     env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], appearance: Appearance = PLAIN
 ) -> Pictures:
-    """Pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
+    """Return pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
 
     The bytes are those that an environment with these cameras gave when it was in these states and looked so.
     """

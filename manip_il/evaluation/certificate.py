@@ -139,7 +139,7 @@ class Row:
 
 
 def pooled(rows: tuple[Row, ...], words: str) -> Row:
-    """All cases of some rows of one group as one row. Raises `UsageError` without rows."""
+    """Return all cases of some rows of one group as one row. Raises `UsageError` without rows."""
     if not rows:
         raise UsageError(f"certificate: no rows to pool as {words!r}")
     cases = tuple(case for row in rows for case in row.cases)
@@ -173,7 +173,7 @@ class Certificate:
     rows: tuple[Row, ...]
 
     def of(self, group: Group) -> tuple[Row, ...]:
-        """The rows of a group."""
+        """Return the rows of a group."""
         return tuple(row for row in self.rows if row.group == group)
 
     @property
@@ -187,7 +187,7 @@ class Certificate:
         return pooled(self.of("action"), "all wrong actions")
 
     def to_json(self) -> dict[str, Any]:
-        """The contents of `certificate.json`.
+        """Return the contents of `certificate.json`.
 
         robot, task, policy (or null), fingerprint, settings (`Settings`), confidence of every interval, mu (the largest
         gap of all wrong actions [control steps]), and rows, a list of: group (start, state, action, learner), kind,

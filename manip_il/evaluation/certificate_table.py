@@ -12,7 +12,7 @@ SHOWN = 6  # seeds of failures in a line at most
 
 
 def certificate_lines(certificate: Certificate) -> list[str]:
-    """The table of recoveries, the table of wrong actions, and what they say in words."""
+    """Return the table of recoveries, the table of wrong actions, and what they say in words."""
     settings = certificate.settings
     horizon = f"{settings.horizon} steps ({_seconds(settings.horizon, settings.control_hz)})"
     return [
@@ -27,7 +27,7 @@ def certificate_lines(certificate: Certificate) -> list[str]:
 
 
 def align(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Columns as wide as their widest cell, under a rule behind the first line; all but the first set right."""
+    """Return columns as wide as their widest cell, under a rule behind the first line; all but the first set right."""
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]
     return [lines[0].rstrip(), "-" * len(lines[0]), *lines[1:]]

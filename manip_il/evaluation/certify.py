@@ -74,7 +74,7 @@ def certify(
 
 
 def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> int:
-    """How many episodes `certify` runs at most."""
+    """Return how many episodes `certify` runs at most."""
     return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
 
 
@@ -149,11 +149,11 @@ class _Run:
 
 
 def draw_moment(seed: int, kind: str, steps: int) -> int:
-    """One of the `steps` steps of an undisturbed run, for one kind of perturbation."""
+    """Return one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 
 def happened(episode: Episode, run: Undisturbed, moment: int) -> bool:
-    """Whether the state or the action of that moment is another than in the undisturbed run."""
+    """Return whether the state or the action of that moment is another than in the undisturbed run."""
     state, action = episode.columns[schema.SIM_STATE][moment], episode.columns[schema.EXECUTED_ACTION][moment]
     return not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment]))

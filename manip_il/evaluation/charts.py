@@ -12,12 +12,12 @@ BAR_HEIGHT = 26  # px
 
 
 def success_bar(row: PolicyRow) -> str:
-    """One bar from 0 to 100 % with its interval as a whisker; as wide as what it stands in."""
+    """Return one bar from 0 to 100 % with its interval as a whisker; as wide as what it stands in."""
     return _bar(row.name, row.kind, row.success)
 
 
 def seeds_bar(name: str, kind: str, successes: Sequence[Proportion]) -> str:
-    """One bar of the mean over training seeds, each seed a dot; of one seed, its interval."""
+    """Return one bar of the mean over training seeds, each seed a dot; of one seed, its interval."""
     if len(successes) == 1:
         return _bar(name, kind, successes[0])
     rates = [one.rate for one in successes]

@@ -73,7 +73,7 @@ class CompareReport:
 
 
 def compare_page(report: CompareReport) -> str:
-    """The page as one string of HTML."""
+    """Return the page as one string of HTML."""
     comparison = report.comparison
     return render_page(
         report.title,

@@ -14,7 +14,7 @@ UNEQUAL = 1.05  # costs that differ by a larger factor are said not to be equal
 
 
 def comparison_table(comparison: Comparison) -> Cells:
-    """Two rows a training seed, the paired result on the second."""
+    """Return two rows a training seed, the paired result on the second."""
     confidence = f"{100 * comparison.confidence:g} %"
     columns = ("policy", "training seed", "round", "labels", "episodes", "wall-clock", "validation")
     columns += (f"test [{confidence} interval]", "difference", "McNemar's exact p")

@@ -34,7 +34,7 @@ class Hardest:
 
 
 def condition_rows(result: EvalResult, kind: Kind) -> list[PolicyRow]:
-    """A row a condition, after one of all; of a single condition, that row alone."""
+    """Return a row a condition, after one of all; of a single condition, that row alone."""
     parts = {
         name: PolicyRow.of(name or UNNAMED, replace(result, episodes=episodes), kind=kind)
         for name, episodes in by_condition(result).items()
@@ -45,12 +45,12 @@ def condition_rows(result: EvalResult, kind: Kind) -> list[PolicyRow]:
 
 
 def success_bars(rows: Sequence[PolicyRow]) -> str:
-    """A bar with its interval for every row."""
+    """Return a bar with its interval for every row."""
     return sections.bars([(row.name, success_bar(row), row.success.rate) for row in rows])
 
 
 def condition_words(result: EvalResult) -> dict[str, str]:
-    """Condition -> what is drawn under it; empty where nothing is."""
+    """Return condition -> what is drawn under it; empty where nothing is."""
     conditions = result.settings.conditions
     if not any(condition.ranges for condition in conditions):
         return {}
@@ -61,7 +61,7 @@ def condition_words(result: EvalResult) -> dict[str, str]:
 
 
 def hardest(result: EvalResult) -> Hardest | None:
-    """None where there is one condition alone."""
+    """Return none where there is one condition alone."""
     parts = {
         name or UNNAMED: replace(result, episodes=episodes).success for name, episodes in by_condition(result).items()
     }
@@ -78,7 +78,7 @@ def hardest(result: EvalResult) -> Hardest | None:
 
 
 def paired_conditions(comparison: Comparison) -> Cells | None:
-    """Both arms by condition, all training seeds together; None where there is one condition alone.
+    """Return both arms by condition, all training seeds together; None where there is one condition alone.
 
     p: exact over test episodes as in `Comparison.p_value`, corrected for the number of conditions (Holm).
     """

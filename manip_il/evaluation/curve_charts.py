@@ -34,12 +34,12 @@ class Across:
     words: str = ""
 
     def percent(self, amount: float) -> float:
-        """Where an amount lies [percent]."""
+        """Return where an amount lies [percent]."""
         return self.axis.percent(amount / self.unit)
 
 
 def across(cost: Cost, amounts: Sequence[float], log: bool | None = None) -> Across:
-    """An axis for these amounts, seconds in a unit that people read."""
+    """Return an axis for these amounts, seconds in a unit that people read."""
     _, unit, name = next(one for one in UNITS if max(amounts) >= one[0]) if cost == "seconds" else (0, 1.0, "")
     axis = axis_for([amount / unit for amount in amounts], log)
     words = [NAMES[cost], f" [{name}]" if name else "", ", logarithmic" if axis.log else ""]
@@ -47,7 +47,7 @@ def across(cost: Cost, amounts: Sequence[float], log: bool | None = None) -> Acr
 
 
 def learning_curve(curve: LearningCurve, cost: Cost = "labels") -> str:
-    """Success over `cost`: rounds of DAgger joined by a line, cloning as squares, expert and target as levels."""
+    """Draw success over `cost`: DAgger's rounds as a line, cloning as squares, expert and target as levels."""
     x, y = curve_axes(curve, cost)
     shared = {p.labels for p in curve.dagger} & {p.labels for p in curve.cloning}
     return _chart(
@@ -61,7 +61,10 @@ def learning_curve(curve: LearningCurve, cost: Cost = "labels") -> str:
 
 
 def study_curve(arms: Sequence[tuple[ArmCurve, str]], cost: Cost, target: float | None = None) -> str:
-    """Every arm with its kind (a CSS class): the mean over training seeds by round, and each seed as a thin line."""
+    """Return every arm with its kind (a CSS class).
+
+    The mean over training seeds by round, and each seed as a thin line.
+    """
     x = across(cost, [amount for arm, _ in arms for amount in _amounts(arm.points, cost)])
     y = success_axis([point.success for arm, _ in arms for point in arm.points], target)
     lines = [
@@ -71,7 +74,7 @@ def study_curve(arms: Sequence[tuple[ArmCurve, str]], cost: Cost, target: float 
 
 
 def curve_axes(curve: LearningCurve, cost: Cost = "labels") -> tuple[Across, Axis]:
-    """Cost across, success upwards [percent]."""
+    """Return cost across, success upwards [percent]."""
     proportions = [*(point.success for point in curve.points), *([curve.expert] if curve.expert else [])]
     x = across(cost, _amounts(curve.points, cost), curve.log_x if cost == "labels" else None)
     return x, success_axis(proportions, curve.target)
@@ -197,7 +200,7 @@ def _shape(shape: str, across: float, down: float) -> str:
 
 
 def whisker_down(across: float, top: float, bottom: float) -> str:
-    """An interval as a line with caps, at percent `across` between percent `top` and `bottom`."""
+    """Return an interval as a line with caps, at percent `across` between percent `top` and `bottom`."""
     at, a, b = percent(across), percent(top), percent(bottom)
     cap = {"class_": "cap", "x": at, "width": 8, "height": 1.5}
     return element(

@@ -20,7 +20,7 @@ from manip_il.evaluation.svg import Axis, element
 
 
 def curve(data: LearningCurve) -> str:
-    """The learning curve with its legend, and its numbers for those who cannot see it."""
+    """Return the learning curve with its legend, and its numbers for those who cannot see it."""
     legend = [
         ("dagger", f"{data.name}, one point a round", bool(data.dagger)),
         ("cloning", "behaviour cloning", bool(data.cloning)),
@@ -41,7 +41,7 @@ def curve(data: LearningCurve) -> str:
 
 
 def arm_curves(arms: Sequence[tuple[ArmCurve, str]], target: float | None = None) -> str:
-    """Learning curves of several arms, each with the CSS class of its colour, over every cost that all know."""
+    """Return learning curves of several arms, each with the CSS class of its colour, over every cost that all know."""
     points = [point for arm, _ in arms for point in arm.points]
     costs: list[Cost] = [cost for cost in COSTS if all(point.amount(cost) is not None for point in points)]
     drawn = [
@@ -67,7 +67,7 @@ def curve_note(words: str, y: Axis, timed: bool) -> str:
 
 
 def plots(drawn: Sequence[tuple[str, str]]) -> str:
-    """Charts with the words under their axes: the first as wide as the page, the others side by side."""
+    """Return charts with the words under their axes: the first as wide as the page, the others side by side."""
     each = [f'<div class="plot">{chart}<p class="x-title">{escape(words)}</p></div>' for chart, words in drawn]
     return f'<div class="plots">{"".join(each)}</div>'
 

@@ -30,13 +30,13 @@ _PARTS = {"colour": ("red", "green", "blue")}  # of other vectors, the length is
 
 
 def condition_of(episode: EpisodeResult) -> str:
-    """The name of the condition that it ran under; empty where nothing says."""
+    """Return the name of the condition that it ran under; empty where nothing says."""
     name = episode.detail.get("condition")
     return name if isinstance(name, str) else ""
 
 
 def by_condition(result: EvalResult) -> dict[str, tuple[EpisodeResult, ...]]:
-    """Condition -> its episodes, in the order in which conditions first come."""
+    """Return condition -> its episodes, in the order in which conditions first come."""
     groups: dict[str, list[EpisodeResult]] = {}
     for episode in result.episodes:
         groups.setdefault(condition_of(episode), []).append(episode)
@@ -44,22 +44,22 @@ def by_condition(result: EvalResult) -> dict[str, tuple[EpisodeResult, ...]]:
 
 
 def start_of(episode: EpisodeResult) -> Place | None:
-    """Where the object started, or the hand where the task has no object."""
+    """Return where the object started, or the hand where the task has no object."""
     return _thing(episode, "start")
 
 
 def end_of(episode: EpisodeResult) -> Place | None:
-    """Where the same ended."""
+    """Return where the same ended."""
     return _thing(episode, "end")
 
 
 def goal_of(episode: EpisodeResult) -> Place | None:
-    """Where it was to go."""
+    """Return where it was to go."""
     return _place(episode.detail.get("goal"))
 
 
 def has_object(result: EvalResult) -> bool:
-    """Whether any episode tells of an object; without one the hand itself goes to the goal."""
+    """Return whether any episode tells of an object; without one the hand itself goes to the goal."""
     starts = [episode.detail.get("start") for episode in result.episodes]
     return not any(isinstance(start, Mapping) for start in starts) or any(
         isinstance(start, Mapping) and _place(start.get("object")) is not None for start in starts
@@ -67,7 +67,7 @@ def has_object(result: EvalResult) -> bool:
 
 
 def drawn_numbers(episode: EpisodeResult) -> dict[str, float]:
-    """Every drawn number by its name and unit, `mass [kg]`: parts of a colour, lengths of other vectors."""
+    """Return every drawn number by its name and unit, `mass [kg]`: parts of a colour, lengths of other vectors."""
     drawn = episode.detail.get("drawn")
     if not isinstance(drawn, Mapping):
         return {}

@@ -76,7 +76,7 @@ class EvalReport:
 
 
 def eval_page(report: EvalReport) -> str:
-    """The page as one string of HTML."""
+    """Return the page as one string of HTML."""
     curve = report.curve
     return render_page(
         report.title,

@@ -10,7 +10,7 @@ from manip_il.evaluation.tables import Cells
 
 
 def evaluation_table(result: EvalResult) -> Cells:
-    """Rows of success with its interval, success at the end, and control steps until success."""
+    """Return rows of success with its interval, success at the end, and control steps until success."""
     head = (f"success [{100 * result.confidence:g} % interval]", "success at end", "steps to success")
     return Cells(("policy", "episodes", *head), tuple(_rows(result)))
 

@@ -12,7 +12,7 @@ from manip_il.evaluation.statistics import format_p
 
 
 def eval_verdict(result: EvalResult, episodes: str = "unseen episodes") -> str:
-    """The first sentence: success with its interval, the phase that failures end in, the hardest condition.
+    """Return the first sentence: success with its interval, the phase that failures end in, the hardest condition.
 
     episodes: what they are called.
     """
@@ -42,7 +42,7 @@ def eval_facts(result: EvalResult, factors: tuple[Factor, ...]) -> list[str]:
 
 
 def main_phase(result: EvalResult) -> tuple[str, int] | None:
-    """The phase that most failures ended in, and how many; None where none failed or no phase is known."""
+    """Return the phase that most failures ended in, and how many; None where none failed or no phase is known."""
     known = {phase: count for phase, count in result.failures.items() if phase}
     return next(iter(known.items()), None)
 

@@ -59,7 +59,7 @@ class Factor:
 
 
 def find_factors(result: EvalResult) -> tuple[Factor, ...]:
-    """Every coordinate and drawn number that varied, those that failures go with the most first.
+    """Return every coordinate and drawn number that varied, those that failures go with the most first.
 
     Places are taken over all episodes, drawn numbers within the condition that drew them: elsewhere they do not vary,
     and would only tell the condition. Empty where all succeeded, or none did.
@@ -79,7 +79,7 @@ def find_factors(result: EvalResult) -> tuple[Factor, ...]:
 
 
 def fisher_exact(successes: Sequence[int], sizes: Sequence[int]) -> float:
-    """Two-sided p that two or three groups have one success rate, by all tables with the same sums.
+    """Return two-sided p that two or three groups have one success rate, by all tables with the same sums.
 
     Freeman and Halton (1951), Biometrika 38, 141-149; of two groups it is Fisher's exact test. Raises `ManipError` for
     another number of groups, or counts that cannot be.
@@ -106,7 +106,7 @@ def fisher_exact(successes: Sequence[int], sizes: Sequence[int]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Every p corrected for how many there are: Holm (1979), Scand. J. Statist. 6, 65-70."""
+    """Return every p corrected for how many there are: Holm (1979), Scand. J. Statist. 6, 65-70."""
     corrected = [1.0] * len(p_values)
     largest = 0.0
     for rank, index in enumerate(sorted(range(len(p_values)), key=lambda i: p_values[i])):

@@ -35,13 +35,13 @@ class MapMark:
 
 
 def map_marks(result: EvalResult) -> tuple[MapMark, ...]:
-    """Every episode whose start and goal are known, in the order of the file."""
+    """Return every episode whose start and goal are known, in the order of the file."""
     found = (map_mark(episode, "solved" if episode.success else "failed") for episode in result.episodes)
     return tuple(mark for mark in found if mark is not None)
 
 
 def map_mark(episode: EpisodeResult, outcome: Outcome) -> MapMark | None:
-    """The episode's mark; None where its start or its goal is not known."""
+    """Return the episode's mark; None where its start or its goal is not known."""
     start, goal = start_of(episode), goal_of(episode)
     if start is None or goal is None:
         return None
@@ -52,7 +52,7 @@ def map_mark(episode: EpisodeResult, outcome: Outcome) -> MapMark | None:
 
 
 def failure_map(marks: Sequence[MapMark], name: str = "", *, stacked: bool = False) -> str:
-    """Two views of the same marks. stacked: one above the other, for two maps side by side."""
+    """Return two views of the same marks. stacked: one above the other, for two maps side by side."""
     places = np.array([place for mark in marks for place in (mark.start, mark.goal)], dtype=np.float64)
     shown = _thinned(marks)
     views = "".join(

@@ -31,7 +31,7 @@ Frames = Sequence[NDArray[np.uint8]]
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
-    """The episode of one seed, with its states: the same that an evaluation of `job` saw."""
+    """Return the episode of one seed, with its states: the same that an evaluation of `job` saw."""
     return next(iter(run_job(replace(job, label="last"), [seed])))
 
 
@@ -43,7 +43,7 @@ def film(
     every: int = 1,
     appearance: Appearance = PLAIN,
 ) -> list[NDArray[np.uint8]]:
-    """One picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
+    """Return one picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
 
     appearance: how the episode's world looked.
 
@@ -55,7 +55,7 @@ def film(
 
 
 def shown_steps(episode: Episode, fps: int) -> int:
-    """How many control steps a picture of the episode spans: to `AFTER_SUCCESS` once solved, else all."""
+    """Return how many control steps a picture of the episode spans: to `AFTER_SUCCESS` once solved, else all."""
     solved = episode.columns[schema.SUCCESS].ravel()
     if not solved.any():
         return len(episode)
@@ -63,12 +63,12 @@ def shown_steps(episode: Episode, fps: int) -> int:
 
 
 def make_film(policy: str, frames: Frames, fps: int, caption: str = "", success: bool | None = None) -> Film:
-    """Pictures (height, width, 3) as a film; its poster is the last one, with the goal reached or missed."""
+    """Return pictures (height, width, 3) as a film; its poster is the last one, with the goal reached or missed."""
     return Film(policy, encode_mp4(frames, fps), caption, success, encode_jpeg(frames[-1]))
 
 
 def encode_mp4(frames: Frames, fps: int) -> bytes:
-    """An MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
+    """Return an MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
 
     Raises `ManipError` for no frames, or for a height or width that is odd, which 4:2:0 has not.
     """
@@ -95,21 +95,21 @@ def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes]
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """One picture as PNG."""
+    """Return one picture as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="png", optimize=True)
     return buffer.getvalue()
 
 
 def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """One picture as JPEG, a fifth of the size of PNG."""
+    """Return one picture as JPEG, a fifth of the size of PNG."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, format="jpeg", quality=85, optimize=True)
     return buffer.getvalue()
 
 
 def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "") -> Paths:
-    """Where hand, object (the hand again where the task has none) and goal were; needs no OpenGL."""
+    """Return where hand, object (the hand again where the task has none) and goal were; needs no OpenGL."""
     rows = episode.columns[schema.ENVIRONMENT_STATE][: shown_steps(episode, spec.fps)].astype(np.float64)
     names = list(spec.environment_state_names)
 

@@ -12,7 +12,7 @@ LONG = 24  # characters of a row's name, from which on it may be broken over lin
 
 
 def cells_table(cells: Cells, kinds: Mapping[str, str] | None = None, names: Collection[str] = ()) -> str:
-    """The table without its empty columns. kinds: a row's name -> the CSS class of its colour.
+    """Return the table without its empty columns. kinds: a row's name -> the CSS class of its colour.
 
     names: columns that are called by the name of something, which keeps its small letter.
     """

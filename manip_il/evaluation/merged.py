@@ -12,7 +12,7 @@ _SAME = ("policy_sha256", "robot", "task", "settings", "confidence")
 
 
 def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
-    """All episodes of the parts (name -> part), in the order of their seeds.
+    """Return all episodes of the parts (name -> part), in the order of their seeds.
 
     Raises `MismatchError` where they are not of one policy in one world, and `ManipError` for no part, for a seed that
     two of them ran, or for a part that stopped by what it saw: its number of episodes was not fixed before.

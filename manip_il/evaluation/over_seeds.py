@@ -15,7 +15,7 @@ from manip_il.evaluation.statistics import CONFIDENCE
 
 
 def mean_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Student's (low, high) of the mean of independent `values`; `UsageError` for fewer than two.
+    """Return Student's (low, high) of the mean of independent `values`; `UsageError` for fewer than two.
 
     Student (1908), Biometrika 6, 1-25. With two or three values it is wide, and honestly so: the factor on the
     standard error is 12.7 or 4.3 where many values have 2.0.
@@ -27,7 +27,7 @@ def mean_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> tu
 
 
 def t_quantile(confidence: float, degrees: int) -> float:
-    """The t that a Student variable with `degrees` of freedom stays within, on both sides, with this probability."""
+    """Return Student's t with `degrees` of freedom for a two-sided interval of this confidence."""
     if degrees < 1 or not 0 < confidence < 1:
         raise UsageError(
             f"t quantile of {confidence} with {degrees} degrees of freedom; expected 0 to 1 and at least 1"
@@ -40,7 +40,7 @@ def t_quantile(confidence: float, degrees: int) -> float:
 
 
 def sign_flip_exact(differences: Sequence[int]) -> float:
-    """Two-sided p that every difference, one a test episode, was as likely to have the other sign.
+    """Return two-sided p that every difference, one a test episode, was as likely to have the other sign.
 
     differences: right's successes less left's in that episode, summed over training seeds. All signs are flipped at
     once, so that training seeds which share an episode need not be independent in it. With one training seed this is

@@ -10,7 +10,7 @@ from manip_il.evaluation.failure_map import MapMark, Outcome, map_mark
 
 
 def paired_marks(comparison: Comparison) -> tuple[tuple[MapMark, ...], tuple[MapMark, ...]]:
-    """The left arm's and the right arm's marks, in the order of the test episodes.
+    """Return the left arm's and the right arm's marks, in the order of the test episodes.
 
     `failed`: the arm failed where the other did not, with several training seeds in more of them; `shared`: it failed,
     and the other at least as often.

@@ -32,7 +32,7 @@ class View:
 
 
 def fit_view(points: F64, right: int, up: int, height: float = HEIGHT) -> View:
-    """The view that has all `points` (T, 3) [m] inside, as large as they allow."""
+    """Return the view that has all `points` (T, 3) [m] inside, as large as they allow."""
     flat = points[:, [right, up]]
     low, high = flat.min(axis=0), flat.max(axis=0)
     room = np.array([WIDTH, height]) - 2 * MARGIN
@@ -43,12 +43,12 @@ def fit_view(points: F64, right: int, up: int, height: float = HEIGHT) -> View:
 
 
 def top_view(paths: Paths) -> str:
-    """Seen from above: x to the right, y upwards."""
+    """Return seen from above: x to the right, y upwards."""
     return _draw(paths, fit_view(_everything(paths), 0, 1), "from above")
 
 
 def side_view(paths: Paths) -> str:
-    """Seen from the side: height over x or y, whichever the episode uses more."""
+    """Return seen from the side: height over x or y, whichever the episode uses more."""
     spread = np.ptp(_everything(paths), axis=0)
     return _draw(paths, fit_view(_everything(paths), 0 if spread[0] >= spread[1] else 1, 2), "from the side")
 

@@ -27,7 +27,7 @@ class PhaseRow:
 
 
 def phase_rows(policies: Sequence[Sequence[EpisodeResult]], task: str) -> tuple[PhaseRow, ...]:
-    """The phases of a task's ladder in order; then what a foreign file calls by other names."""
+    """Return the phases of a task's ladder in order; then what a foreign file calls by other names."""
     counted = [Counter(e.phase_at_end or NOT_TOLD for e in episodes if not e.success) for episodes in policies]
     meanings = _meanings(task)
     others = sorted({name for counts in counted for name in counts} - meanings.keys())
@@ -48,7 +48,7 @@ def _meanings(task: str) -> dict[str, str]:
 
 
 def phase_chart(rows: Sequence[PhaseRow], kinds: Sequence[str], names: Sequence[str]) -> str:
-    """A histogram lying on its side. kinds, names: of the policies, for the bars' colours and words."""
+    """Return a histogram lying on its side. kinds, names: of the policies, for the bars' colours and words."""
     most = max((count for row in rows for count in row.counts), default=0) or 1
     lines = "".join(_line(row, kinds, names, most) for row in rows)
     return f'<div class="bars phases">{lines}</div>'

@@ -38,7 +38,7 @@ POLICY = "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-
 
 
 def render_report(report: Report) -> str:
-    """The page as one string of HTML."""
+    """Return the page as one string of HTML."""
     return render_page(
         report.title,
         [
@@ -52,7 +52,7 @@ def render_report(report: Report) -> str:
 
 
 def render_page(title: str, body: Sequence[str]) -> str:
-    """A whole page around the parts of its body."""
+    """Return a whole page around the parts of its body."""
     css = files("manip_il.evaluation").joinpath("report.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'

@@ -45,7 +45,7 @@ class PolicyRow:
         disturbed: EvalResult | None = None,
         kind: Kind = "dagger",
     ) -> PolicyRow:
-        """A row from one evaluation, and a second one under a disturbance where there is one."""
+        """Return a row from one evaluation, and a second one under a disturbance where there is one."""
         return cls(
             name=name,
             success=result.success,
@@ -215,7 +215,7 @@ class Report:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """A nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
+    """Return a nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
     flat: dict[str, str] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"

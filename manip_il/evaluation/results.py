@@ -42,7 +42,7 @@ class EpisodeResult:
     detail: Mapping[str, Any] = field(default_factory=dict[str, Any])  # further keys of the JSON object
 
     def to_json(self) -> dict[str, Any]:
-        """The episode as `eval.json` holds it."""
+        """Return the episode as `eval.json` holds it."""
         own = {
             "seed": self.seed,
             "success": self.success,
@@ -55,7 +55,7 @@ class EpisodeResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
-        """The inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
         data = checks.mapping("an episode", data)
         known = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")
         detail = {key: value for key, value in data.items() if key not in known}
@@ -100,7 +100,7 @@ class EvalSettings:
         return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions, job.hold)
 
     def env(self, robot: str, task: str) -> EnvConfig:
-        """The environment that was evaluated in."""
+        """Return the environment that was evaluated in."""
         from manip_il.sim.env import EnvConfig  # here, as whoever only reads results needs no simulator
 
         return EnvConfig(robot, task, self.control_hz, self.tolerance, self.success_steps, self.horizon)
@@ -129,7 +129,7 @@ class EvalSettings:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
-        """The inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is amiss or missing."""
         data = checks.mapping("settings", data)
         given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), _MOST_CONDITIONS)
         named = [checks.mapping("a condition", one) for one in given]
@@ -211,7 +211,7 @@ class EvalResult:
         return dict(sorted(((p, phases.count(p)) for p in set(phases)), key=lambda item: (-item[1], item[0])))
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of `eval.json`."""
+        """Return the contract of `eval.json`."""
         return {
             "success_rate": self.success.rate,
             "interval": list(self.success.interval),
@@ -235,7 +235,7 @@ class EvalResult:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalResult:
-        """The inverse of `to_json`: rates and interval are worked out anew from the episodes."""
+        """Return the inverse of `to_json`: rates and interval are worked out anew from the episodes."""
         width = data.get("until_width")
         return cls(
             policy=checks.text("policy", data["policy"]),

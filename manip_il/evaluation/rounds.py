@@ -59,7 +59,10 @@ History = tuple[Round, ...]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """A run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are none of a run."""
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`.
+
+    `ManipError` where they are none of a run.
+    """
     if not records:
         raise ManipError(f"{name} has no finished round yet; continue with manip-il dagger --resume=true")
     rounds: list[Round] = []
@@ -102,7 +105,7 @@ def _number(record: Mapping[str, Any]) -> int:
 
 
 def curve_points(rounds: History) -> tuple[CurvePoint, ...]:
-    """A run's learning curve, with all that it had cost."""
+    """Return a run's learning curve, with all that it had cost."""
     return tuple(
         CurvePoint(one.labels, one.validation, f"round {one.round}", one.episodes, one.seconds) for one in rounds
     )
@@ -151,7 +154,9 @@ class Rule:
 
 
 def budget(rule: Rule, histories: Sequence[History]) -> float | None:
-    """How much of `rule.axis` every run may have used: given, or the largest that all reached; None for no limit.
+    """Return how much of `rule.axis` every run may have used: given, or the largest that all reached.
+
+    None for no limit.
 
     Raises `UsageError` where a run ended at less than `ENOUGH` of what is given.
     """
@@ -167,7 +172,7 @@ def budget(rule: Rule, histories: Sequence[History]) -> float | None:
 
 
 def choose(rule: Rule, rounds: History, limit: float | None, name: str) -> Round:
-    """The round that `rule` takes of one run; `UsageError` where none ended within `limit`."""
+    """Return the round that `rule` takes of one run; `UsageError` where none ended within `limit`."""
     within = [one for one in rounds if rule.axis == END or limit is None or one.amount(rule.axis) <= limit]
     if not within:
         assert rule.axis != END
@@ -181,12 +186,15 @@ def choose(rule: Rule, rounds: History, limit: float | None, name: str) -> Round
 
 
 def first_reaching(rounds: History, target: float) -> Round | None:
-    """The first round with at least this validation success; None where none got there."""
+    """Return the first round with at least this validation success; None where none got there."""
     return next((one for one in rounds if one.validation.rate >= target), None)
 
 
 def largest_dip(rounds: History) -> float:
-    """How far validation success fell, in any round, below the best before it; 0 where it never did, at most 1."""
+    """Return how far validation success fell, in any round, below the best before it.
+
+    0 where it never did, at most 1.
+    """
     best, dip = 0.0, 0.0
     for one in rounds:
         dip, best = max(dip, best - one.validation.rate), max(best, one.validation.rate)

@@ -94,7 +94,7 @@ OUTCOMES: tuple[tuple[bool | None, str], ...] = ((None, ""), (False, "Failures")
 
 
 def header(report: Told) -> str:
-    """The verdict comes first; then what else can be said in a sentence."""
+    """Return the verdict comes first; then what else can be said in a sentence."""
     facts = "".join(f"<li>{prose(fact)}</li>" for fact in report.facts)
     return (
         f'<header><p class="kicker">{escape(report.title)}</p><h1>{prose(report.verdict)}</h1>'
@@ -103,7 +103,7 @@ def header(report: Told) -> str:
 
 
 def results(report: Report) -> str:
-    """The table, and under it the same success as bars."""
+    """Return the table, and under it the same success as bars."""
     drawn = [(row.name, success_bar(row), row.success.rate) for row in report.rows]
     return section(
         "Results",
@@ -131,7 +131,7 @@ def _pictures_of(report: Pictured, success: bool | None, heading: str) -> str:
 
 
 def making(report: Told) -> str:
-    """The command, and folded away: timings, configuration and fingerprint."""
+    """Return the command, and folded away: timings, configuration and fingerprint."""
     # Word by word, so that a narrow page breaks lines between options and not inside them.
     words = " ".join(f"<span>{escape(word)}</span>" for word in report.command.split(" "))
     timings = {what: format_seconds(seconds) for what, seconds in report.timings.items()}
@@ -145,7 +145,7 @@ def making(report: Told) -> str:
 
 
 def policy_table(rows: Sequence[PolicyRow], named: str = "Policy") -> str:
-    """A line each, without the columns that no row fills. named: what a row is."""
+    """Return a line each, without the columns that no row fills. named: what a row is."""
     confidence = f"{100 * rows[0].success.confidence:g} %"
     columns: list[tuple[str, list[str]]] = [
         ("Expert labels", [NOT_MEASURED if r.labels is None else f"{r.labels:,}" for r in rows]),
@@ -260,18 +260,18 @@ def details(name: str, content: str) -> str:
 
 
 def pairs(named: Mapping[str, str]) -> str:
-    """Names and values, a line each."""
+    """Return names and values, a line each."""
     rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in named.items())
     return f'<dl class="pairs">{rows}</dl>'
 
 
 def section(name: str, *parts: str) -> str:
-    """A part of the page with its heading."""
+    """Return a part of the page with its heading."""
     return f"<section><h2>{escape(name)}</h2>{''.join(parts)}</section>"
 
 
 def prose(sentence: str) -> str:
-    """A sentence, escaped."""
+    """Return a sentence, escaped."""
     # A number keeps its unit, and a comparison its sign, on one line.
     joined = re.sub(r"(?<=\d) (?=%)|(?<=\bp) (?=[<=] )|(?<=[<=]) (?=\d)", "\u00a0", sentence)
     return escape(joined, quote=False)

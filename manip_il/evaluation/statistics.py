@@ -34,7 +34,7 @@ class Proportion:
 
     @classmethod
     def of(cls, outcomes: Sequence[bool], confidence: float = CONFIDENCE, sequential: bool = False) -> Proportion:
-        """The proportion of true values."""
+        """Return the proportion of true values."""
         return cls(sum(map(bool, outcomes)), len(outcomes), confidence, sequential)
 
     @property
@@ -163,7 +163,7 @@ def confidence_sequence(successes: int, n: int, confidence: float = CONFIDENCE) 
 
 
 def mcnemar_exact(a: Sequence[bool], b: Sequence[bool]) -> float:
-    """Two-sided p that `a` and `b`, paired outcomes on the same seeds, have one success rate.
+    """Return two-sided p that `a` and `b`, paired outcomes on the same seeds, have one success rate.
 
     McNemar (1947), Psychometrika 12, 153-157, with the exact binomial in place of chi-square.
     """

@@ -74,23 +74,23 @@ class Study:
         ]
 
     def reached(self, arm: Arm) -> list[Round | None]:
-        """The round of each training seed in which validation first reached the target."""
+        """Return the round of each training seed in which validation first reached the target."""
         return [first_reaching(member.history, self.target) for member in arm.members]
 
     def results_table(self) -> Cells:
-        """An arm a row: what its policies had cost, how they did, and against the baseline."""
+        """Return an arm a row: what its policies had cost, how they did, and against the baseline."""
         columns = ("arm", *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
         columns += ("validation", "test", f"test, against {self.baseline}")
         return Cells((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
 
     def target_table(self) -> Cells:
-        """An arm a row: labels, episodes and wall-clock when validation first reached the target."""
+        """Return an arm a row: labels, episodes and wall-clock when validation first reached the target."""
         columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {_percent(self.target)}" for cost in COSTS]
         rows = [(arm.name, *(self._to_target(arm, cost) for cost in COSTS), self._fewer(arm)) for arm in self.arms]
         return Cells(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
 
     def to_json(self) -> dict[str, Any]:
-        """The contract of `study.json`."""
+        """Return the contract of `study.json`."""
         return {
             "verdict": self.verdict,
             "facts": self.facts,
@@ -153,7 +153,7 @@ class Study:
 
 
 def table_markdown(study: Study) -> str:
-    """Both tables, for the documentation."""
+    """Return both tables, for the documentation."""
     results, target = study.results_table().filled(), study.target_table().filled()
     count = study.arms[0].members[0].result.success.n
     seeds = ", ".join(map(str, study.training_seeds))

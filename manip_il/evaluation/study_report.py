@@ -50,7 +50,7 @@ class StudyReport:
 
 
 def render_study(report: StudyReport) -> str:
-    """The page as one string of HTML."""
+    """Return the page as one string of HTML."""
     study = report.study
     return render_page(
         report.title, [sections.header(report), _results(study), _curves(study), sections.making(report)]
@@ -96,12 +96,12 @@ def arm_kinds(study: Study) -> dict[str, str]:
 
 
 def arm_curve(arm: Arm) -> ArmCurve:
-    """Its members' runs; `ManipError` where one is of no run."""
+    """Return its members' runs; `ManipError` where one is of no run."""
     return ArmCurve(arm.name, tuple(curve_points(member.history) for member in arm.members))
 
 
 def arm_numbers(arms: Sequence[Arm]) -> dict[str, str]:
-    """Every round of every run in words, and its validation."""
+    """Return every round of every run in words, and its validation."""
     return {
         f"{arm.name}{_seed(member)}, {one.words}": str(one.validation)
         for arm in arms

@@ -25,7 +25,7 @@ def element(tag: str, *children: str, **attributes: object) -> str:
 
 
 def text(content: str, **attributes: object) -> str:
-    """A `<text>` with its content escaped."""
+    """Return a `<text>` with its content escaped."""
     return element("text", escape(content), **attributes)
 
 
@@ -43,7 +43,7 @@ class Axis:
     log: bool = False
 
     def percent(self, value: float) -> float:
-        """Where `value` lies [percent], clipped to the axis."""
+        """Return where `value` lies [percent], clipped to the axis."""
         low, high, value = (self._scale(v) for v in (self.low, self.high, value))
         return 100 * min(1.0, max(0.0, (value - low) / (high - low)))
 
@@ -56,7 +56,7 @@ class Axis:
 
 
 def axis_for(values: Sequence[float], log: bool | None = None) -> Axis:
-    """An axis with a little room on both sides; `log` None decides by the values' span."""
+    """Return an axis with a little room on both sides; `log` None decides by the values' span."""
     low, high = min(values), max(values)
     if log is None:
         log = low > 0 and high / low >= 20

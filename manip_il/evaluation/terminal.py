@@ -19,7 +19,7 @@ STYLES = {"expert": "green", "dagger": "bold blue", "cloning": "dark_orange", "b
 
 
 def results_table(rows: Sequence[PolicyRow], color: bool = True, width: int = PLAIN_WIDTH) -> Table:
-    """A table of policies; columns that no row fills are left out."""
+    """Return a table of policies; columns that no row fills are left out."""
     gap = " " if width >= ROOMY else "\n"
     confidence = f"{100 * rows[0].success.confidence:g} %" if rows else ""
     columns: list[tuple[str, list[str]]] = [

@@ -34,7 +34,7 @@ class Expert:
         self._rungs = tuple(zip(range(len(scene.task.rungs), 0, -1), scene.task.rungs, strict=True))
 
     def label(self, state: State) -> Label:
-        """The expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
+        """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
 
         Where there is no sound action (object out of reach, inverse kinematics without a solution), `valid`
         is false, `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of

@@ -15,7 +15,7 @@ _GREY = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
 
 
 def to_float(pictures: Tensor) -> Tensor:
-    """Levels 0 to 255 as float32 in [0, 1]: the values that LeRobot's loader gives."""
+    """Return levels 0 to 255 as float32 in [0, 1]: the values that LeRobot's loader gives."""
     return pictures.to(torch.float32).div_(255)
 
 

@@ -97,7 +97,10 @@ class CheckpointMeta:
         observation: str = "state",
         look: Mapping[str, Any] | None = None,
     ) -> CheckpointMeta:
-        """The meta of a policy trained on data of `spec`; look: `learn.observation.recorded_look` of the dataset."""
+        """Return the meta of a policy trained on data of `spec`.
+
+        look: `learn.observation.recorded_look` of the dataset.
+        """
         pictured = observation != "state"
         return cls(
             robot=spec.robot,
@@ -116,7 +119,7 @@ class CheckpointMeta:
 
 
 def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
-    """The checkpoint's meta, or None where another tool (lerobot-train) wrote the checkpoint.
+    """Return the checkpoint's meta, or None where another tool (lerobot-train) wrote the checkpoint.
 
     Raises `ManipError` for a file that is not ours or not whole.
     """
@@ -181,13 +184,13 @@ def save_checkpoint(
 
 
 def last_checkpoint(output_dir: Path) -> Path | None:
-    """The folder `checkpoints/last` under `output_dir`, or None where there is none."""
+    """Return the folder `checkpoints/last` under `output_dir`, or None where there is none."""
     last = Path(output_dir) / "checkpoints" / _LAST
     return last if (last / PRETRAINED_MODEL).is_dir() else None
 
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
-    """The step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
+    """Return the step and the resume key of a checkpoint folder. Raises `ManipError` where it has none."""
     path = checkpoint / TRAINING_STATE / STEP_FILE
     if not path.is_file():
         raise ManipError(f"no {path}: this checkpoint cannot be resumed; use it as init_from instead")

@@ -30,21 +30,23 @@ PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 
 @cache
 def policy_types() -> tuple[str, ...]:
-    """Every `--policy.type` that LeRobot and this project know."""
+    """Return every `--policy.type` that LeRobot and this project know."""
     for module in ("lerobot.policies", *PLUGINS):
         importlib.import_module(module)
     return tuple(sorted(PreTrainedConfig.get_known_choices()))
 
 
 def policy_class(kind: str) -> type[PreTrainedConfig]:
-    """The configuration class of a policy type; `UnknownName` for another."""
+    """Return the configuration class of a policy type; `UnknownName` for another."""
     if kind not in policy_types():
         raise UnknownName("policy", kind, policy_types())
     return PreTrainedConfig.get_choice_class(kind)
 
 
 def policy_config(settings: Mapping[str, Any], default_type: str = "mlp", *, trust: bool = False) -> PreTrainedConfig:
-    """The configuration that `--policy.*` asks for: of `type`, or of the checkpoint in `path`, with the rest changed.
+    """Return the configuration that `--policy.*` asks for.
+
+    Of `type`, or of the checkpoint in `path`, with the rest changed.
 
     The device is the graphics card where there is one. As many actions are taken of a plan as it has, where LeRobot's
     default is more. trust: whether models that the configuration names may be loaded. Raises `UnknownName` for a type
@@ -101,7 +103,7 @@ def _checked(config: PreTrainedConfig) -> PreTrainedConfig:
 
 
 def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """One of the configurations registered under `base`, by `settings["type"]`: an optimiser, a schedule."""
+    """Return one of the configurations registered under `base`, by `settings["type"]`: an optimiser, a schedule."""
     settings = dict(settings)
     known = sorted(base.get_known_choices())
     kind = settings.pop("type", None)
@@ -111,7 +113,7 @@ def choice(base: type[Any], settings: Mapping[str, Any], group: str) -> Any:
 
 
 def plain(cls: type[Any], settings: Mapping[str, Any], group: str) -> Any:
-    """A configuration without types, `WandBConfig` for instance."""
+    """Return a configuration without types, `WandBConfig` for instance."""
     return _decode(cls, dict(settings), f"--{group}")
 
 

@@ -51,7 +51,7 @@ def check_table(table: Table, spec: RobotTaskSpec) -> None:
 
 
 def learning_rows(table: Table) -> Rows:
-    """The rows whose `label_valid` is not 0 (all of them where there is no such column).
+    """Return the rows whose `label_valid` is not 0 (all of them where there is no such column).
 
     Targets are relative to the measured joints, the gripper's command is absolute. Without
     `episode_index` all rows count as one episode. Raises `ManipError` where no row is left.
@@ -69,7 +69,7 @@ def learning_rows(table: Table) -> Rows:
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:
-    """Whether each frame takes part in the loss, (N,)."""
+    """Return whether each frame takes part in the loss, (N,)."""
     if LABEL_VALID not in table:
         return np.ones(len(table[STATE]), dtype=bool)
     return np.asarray(table[LABEL_VALID]).reshape(-1) != 0
@@ -78,7 +78,7 @@ def valid_frames(table: Table) -> NDArray[np.bool_]:
 def split_by_episode(
     episodes: NDArray[np.int64], fraction: float, seed: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row numbers to train on and to hold out: about `fraction` of the episodes, whole ones.
+    """Return row numbers to train on and to hold out: about `fraction` of the episodes, whole ones.
 
     Nothing is held out where that would be less than half an episode or all of them.
     """
@@ -92,7 +92,7 @@ def split_by_episode(
 
 
 def read_columns(*roots: Path) -> dict[str, NDArray[Any]]:
-    """The learning columns of LeRobot v3.0 datasets' parquet files, whole, in order of `index`, which goes on.
+    """Return the learning columns of LeRobot v3.0 datasets' parquet files, whole, in order of `index`, which goes on.
 
     Raises `ManipError` where the files are not there.
     """

@@ -94,7 +94,7 @@ class _InOrder(nn.Module):
 
 
 def export_onnx(path: Path, policy_sha256: str) -> Exported:
-    """The policy in a `pretrained_model` folder as ONNX.
+    """Return the policy in a `pretrained_model` folder as ONNX.
 
     Raises `ManipError` where the file would act otherwise than the checkpoint, and what `LearnedPolicy.load` raises.
     """
@@ -129,7 +129,7 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
 
 
 def export_torchscript(path: Path, policy_sha256: str) -> Exported:
-    """The same as TorchScript: a module whose one argument is a dict of observations."""
+    """Return the same as TorchScript: a module whose one argument is a dict of observations."""
     policy, function, metadata = _load(path, policy_sha256)
     content = io.BytesIO()
     with warnings.catch_warnings():
@@ -154,7 +154,10 @@ def _without_source_paths(archive: bytes) -> bytes:
 
 
 def describe(policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str) -> dict[str, Any]:
-    """A file's metadata: what policy it is, for what, and its inputs and outputs. What is not known is left out."""
+    """Return a file's metadata: what policy it is, for what, and its inputs and outputs.
+
+    What is not known is left out.
+    """
     meta, n = policy.meta, policy.interface.action
     outputs = [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))]
     told: dict[str, Any] = {

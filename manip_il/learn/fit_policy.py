@@ -171,7 +171,7 @@ class PolicyTrainer:
                 yield {"step": self.step, **log.take(), "lr": self._lr()} | self.validate()
 
     def validate(self) -> dict[str, float]:
-        """Mean loss on samples of the held-out episodes, without touching the training's random state."""
+        """Return mean loss on samples of the held-out episodes, without touching the training's random state."""
         held_out = self.samples.held_out
         if len(held_out) == 0 or not self.accelerator.is_main_process:
             return {}
@@ -271,7 +271,7 @@ class _Log:
         self._waited += waited
 
     def take(self) -> dict[str, float]:
-        """The means, the samples a second, and the share of the time that was spent waiting for data."""
+        """Return the means, the samples a second, and the share of the time that was spent waiting for data."""
         seconds = max(time.perf_counter() - self._started, 1e-9)
         means = {name: total / self._steps for name, total in self._sums.items()}
         rates = {

@@ -64,7 +64,7 @@ class EpisodePolicy:
         return self._fresh
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        """One action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
+        """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget(self._memories.keys() - set(episodes))
         rows = ({key: values[i : i + 1] for key, values in batch.items()} for i in range(len(episodes)))
         try:
@@ -97,7 +97,7 @@ class EpisodePolicy:
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
-    """The policy in a `pretrained_model` folder, without a network where LeRobot needs none.
+    """Return the policy in a `pretrained_model` folder, without a network where LeRobot needs none.
 
     settings: its `config.json`. Raises `UnknownName` for a type that is not known, `ManipError` where packages are
     missing, where what it names would have to be trusted and is not (`require_trust`), or where LeRobot cannot load

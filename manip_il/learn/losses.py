@@ -43,11 +43,11 @@ class Head(ABC):
 
     @abstractmethod
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        """Loss of each row, (B,), from params (B, size) and target (B, n)."""
+        """Return loss of each row, (B,), from params (B, size) and target (B, n)."""
 
     @abstractmethod
     def action(self, params: Tensor) -> Tensor:
-        """The action of each row, (B, n)."""
+        """Return the action of each row, (B, n)."""
 
 
 class Distribution(Head):
@@ -59,10 +59,10 @@ class Distribution(Head):
 
     @abstractmethod
     def sample(self, params: Tensor, draws: Tensor) -> Tensor:
-        """One sample a row, (B, n), from params (B, size) and `draw` of each row (B, m)."""
+        """Return one sample a row, (B, n), from params (B, size) and `draw` of each row (B, m)."""
 
     def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
-        """Log-density of each row's target (B, n), of `categorical` log-probability [nats], (B,)."""
+        """Return log-density of each row's target (B, n), of `categorical` log-probability [nats], (B,)."""
         return -self.nll(params, target)
 
 
@@ -148,7 +148,7 @@ class MixtureHead(Distribution):
         return self.components * (1 + 2 * self.n)
 
     def split(self, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
+        """Return log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
         k, n = self.components, self.n
         logits, means, raw = params.split([k, k * n, k * n], -1)
         shape = (*params.shape[:-1], k, n)
@@ -236,7 +236,7 @@ class CategoricalHead(Distribution):
 
 
 def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
-    """The head for a name in `LOSSES`; raises `UnknownName` for another."""
+    """Return the head for a name in `LOSSES`; raises `UnknownName` for another."""
     heads: dict[str, Head] = {
         "mse": MSEHead(n),
         "l1": L1Head(n),
@@ -250,7 +250,7 @@ def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
 
 
 def floored_log_std(raw: Tensor) -> Tensor:
-    """Log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
+    """Return log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
 
 

@@ -80,20 +80,20 @@ class MLPNetwork(nn.Module):
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def encode(self, inputs: Tensor) -> Tensor:
-        """The perceptron's inputs from raw ones, (B, n + k)."""
+        """Return the perceptron's inputs from raw ones, (B, n + k)."""
         return ((inputs - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """The head's targets from raw relative ones, (B, n)."""
+        """Return the head's targets from raw relative ones, (B, n)."""
         return scale_targets(targets, self.target_mean, self.target_scale)
 
     def row_losses(self, x: Tensor, y: Tensor) -> Tensor:
-        """Loss of each row, (B,), from encoded inputs and targets."""
+        """Return loss of each row, (B,), from encoded inputs and targets."""
         return self.head.nll(self.layers(x), y)
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
-        """Absolute actions, (B, n), each the same bits whatever the other rows are."""
+        """Return absolute actions, (B, n), each the same bits whatever the other rows are."""
         return _in_blocks(self.actions, inputs)
 
     def distribution(self) -> Distribution:  # no property: TorchScript would compile it
@@ -104,7 +104,10 @@ class MLPNetwork(nn.Module):
 
     @torch.no_grad()
     def sample(self, inputs: Tensor, draws: Tensor) -> Tensor:
-        """Absolute actions, (B, n), from what the distribution's `draw` gave for each row (B, m); bits as in `act`."""
+        """Return absolute actions, (B, n), from what the distribution's `draw` gave for each row (B, m).
+
+        Bits as in `act`.
+        """
 
         def samples(inputs: Tensor, draws: Tensor) -> Tensor:
             drawn = self.distribution().sample(self.layers(self.encode(inputs)), draws)
@@ -123,7 +126,7 @@ class MLPNetwork(nn.Module):
         return _in_blocks(log_probs, inputs, actions)
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """The same as `act` of all rows in one product, whose last bits depend on their number."""
+        """Return the same as `act` of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so neither shall the learner's, wherever it is.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)

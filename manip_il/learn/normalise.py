@@ -36,14 +36,14 @@ class Statistics:
 
 
 def identity_statistics(inputs: int, targets: int) -> Statistics:
-    """Statistics that change nothing."""
+    """Return statistics that change nothing."""
     everything = torch.full((targets,), torch.inf)
     zeros, ones = torch.zeros, torch.ones
     return Statistics(zeros(inputs), ones(inputs), zeros(targets), ones(targets), -everything, everything)
 
 
 def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
-    """Statistics of inputs (N, d) and targets (N, n).
+    """Return statistics of inputs (N, d) and targets (N, n).
 
     Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
@@ -61,6 +61,6 @@ def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], lo
 
 
 def scale_targets(targets: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
-    """Targets (B, n) in the network's units; 0 where the scale is 0."""
+    """Return targets (B, n) in the network's units; 0 where the scale is 0."""
     inverse = torch.where(scale > 0, 1.0 / scale, torch.zeros_like(scale))
     return (targets - mean) * inverse

@@ -23,7 +23,7 @@ _LACKING = {
 def policy_features(
     features: Mapping[str, dict[str, Any]], observation: str
 ) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
-    """LeRobot's input and output features of a policy, from a dataset's feature table (`info.json`'s `features`).
+    """Return LeRobot's input and output features of a policy, from the `features` of `info.json`.
 
     observation: `state` is `observation.state` and `observation.environment_state`, `images` is `observation.state`
     and every camera, `both` all three. Pictures, (H, W, 3) in the table, are (3, H, W) for a policy. Raises
@@ -50,7 +50,7 @@ def policy_features(
 
 
 def observation_of(input_features: Iterable[str]) -> str:
-    """The choice that a policy was trained with, from the names of its inputs (`config.json`'s `input_features`)."""
+    """Return the choice that a policy was trained with, from the `input_features` of its config.json."""
     keys = set(input_features)
     pictures = any(key.startswith(IMAGES) for key in keys)
     if not pictures:
@@ -59,7 +59,7 @@ def observation_of(input_features: Iterable[str]) -> str:
 
 
 def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
+    """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
 
     None where that is not known: another program's dataset, or one without pictures.
     """

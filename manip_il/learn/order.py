@@ -18,7 +18,7 @@ class ShuffledRows:
         self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
 
     def batch(self, step: int) -> torch.Tensor:
-        """Row numbers of the batch of `step`, (batch_size,)."""
+        """Return row numbers of the batch of `step`, (batch_size,)."""
         start, end = step * self.batch_size, (step + 1) * self.batch_size
         pieces = []
         while start < end:
@@ -44,7 +44,7 @@ class WeightedRows:
         self.batch_size, self.seed = batch_size, seed
 
     def batch(self, step: int) -> torch.Tensor:
-        """Row numbers of the batch of `step`, (batch_size,)."""
+        """Return row numbers of the batch of `step`, (batch_size,)."""
         draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
         rows = np.searchsorted(self._edges, draws, side="right")
         return torch.from_numpy(np.minimum(rows, len(self._edges) - 1))
@@ -56,5 +56,5 @@ def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, se
 
 
 def batches_of(samples: NDArray[np.int64], size: int) -> list[NDArray[np.int64]]:
-    """Samples in their order, in pieces of at most `size`."""
+    """Return samples in their order, in pieces of at most `size`."""
     return [samples[start : start + size] for start in range(0, len(samples), size)]

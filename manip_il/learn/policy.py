@@ -41,7 +41,7 @@ class Chooser(Protocol):
         ...
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        """One action (n,) a row; `episodes` says whose row each is. Other episodes have ended."""
+        """Return one action (n,) a row; `episodes` says whose row each is. Other episodes have ended."""
         ...
 
     def forget(self, episodes: Iterable[int]) -> None:
@@ -103,7 +103,7 @@ class LearnedPolicy:
     def act(
         self, states: F32, environment_states: F32, images: Images | None = None, episodes: Sequence[int] | None = None
     ) -> F64:
-        """Absolute actions, (B, n): joint targets [rad], gripper command [m].
+        """Return absolute actions, (B, n): joint targets [rad], gripper command [m].
 
         states: (B, n); environment_states: (B, k); images: camera -> (B, H, W, 3). episodes: a number for each row,
         its seed: what the policy remembers of an episode, and what it draws in it, belong to that number; by default
@@ -234,11 +234,14 @@ class _Perceptron:
         return self._network
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        """One action a row. The mlp's processors are the identity (see MLPConfig), so there is nothing else to do."""
+        """Return one action a row (B, n).
+
+        The mlp's processors are the identity (see MLPConfig), so there is nothing else to do.
+        """
         return self._network.act(self._inputs(batch))
 
     def sample(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
-        """Absolute actions (B, n), each row's from its own generator."""
+        """Return absolute actions (B, n), each row's from its own generator."""
         head = self._network.distribution()
         draws = torch.from_numpy(np.stack([head.draw(rng) for rng in rngs]))
         return self._network.sample(self._inputs(batch), draws.to(self._device)).cpu()

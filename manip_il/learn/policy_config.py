@@ -58,18 +58,18 @@ class PolicyFitConfig:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
 
     def resolved_optimizer(self) -> OptimizerConfig:
-        """The optimiser asked for, else the policy's preset, with `lr` in it."""
+        """Return the optimiser asked for, else the policy's preset, with `lr` in it."""
         optimizer = self.optimizer or self.policy.get_optimizer_preset()
         if self.lr is not None:
             optimizer.lr = self.lr
         return optimizer
 
     def resolved_scheduler(self) -> LRSchedulerConfig | None:
-        """The schedule asked for, else the policy's preset; None is a constant rate."""
+        """Return the schedule asked for, else the policy's preset; None is a constant rate."""
         return self.scheduler or self.policy.get_scheduler_preset()
 
     def lerobot(self, repo_id: str, root: str, output_dir: Any) -> TrainPipelineConfig:
-        """The same as LeRobot's `train_config.json`, from which `lerobot-train --resume=true` goes on."""
+        """Return the same as LeRobot's `train_config.json`, from which `lerobot-train --resume=true` goes on."""
         return TrainPipelineConfig(
             dataset=DatasetConfig(repo_id, root=root),
             policy=self.policy,
@@ -88,7 +88,7 @@ class PolicyFitConfig:
         )
 
     def what_changes_the_weights(self) -> dict[str, Any]:
-        """The options that a resumed fit must share with the one before, as JSON knows them."""
+        """Return the options that a resumed fit must share with the one before, as JSON knows them."""
         return {
             "policy": _without_machine(draccus.encode(self.policy)),
             "optimizer": draccus.encode(self.resolved_optimizer()),

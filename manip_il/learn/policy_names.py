@@ -31,7 +31,10 @@ def policy_files() -> Mapping[str, Path]:
 
 
 def policy_options(kind: str) -> tuple[str, ...]:
-    """Names of the options of a policy type, sorted; none where its configuration is not written as others are."""
+    """Return names of the options of a policy type, sorted.
+
+    None where its configuration is not written as others are.
+    """
     own, classes = (_classes(policy_files()[one]) for one in ("mlp", kind))
     name = next((name for name, one in classes.items() if kind in _registered(one)), "")
     classes = own | classes  # the cnn's options are the mlp's, and some
@@ -60,7 +63,7 @@ def check_names(settings: Mapping[str, Any], default_type: str) -> None:
 
 
 def unknown_option(kind: str, name: str, known: tuple[str, ...]) -> UnknownName:
-    """The error that names the nearest of a policy's options, and all where they are few."""
+    """Return the error that names the nearest of a policy's options, and all where they are few."""
     where = f"manip-il train --policy.type={kind} --help lists all"
     return UnknownName(f"option of --policy.type={kind}:", name, known, where if len(known) > _FEW else "")
 

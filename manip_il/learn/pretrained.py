@@ -72,7 +72,7 @@ def read_interface(path: Path) -> Interface:
 
 
 def interface_of(config: dict[str, Any], path: Path) -> Interface:
-    """The same from `config.json`; path: for the message."""
+    """Return the same from `config.json`; path: for the message."""
     try:
         inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
         if ACTION not in outputs:

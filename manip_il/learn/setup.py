@@ -71,7 +71,7 @@ def set_features(config: PreTrainedConfig, meta: Any, observation: str) -> None:
 
 
 def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
-    """LeRobot's policy, its weights new or from `config.pretrained_path`.
+    """Return LeRobot's policy, its weights new or from `config.pretrained_path`.
 
     Raises `ManipError` for a checkpoint that cannot be loaded, and with the two ways out where a backbone's weights
     would have to be downloaded and cannot be.
@@ -111,7 +111,7 @@ def _loaded(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
 def build_processors(
     config: PreTrainedConfig, meta: Any, checkpoint: Path | None, *, trust: bool = False
 ) -> tuple[Any, Any]:
-    """LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
+    """Return LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
 
     Raises what `require_trust` raises for the checkpoint's, and `ManipError` where they cannot be read.
     """
@@ -125,7 +125,7 @@ def build_processors(
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """A dataset's statistics with a least deviation and range for vectors.
+    """Return a dataset's statistics with a least deviation and range for vectors.
 
     A joint that hardly moved in the data would else be blown up to many deviations wherever it does.
     """
@@ -144,7 +144,7 @@ def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[
 def load_samples(
     roots: Sequence[Path], config: PolicyFitConfig, meta: Any, on_frames: Callable[[int], None] | None = None
 ) -> Samples:
-    """The samples of datasets, taken as one, for one policy; in memory where they fit.
+    """Return the samples of datasets, taken as one, for one policy; in memory where they fit.
 
     on_frames: sees how many frames more have been decoded. Raises `NotFiniteError`, and what `windows_of` and
     `Windows.usable` raise.

@@ -22,7 +22,7 @@ class Source(Protocol):
     """Batches for given samples."""
 
     def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """One batch for every array of sample numbers, (B,), in that order. Pictures are uint8 or float32."""
+        """Return one batch for every array of sample numbers, (B,), in that order. Pictures are uint8 or float32."""
         ...
 
 
@@ -63,7 +63,7 @@ class MemorySource:
         return (self.batch(one) for one in samples)
 
     def batch(self, samples: I64) -> Batch:
-        """The batch of these samples, (B,)."""
+        """Return the batch of these samples, (B,)."""
         batch: Batch = {}
         for key, column in self.columns.items():
             batch |= self._gather(key, samples, lambda rows, column=column: column[torch.from_numpy(rows)])
@@ -111,7 +111,7 @@ class _Batches(torch.utils.data.Sampler[list[int]]):
 
 
 def pictures_to_float(batch: Batch, cameras: Iterable[str]) -> Batch:
-    """The batch with its uint8 pictures as float32 in [0, 1]."""
+    """Return the batch with its uint8 pictures as float32 in [0, 1]."""
     return batch | {key: to_float(batch[key]) for key in cameras if batch[key].dtype == torch.uint8}
 
 

@@ -89,7 +89,7 @@ class TrainConfig:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
 
     def lerobot(self, repo_id: str, output_dir: Path) -> TrainPipelineConfig:
-        """The same in LeRobot's words, for its logger."""
+        """Return the same in LeRobot's words, for its logger."""
         optimizer = AdamWConfig(lr=self.lr, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm)
         return TrainPipelineConfig(
             dataset=DatasetConfig(repo_id),
@@ -107,7 +107,7 @@ class TrainConfig:
         )
 
     def lr_at(self, step: int) -> float:
-        """Learning rate of the update with number `step`, from 0."""
+        """Return learning rate of the update with number `step`, from 0."""
         warmup = min(self.warmup_steps, self.steps // 10)
         if step < warmup:
             return self.lr * (step + 1) / (warmup + 1)
@@ -230,7 +230,7 @@ class Trainer:
         return rows[:, : self.width], rows[:, self.width :]
 
     def validate(self) -> dict[str, float]:
-        """Loss on the held-out episodes, and the mean absolute errors of acting: arm [rad], gripper [m]."""
+        """Return loss on the held-out episodes, and the mean absolute errors of acting: arm [rad], gripper [m]."""
         if len(self.held_out) == 0:
             return {}
         network = self.policy.model

@@ -39,13 +39,13 @@ class Windows:
         object.__setattr__(self, "_last", np.repeat(ends - 1, ends - starts))
 
     def rows(self, samples: I64, key: str) -> tuple[I64, NDArray[np.bool_]]:
-        """Row numbers (B, K) of one column's frames, and which of them stand in for one outside of the episode."""
+        """Return row numbers (B, K) of one column's frames, and which are padding beyond the episode (B, K)."""
         wanted = samples[:, None] + self.deltas[key]
         inside = np.clip(wanted, self._first[samples, None], self._last[samples, None])
         return inside, inside != wanted
 
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
-        """The samples to learn from: no label in the window is unsound, and `drop_last` frames at the end are left out.
+        """Return the samples to learn from (S,): every label in the window is sound, `drop_last` frames left out.
 
         valid: whether each frame's label is sound, (N,). drop_last: LeRobot's `drop_n_last_frames`. Raises
         `ManipError` where nothing is left.
@@ -62,7 +62,10 @@ class Windows:
 
 
 def windows_of(config: PreTrainedConfig, columns: Sequence[str], episodes: I64) -> Windows:
-    """The windows that a policy asks for. Raises `UsageError` for a dataset shorter than one chunk of actions."""
+    """Return the windows that a policy asks for.
+
+    Raises `UsageError` for a dataset shorter than one chunk of actions.
+    """
     deltas = {}
     for key in columns:
         indices = _delta_indices(config, key)

@@ -145,7 +145,7 @@ class Unfilmed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def make_env(env_id: str, kwargs: dict[str, Any], *, film: bool) -> gymnasium.Env[Any, Any]:
-    """One environment; in a child process too, where nothing is registered yet."""
+    """Return one environment; in a child process too, where nothing is registered yet."""
     register_envs()
     env = gymnasium.make(env_id, disable_env_checker=True, **kwargs)
     return env if film else Unfilmed(env)

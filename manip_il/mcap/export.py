@@ -98,7 +98,7 @@ _HEADER = """\
 
 
 def mapping_of(source: Source) -> Mapping:
-    """The mapping that makes the dataset again from its export."""
+    """Return the mapping that makes the dataset again from its export."""
     near = ("nearest", round(_TOLERANCE / source.fps, 6))
     features: dict[str, Values | Camera] = {}
     for key, feature in source.features.items():

@@ -71,12 +71,12 @@ class Channel:
 
 
 def log_time(frame: int, fps: int) -> int:
-    """Nanoseconds since the episode's start."""
+    """Return nanoseconds since the episode's start."""
     return frame * NANOSECONDS // fps
 
 
 def joint_states(topic: str, names: Sequence[str], values: NDArray[Any], times: Times) -> Channel:
-    """Positions (T, n) of named joints."""
+    """Return positions (T, n) of named joints."""
 
     def messages() -> Iterator[bytes]:
         message = JointStates()
@@ -91,7 +91,7 @@ def joint_states(topic: str, names: Sequence[str], values: NDArray[Any], times: 
 
 
 def frame_transforms(topic: str, places: Mapping[str, tuple[F64, F64]], times: Times) -> Channel:
-    """Where frames are in the world. places: frame -> positions (T, 3) [m], quaternions wxyz (T, 4)."""
+    """Return where frames are in the world. places: frame -> positions (T, 3) [m], quaternions wxyz (T, 4)."""
 
     def messages() -> Iterator[bytes]:
         message = FrameTransforms()
@@ -119,7 +119,7 @@ def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) 
 
 
 def images(topic: str, frame_id: str, pictures: Iterable[U8], times: Times) -> Channel:
-    """RGB pictures (height, width, 3), without loss."""
+    """Return RGB pictures (height, width, 3), without loss."""
 
     def messages() -> Iterator[bytes]:
         message = RawImage(frame_id=frame_id, encoding=RGB)
@@ -162,7 +162,7 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
 
 
 def read_images(records: Iterable[Record], cameras: Sequence[str], shape: tuple[int, ...]) -> dict[str, U8]:
-    """Every camera's pictures as `images` wrote them, from a file's records in stored order.
+    """Return every camera's pictures as `images` wrote them, from a file's records in stored order.
 
     shape: of what each camera has, (T, height, width, 3). Raises `ValueError` for another camera, another size, and for
     fewer or more pictures.

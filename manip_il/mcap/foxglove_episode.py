@@ -21,7 +21,7 @@ _SCALARS = (s.ACTOR, s.EXPERT_PHASE, s.LABEL_VALID, s.REWARD, s.SUCCESS, s.DONE)
 
 
 def channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[foxglove.Channel]:
-    """Every channel that the episode's columns can fill.
+    """Yield every channel that the episode's columns can fill.
 
     Raises `ManipError` for pictures that are not uint8 (T, height, width, 3).
     """
@@ -44,7 +44,7 @@ def channels(episode: Episode, spec: s.RobotTaskSpec) -> Iterator[foxglove.Chann
 
 
 def frame_times(episode: Episode, spec: s.RobotTaskSpec) -> list[int]:
-    """Every frame's log time [ns]."""
+    """Return every frame's log time [ns]."""
     return [foxglove.log_time(frame, spec.fps) for frame in range(len(episode))]
 
 

@@ -33,20 +33,20 @@ class DatasetFrames:
         self._stored = {key: _stored(root, key) for key, dtype in dtypes.items() if dtype == "image"}
 
     def read(self, key: str, episode: int, count: int) -> Iterator[U8]:
-        """The episode's pictures (height, width, 3); all must be taken before the next episode's."""
+        """Return the episode's pictures (height, width, 3); all must be taken before the next episode's."""
         if key in self._stored:
             return itertools.islice(self._stored[key], count)
         return iter(read_frames(self._root, key, episode))
 
 
 def is_depth(feature: dict[str, Any]) -> bool:
-    """Whether a picture column holds distances, and no colours."""
+    """Return whether a picture column holds distances, and no colours."""
     info = feature.get("info") or {}
     return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
 def decode_message(schema: str, message: Any) -> U8:
-    """The picture (height, width, 3) of a `foxglove.RawImage` or `foxglove.CompressedImage`.
+    """Return the picture (height, width, 3) of a `foxglove.RawImage` or `foxglove.CompressedImage`.
 
     Raises `ManipError` for another schema, encoding or a picture that is not whole.
     """
@@ -60,7 +60,7 @@ def decode_message(schema: str, message: Any) -> U8:
 
 
 def decode_bytes(data: bytes) -> U8:
-    """A PNG or JPEG as RGB (height, width, 3). Raises `ManipError` for anything else."""
+    """Return a PNG or JPEG as RGB (height, width, 3). Raises `ManipError` for anything else."""
     try:
         with open_picture(data) as picture:
             if picture.mode not in _COLOURS:

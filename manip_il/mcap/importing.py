@@ -39,7 +39,7 @@ class Import:
 
 
 def list_files(source: Path) -> list[Path]:
-    """The MCAP file, or the folder's in the order of their names. Raises `ManipError` where there are none."""
+    """Return the MCAP file, or the folder's in the order of their names. Raises `ManipError` where there are none."""
     if source.is_dir():
         paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
         if not paths:
@@ -105,7 +105,7 @@ def read_import(path: Path, mapping: Mapping) -> Import:
 
 
 def features_of(mapping: Mapping, first: Import) -> dict[str, dict[str, Any]]:
-    """LeRobot's feature table, shapes that the mapping leaves open as the first file has them."""
+    """Return LeRobot's feature table, shapes that the mapping leaves open as the first file has them."""
     features: dict[str, dict[str, Any]] = {}
     for key, source in mapping.features.items():
         if isinstance(source, Camera):
@@ -120,7 +120,7 @@ def features_of(mapping: Mapping, first: Import) -> dict[str, dict[str, Any]]:
 
 
 def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Frames as LeRobot's writer takes them, pictures read as they are needed.
+    """Yield frames as LeRobot's writer takes them, pictures read as they are needed.
 
     Raises `MismatchError` where a column's width or a picture's size is not that of the first file.
     """

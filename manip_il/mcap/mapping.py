@@ -149,7 +149,7 @@ class Mapping:
         return list(dict.fromkeys([*task, *(source.topic for source in self.features.values())]))
 
     def to_yaml(self) -> str:
-        """The text of a mapping file: `load_mapping` gives an equal one."""
+        """Return the text of a mapping file: `load_mapping` gives an equal one."""
         task = self.task if isinstance(self.task, str) else _plain(self.task, _TASK_KEYS)
         features = {
             key: _plain(source, _CAMERA_KEYS if isinstance(source, Camera) else _VALUE_KEYS)

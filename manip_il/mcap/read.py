@@ -93,7 +93,7 @@ def read_topics(path: Path, topics: Iterable[str], values: dict[str, Values]) ->
 
 
 def read_pictures(path: Path, topic: str, chosen: I64) -> Iterator[U8]:
-    """The chosen pictures of a topic, (height, width, 3); `chosen`: message numbers that never descend.
+    """Yield the chosen pictures of a topic, (height, width, 3); `chosen`: message numbers that never descend.
 
     Raises `ManipError` naming file, topic and stamp for a message that holds no picture.
     """

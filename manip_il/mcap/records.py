@@ -169,7 +169,7 @@ def chunk_records(data: bytes, budget: Budget) -> Iterator[Record]:
 
 
 def to_message(body: bytes) -> Message:
-    """A message record's content. Raises `ValueError` where it is too short."""
+    """Return a message record's content. Raises `ValueError` where it is too short."""
     if len(body) < _MESSAGE.size:
         raise ValueError("a message record ends too early")
     channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
@@ -177,12 +177,12 @@ def to_message(body: bytes) -> Message:
 
 
 def to_channel(body: bytes) -> Channel:
-    """A channel record's content."""
+    """Return a channel record's content."""
     return Channel.read(ReadDataStream(BytesIO(body)))
 
 
 def to_attachment(body: bytes) -> tuple[str, memoryview]:
-    """An attachment's name and data. Raises `ValueError` where its sizes do not fit the record."""
+    """Return an attachment's name and data. Raises `ValueError` where its sizes do not fit the record."""
     view, at = memoryview(body), _ATTACHMENT_TIMES
     texts: list[str] = []
     for _ in ("name", "media type"):

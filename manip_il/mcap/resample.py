@@ -26,7 +26,10 @@ class Pick:
     weight: F64
 
     def blend(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values (T, ...) of the frames from values (N, ...) of the messages; untouched where one is taken as it is."""
+        """Return values (T, ...) of the frames from values (N, ...) of the messages.
+
+        Untouched where one is taken as it is.
+        """
         left, right = values[self.left], values[self.right]
         if (self.left == self.right).all():
             return left

@@ -75,7 +75,7 @@ class Gripper:
         return self._closed + share * self._travel
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) -> bool:
-        """Whether every finger touches one of an object's geoms. Needs kinematics to be up to date in `data`."""
+        """Return whether every finger touches one of an object's geoms. Needs kinematics to be up to date in `data`."""
         # Of two boxes that are apart `mj_geomDistance` now and then says 0, but only within what it is asked to look.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads for geom in geoms)

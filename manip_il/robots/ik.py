@@ -45,14 +45,14 @@ class ArmIK:
         self._qpos = np.zeros(model.nq)
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
-        """Position [m] (3,) and rotation matrix (3, 3) of `ee` in the world at joint positions `q` [rad] (arm,)."""
+        """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
         self._qpos[self._address] = q
         self._configuration.update(self._qpos)
         data = self._configuration.data
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
     def step(self, position: F64, rotation: F64, largest: float) -> tuple[F64, float] | None:
-        """One step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
+        """Return one step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
 
         Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
         of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.

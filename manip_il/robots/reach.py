@@ -66,7 +66,7 @@ class Reach:
         return tuple(self.origin.tolist())
 
     def error(self, position: Sequence[float] | F64) -> float:
-        """How far from `position` [m], (3,), the hand ends; beyond the map also how far that is from it [m]."""
+        """Return how far from `position` [m], (3,), the hand ends; beyond the map also how far that is from it [m]."""
         place = (np.asarray(position) - self.origin) / _CELL
         last = np.array(self.errors.shape) - 1
         inside = np.minimum(np.maximum(place, 0.0), last)
@@ -78,7 +78,7 @@ class Reach:
         return float(block[0] + fz * (block[1] - block[0])) + _CELL * float(np.abs(place - inside).max())
 
     def has(self, position: Sequence[float] | F64) -> bool:
-        """Whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
+        """Return whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
         cells = self._arrives
         x, y, z = (math.floor((at - start) / _CELL) for at, start in zip(position, self._corner, strict=True))
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
@@ -86,7 +86,7 @@ class Reach:
         return cells[x][y][z]
 
     def nearly(self, position: Sequence[float] | F64) -> bool:
-        """Whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
+        """Return whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
         return self.has(position) or self.error(position) < STRETCH
 
 

@@ -139,7 +139,7 @@ class Robot:
         return b"".join([repr((said, files)).encode(), *texts])
 
     def mesh_files(self) -> dict[str, Path]:
-        """The model's meshes by name: of the folder that is given, else those that the model names."""
+        """Return the model's meshes by name: of the folder that is given, else those that the model names."""
         if self.meshes or self.includes:
             folder = self.meshes or self.model.parent
             return {str(one.relative_to(folder)): one for one in folder.rglob("*.stl")}

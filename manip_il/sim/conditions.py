@@ -86,7 +86,7 @@ class Condition:
         }
 
     def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
-        """The condition without what a task without an object, or a policy without cameras, does not notice.
+        """Return the condition without what a task without an object, or a policy without cameras, does not notice.
 
         None where nothing of it is left.
         """
@@ -102,7 +102,7 @@ class Condition:
 
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
-        """Ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
+        """Return ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
         for key in tree:
             if key not in _BOUNDS:
                 raise UnknownName(f"key in {name}:", str(key)[: checks.LONGEST_NAME], _BOUNDS)
@@ -124,7 +124,7 @@ class Circumstances:
     drawn: Mapping[str, Any]
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """A drawn number, or what holds without it."""
+        """Return a drawn number, or what holds without it."""
         return float(self.drawn.get(name, default))
 
     @property
@@ -145,12 +145,12 @@ class Circumstances:
 
 
 def changes_object(named: Mapping[str, Any]) -> bool:
-    """Whether ranges, or what was drawn from them, make the object another than the model's."""
+    """Return whether ranges, or what was drawn from them, make the object another than the model's."""
     return not named.keys().isdisjoint(("mass", "size", "friction"))
 
 
 def draw(conditions: Sequence[Condition], seed: int) -> Circumstances:
-    """The circumstances of a seed: conditions take turns, each value has a random stream of its own.
+    """Return the circumstances of a seed: conditions take turns, each value has a random stream of its own.
 
     So a range that is changed leaves the other draws as they were.
     """

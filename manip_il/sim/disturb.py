@@ -161,7 +161,7 @@ def _place(world: World, name: str, pose: F64) -> bool:
 
 
 def disturbance_of(circumstances: Circumstances) -> Disturbance:
-    """The part of an episode's circumstances that knocks its object and makes its actions noisy."""
+    """Return the part of an episode's circumstances that knocks its object and makes its actions noisy."""
     noise = circumstances.number("action_noise")
     if "knock" not in circumstances.drawn:
         return Disturbance(noise)
@@ -183,6 +183,6 @@ class Disturber:
             knock_object(self._env, self._knock, self._disturbance.knock)
 
     def action(self, action: F64) -> F64:
-        """The action as it reaches the robot."""
+        """Return the action as it reaches the robot."""
         share = self._disturbance.action_noise
         return noisy(action, self._env, share, self._noise) if share else action

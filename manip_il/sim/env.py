@@ -152,7 +152,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._streak >= self.config.success_steps
 
     def distance(self) -> float:
-        """How far the task is from being solved [m]."""
+        """Return how far the task is from being solved [m]."""
         return self.scene.task.error(self.world)
 
     @property
@@ -161,7 +161,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return min(1.0, max(0.0, self.scene.task.progress(self.world)))
 
     def get_state(self) -> State:
-        """Everything that the future depends on; `set_state` restores it bit for bit."""
+        """Return everything that the future depends on; `set_state` restores it bit for bit."""
         return State(self.world.physics(), self.world.variation.copy(), self._step, self._streak, self._ever)
 
     def set_state(self, state: State) -> None:
@@ -175,7 +175,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return Observation(joint_state(self.world), environment_state(self.world), images)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A picture from the front camera, uint8 (480, 640, 3)."""
+        """Return a picture from the front camera, uint8 (480, 640, 3)."""
         if self.render_mode != "rgb_array":
             return None
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]

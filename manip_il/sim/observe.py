@@ -27,7 +27,7 @@ def environment_state(world: World) -> F32:
 
 @cache
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
-    """Names of the vector's k entries; lengths in [m]."""
+    """Return names of the vector's k entries; lengths in [m]."""
     world = World(scene)
     world.moved()
     names: list[str] = []

@@ -43,7 +43,7 @@ def random_action(action: F64, env: ManipEnv, rng: np.random.Generator) -> F64:
 
 
 def opposite_action(action: F64, env: ManipEnv, rng: np.random.Generator) -> F64:
-    """The joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
+    """Return the joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
     mirrored = 2 * _measured(env) - action
     return np.where(env.scene.actions.relative, mirrored, _other_opening(action, env))
 
@@ -68,7 +68,7 @@ KINDS: dict[str, Kind] = {
 
 
 def kinds_for(task: Task) -> dict[str, Kind]:
-    """The entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
+    """Return the entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
     return {name: kind for name, kind in KINDS.items() if task.grasped or not kind.needs_object}
 
 
@@ -117,7 +117,7 @@ class Perturber:
             self._env.set_state(replace(self._env.get_state(), streak=0))
 
     def action(self, action: F64) -> F64:
-        """The action as it reaches the robot, (n,)."""
+        """Return the action as it reaches the robot, (n,)."""
         if not self._now or self._kind.wrong is None:
             return action
         return self._kind.wrong(action, self._env, self._rng)

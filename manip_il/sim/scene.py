@@ -31,7 +31,7 @@ _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
 @cache
 def build_scene(robot: str, task: str) -> Scene:
-    """The scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`."""
+    """Return the scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`."""
     the_robot, the_task = get_robot(robot), get_task(task)
     try:
         model = scene_spec(the_robot, the_task).compile()
@@ -42,7 +42,7 @@ def build_scene(robot: str, task: str) -> Scene:
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
-    """The uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
+    """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
     spec = mujoco.MjSpec()
     spec.modelname = f"{robot.name}_{task.name}"
     spec.option.timestep = DT_SIM

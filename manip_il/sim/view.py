@@ -27,7 +27,7 @@ _LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
 
 
 def view_model(robot: str, task: str, look: Look) -> mujoco.MjModel:
-    """A model to draw from, not to simulate: every name, address and pose is the physics model's."""
+    """Return a model to draw from, not to simulate: every name, address and pose is the physics model's."""
     model = copy.copy(_with_few_faces(robot, task))
     _light(model, look)
     return model

@@ -81,7 +81,7 @@ class Scene:
         return f"{self.robot.name} {self.task.name}"
 
     def model_bytes(self) -> bytes:
-        """The compiled model, byte for byte: what a fingerprint hashes."""
+        """Return the compiled model, byte for byte: what a fingerprint hashes."""
         buffer = np.zeros(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
         mujoco.mj_saveModel(self.model, None, buffer)
         return buffer.tobytes()
@@ -124,7 +124,7 @@ class World:
         mujoco.mj_setConst(self.model, self.data)  # what follows from masses
 
     def physics(self) -> F64:
-        """MuJoCo's integration state, (p,)."""
+        """Return MuJoCo's integration state, (p,)."""
         physics = np.empty(self.scene.state_size)
         mujoco.mj_getState(self.model, self.data, physics, STATE_KIND)
         return physics
@@ -190,7 +190,7 @@ class World:
         return self.scene.gripper.most
 
     def extents(self, name: str) -> tuple[float, ...]:
-        """Lengths of an object along its own axes x, y and z."""
+        """Return lengths of an object along its own axes x, y and z."""
         if name not in self._extents:
             geom = self.scene.objects[name].geom
             kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
@@ -198,7 +198,7 @@ class World:
         return self._extents[name]
 
     def touched(self, name: str) -> bool:
-        """Whether every finger touches an object."""
+        """Return whether every finger touches an object."""
         geoms = (self.scene.objects[name].geom,)
         return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
 

@@ -32,11 +32,11 @@ class Blobs(Protocol):
     warnings: tuple[str, ...]
 
     def describe(self) -> str:
-        """The place, for messages."""
+        """Return the place, for messages."""
         ...
 
     def manifest(self) -> tuple[bytes, str] | None:
-        """Content and token; None where there is none."""
+        """Return content and token; None where there is none."""
         ...
 
     def prepare(self, size: int) -> None:
@@ -63,7 +63,7 @@ class Blobs(Protocol):
         ...
 
     def list(self) -> dict[str, Stored]:
-        """Every object."""
+        """Return every object."""
         ...
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:

@@ -44,7 +44,7 @@ class Policy:
         return str(self.config.get("type", "policy"))
 
     def named(self, key: str) -> str:
-        """Its `robot` or `task`; empty where nothing says it."""
+        """Return its `robot` or `task`; empty where nothing says it."""
         return str(self.meta.get(key) or self.evaluation.get(key) or "")
 
     @property
@@ -79,7 +79,7 @@ def _card(root: Path, policy: Policy, url: str) -> str:
 
 
 def read_policy(root: Path) -> Policy:
-    """The policy in a folder, or in the run that the folder is. Raises `ManipError` where there is none."""
+    """Return the policy in a folder, or in the run that the folder is. Raises `ManipError` where there is none."""
     inside = policy_folder(path.relative_to(root).as_posix() for place in _PLACES for path in root.glob(place))
     if inside is None:
         raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")

@@ -36,7 +36,7 @@ class Paths:
 
 
 def picture_strip(root: Path) -> bytes | None:
-    """A PNG; None for a dataset that has neither cameras nor an object and a goal among its columns."""
+    """Return a PNG; None for a dataset that has neither cameras nor an object and a goal among its columns."""
     keys = camera_keys(root)
     if keys:
         return _png(_frames(root, keys))
@@ -45,7 +45,7 @@ def picture_strip(root: Path) -> bytes | None:
 
 
 def read_paths(root: Path) -> Paths | None:
-    """Where the object of each episode went and should go; None where no column says so."""
+    """Return where the object of each episode went and should go; None where no column says so."""
     try:
         names = read_spec(root).environment_state_names
     except ManipError:

@@ -31,13 +31,13 @@ def repository(url: str) -> str:
 
 
 def table(rows: Iterable[tuple[str, object]]) -> str:
-    """A Markdown table without a head; a last row says what made it, so that a card of ours is known."""
+    """Return a Markdown table without a head; a last row says what made it, so that a card of ours is known."""
     cells = [f"| {name} | {_cell(value)} |" for name, value in rows]
     return "\n".join(["| | |", "|---|---|", *cells, f"{MADE_BY} {version('manip_il')} |"])
 
 
 def fingerprint_rows(fingerprint: Mapping[str, Any]) -> str:
-    """Versions and hashes, folded away."""
+    """Return versions and hashes, folded away."""
     if not fingerprint:
         return "Made by another program: there is no fingerprint of its environment.\n"
     rows = "\n".join(f"| {_cell(name)} | `{_cell(value)}` |" for name, value in fingerprint.items())
@@ -46,7 +46,7 @@ def fingerprint_rows(fingerprint: Mapping[str, Any]) -> str:
 
 
 def command(config: Path) -> str | None:
-    """The `manip-il` command that a `config.yaml` of ours stands for; None without one.
+    """Return the `manip-il` command that a `config.yaml` of ours stands for; None without one.
 
     Folders and what concerns one machine are left out, and anything that could be a secret.
     """

@@ -17,7 +17,7 @@ STRIP = "assets/episodes.png"
 
 
 def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
-    """Path in the repository -> content. url: of the repository, for the commands that the card shows.
+    """Return path in the repository -> content. url: of the repository, for the commands that the card shows.
 
     A `README.md` that somebody else wrote is kept: then there is none among these. Raises `ManipError` for a folder
     that cannot be read.

@@ -23,7 +23,7 @@ class Hasher(Protocol):
         ...
 
     def hexdigest(self) -> str:
-        """The hash of all that was fed."""
+        """Return the hash of all that was fed."""
         ...
 
 

@@ -30,7 +30,7 @@ LOCK_WAIT = 30.0  # how long another push may take to switch over [s]
 
 
 def open_file(url: RemoteUrl) -> ObjectRemote:
-    """The remote of a `file://` URL."""
+    """Return the remote of a `file://` URL."""
     return ObjectRemote(FileBlobs(Path(url.place).expanduser(), str(url)))
 
 
@@ -45,11 +45,11 @@ class FileBlobs:
         self.warnings: tuple[str, ...] = ()
 
     def describe(self) -> str:
-        """The URL."""
+        """Return the URL."""
         return self._name
 
     def manifest(self) -> tuple[bytes, str] | None:
-        """Content and its hash."""
+        """Return content and its hash."""
         with self._explained(f"read {self._name}"):
             try:
                 with (self.root / MANIFEST_FILE).open("rb") as file:
@@ -132,7 +132,7 @@ class FileBlobs:
         return found
 
     def list(self) -> dict[str, Stored]:
-        """Every object."""
+        """Return every object."""
         return self.find(path.name for path in self._all() if not path.name.startswith("."))
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:

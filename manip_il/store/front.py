@@ -20,7 +20,7 @@ _CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 
 
 def policy_folder(paths: Iterable[str]) -> str | None:
-    """Where the policy of a run lies among its files' `paths`; empty for the root itself, None without a policy.
+    """Return where the policy of a run lies among its files' `paths`; empty for the root itself, None without a policy.
 
     The best one, where a run has chosen it; else that of the newest checkpoint.
     """
@@ -33,7 +33,7 @@ def policy_folder(paths: Iterable[str]) -> str | None:
 
 
 def with_front(scanned: Scanned) -> Scanned:
-    """A run with copies of its policy's files at the root.
+    """Return a run with copies of its policy's files at the root.
 
     A folder that holds any file of such a name there itself is left as it is.
     """
@@ -48,7 +48,7 @@ def with_front(scanned: Scanned) -> Scanned:
 
 
 def without_front(manifest: Manifest) -> Manifest:
-    """A run without such copies: where all of them are there, and are the same bytes still."""
+    """Return a run without such copies: where all of them are there, and are the same bytes still."""
     inside = _inside(manifest)
     there = manifest.by_path
     if any(name not in there or there[name].key != entry.key for name, entry in inside.items()):

@@ -54,7 +54,7 @@ class HubRemote:
         self._repo = HubRepo(self.endpoint, _TYPES[self.kind], self.url.place, shown, self.retry)
 
     def describe(self) -> str:
-        """The URL, the endpoint where it is not the public Hub, and why there is nothing where nothing was found."""
+        """Return the URL, the endpoint if not the public Hub, and why nothing is there if nothing was found."""
         return f"{self._repo.shown}{self._absence}"
 
     def read(self) -> Snapshot | None:

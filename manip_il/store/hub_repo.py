@@ -44,7 +44,7 @@ class HubRepo:
         self.api = HfApi(endpoint=self.endpoint, library_name=_LIBRARY)
 
     def find(self, revision: str) -> str | Literal["no repo", "no revision"]:
-        """The commit that a branch, a tag or a commit id names, or what is not there."""
+        """Return the commit that a branch, a tag or a commit id names, or what is not there."""
 
         def once() -> str:
             try:
@@ -58,7 +58,7 @@ class HubRepo:
         return self.ask(once)
 
     def exists_as(self, kind: Type) -> bool:
-        """Whether there is a repository of this name and of that type."""
+        """Return whether there is a repository of this name and of that type."""
         return self.ask(lambda: self.api.repo_exists(self.place, repo_type=kind))
 
     def refs(self) -> tuple[dict[str, str], dict[str, str]]:
@@ -87,7 +87,7 @@ class HubRepo:
         self.ask(lambda: self.api.delete_tag(self.place, tag=tag, repo_type=self.type))
 
     def tree(self, commit: str) -> Tree:
-        """All files of a commit."""
+        """Return all files of a commit."""
 
         def once() -> Tree:
             listed = self.api.list_repo_tree(self.place, repo_type=self.type, revision=commit, recursive=True)
@@ -96,7 +96,7 @@ class HubRepo:
         return self.ask(once, listing=True)
 
     def stored_manifest(self, tree: Tree) -> Manifest | None:
-        """Our manifest of a commit; None where another program pushed it. Raises `ManifestError`."""
+        """Return our manifest of a commit; None where another program pushed it. Raises `ManifestError`."""
         file = tree.files.get(MANIFEST_FILE)
         if file is None:
             return None
@@ -150,7 +150,7 @@ class HubRepo:
     def commit(
         self, branch: str, parent: str, operations: Sequence[CommitOperationAdd | CommitOperationDelete], title: str
     ) -> str:
-        """One commit on top of `parent`, tried once. Raises `ConflictError` where that is no longer the head."""
+        """Return one commit on top of `parent`, tried once. Raises `ConflictError` where that is no longer the head."""
         with self._talking():
             made = self.api.create_commit(
                 self.place,

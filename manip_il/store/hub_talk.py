@@ -102,7 +102,7 @@ def quiet(endpoint: str) -> Iterator[None]:
 
 
 def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | None:
-    """The error in our words; None for one that is no remote's."""
+    """Return the error in our words; None for one that is no remote's."""
     cause = _cause(error)
     if isinstance(cause, RemoteError):
         return cause
@@ -130,7 +130,7 @@ def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | 
 
 
 def host(endpoint: str) -> str:
-    """The endpoint without the name and password that it may hold."""
+    """Return the endpoint without the name and password that it may hold."""
     return httpx.URL(endpoint).copy_with(userinfo=b"").__str__().rstrip("/")
 
 

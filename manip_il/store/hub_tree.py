@@ -54,14 +54,14 @@ class Tree:
         return Manifest(kind, tuple(_entry(file, known.get(path)) for path, file in self.own.items()))
 
     def holds(self, entry: FileEntry) -> bool:
-        """Whether the commit has this file with these bytes. entry: with both hashes where it is small."""
+        """Return whether the commit has this file with these bytes. entry: with both hashes where it is small."""
         there = self.files.get(entry.path)
         if there is None or there.size != entry.size:
             return False
         return there.lfs.sha256 == entry.sha256 if there.lfs else there.blob_id == entry.git_sha1
 
     def lists(self, listed: bytes) -> bool:
-        """Whether the commit has our manifest with this content."""
+        """Return whether the commit has our manifest with this content."""
         file = self.files.get(MANIFEST_FILE)
         if file is None:
             return False
@@ -76,7 +76,7 @@ class Tree:
 
 
 def with_git(manifest: Manifest, local: Mapping[str, Path]) -> Manifest:
-    """The manifest with git's hash of every file that may not go into LFS."""
+    """Return the manifest with git's hash of every file that may not go into LFS."""
     files = tuple(_with_git(entry, local[entry.path]) if entry.size < SMALL else entry for entry in manifest.files)
     return replace(manifest, files=files, replaced=())
 

@@ -70,7 +70,7 @@ def hasher(entry: FileEntry) -> Hasher:
 
 
 def is_whole(entry: FileEntry, path: Path) -> bool:
-    """Whether a plain file holds the bytes of an entry."""
+    """Return whether a plain file holds the bytes of an entry."""
     if path.is_symlink() or not path.is_file() or path.stat().st_size != entry.size:
         return False
     digest = hasher(entry)

@@ -44,11 +44,11 @@ class ObjectRemote:
         return self.blobs.warnings
 
     def describe(self) -> str:
-        """The URL, without a password."""
+        """Return the URL, without a password."""
         return self.blobs.describe()
 
     def read(self) -> Snapshot | None:
-        """The manifest that is there; None where there is none."""
+        """Return the manifest that is there; None where there is none."""
         found = self.retry(self.blobs.manifest)
         if found is None:
             return None

@@ -56,7 +56,7 @@ def fold(path: str) -> str:
 
 
 def is_hidden(path: str) -> bool:
-    """Whether a name in the path begins with a dot: no push takes such files along, and no pull makes them."""
+    """Return whether a name in the path begins with a dot: no push takes such files along, and no pull makes them."""
     return any(part.startswith(".") for part in path.split("/"))
 
 

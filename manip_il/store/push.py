@@ -82,7 +82,7 @@ def _datasets(source: Path) -> Iterator[Path]:
 
 
 def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
-    """The difference between a folder and what is there. Raises `UsageError` where another kind is there."""
+    """Return the difference between a folder and what is there. Raises `UsageError` where another kind is there."""
     manifest = scanned.manifest
     if before and before.manifest.kind != manifest.kind:
         there, here = before.manifest.kind, manifest.kind

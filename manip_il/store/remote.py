@@ -50,7 +50,7 @@ class Remote(Protocol):
         ...
 
     def describe(self) -> str:
-        """The place, as messages name it: without any secret."""
+        """Return the place, as messages name it: without any secret."""
         ...
 
     def read(self) -> Snapshot | None:

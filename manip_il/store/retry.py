@@ -50,7 +50,10 @@ class Retry:
 
 
 def retry_after(value: str | None) -> float | None:
-    """Seconds that a Retry-After header asks to wait, given as a number or as a date; None where it says neither."""
+    """Return seconds that a Retry-After header asks to wait, given as a number or as a date.
+
+    None where it says neither.
+    """
     if value is None:
         return None
     if value.strip().isdecimal():

@@ -27,18 +27,18 @@ _KEYS = {"InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "Invalid
 
 
 def code_of(error: BaseException) -> str:
-    """S3's word for what went wrong, or an HTTP status as text; empty where no server answered."""
+    """Return S3's word for what went wrong, or an HTTP status as text; empty where no server answered."""
     response = _response(error)
     return str(cast("Mapping[str, Any]", response.get("Error", {})).get("Code", ""))
 
 
 def status_of(error: BaseException) -> int:
-    """HTTP status of the answer; 0 where no server answered."""
+    """Return HTTP status of the answer; 0 where no server answered."""
     return int(_metadata(error).get("HTTPStatusCode", 0) or 0)
 
 
 def explained(error: Exception, what: str, bucket: str) -> RemoteError:
-    """One line that says what to do. what: what was being done, with the place."""
+    """Return one line that says what to do. what: what was being done, with the place."""
     name, code, status = type(error).__name__, code_of(error), status_of(error)
     if name in ("NoCredentialsError", "PartialCredentialsError", "CredentialRetrievalError", "ProfileNotFound"):
         return AuthError(f"cannot {what}: not logged in; set {CREDENTIALS}")

@@ -38,7 +38,7 @@ Call = Callable[..., Awaitable[Any]]
 
 
 def open_s3(url: RemoteUrl) -> ObjectRemote:
-    """The remote of an `s3://` URL."""
+    """Return the remote of an `s3://` URL."""
     return ObjectRemote(S3Blobs(url))
 
 
@@ -60,11 +60,11 @@ class S3Blobs:
         self._fs = S3FileSystem(config_kwargs=config, skip_instance_cache=True, use_listings_cache=False)
 
     def describe(self) -> str:
-        """The URL."""
+        """Return the URL."""
         return self._name
 
     def manifest(self) -> tuple[bytes, str] | None:
-        """Content and ETag."""
+        """Return content and ETag."""
         try:
             return self._run(self._get_manifest, f"read {self._name}")
         except NotFoundError as error:
@@ -161,7 +161,7 @@ class S3Blobs:
         return {key: stored for key, stored in in_threads(self.threads, one, keys).items() if stored}
 
     def list(self) -> dict[str, Stored]:
-        """Every object."""
+        """Return every object."""
         found: dict[str, Stored] = {}
         self._left = []
         with self._speaking_s3():

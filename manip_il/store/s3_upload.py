@@ -39,7 +39,7 @@ class Part:
 
 
 def is_as_sent(answer: Mapping[str, Any], part: Part, checksum: str = "") -> bool | None:
-    """Whether the store has what was sent; None where its answer cannot tell.
+    """Return whether the store has what was sent; None where its answer cannot tell.
 
     checksum: base64 of the sha256 that was sent along; a store that encrypts has an ETag of its own, but names it.
     """

@@ -35,7 +35,7 @@ class Scanned:
 
 
 def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None) -> Scanned:
-    """Every file of a dataset or of a run, hashed.
+    """Return every file of a dataset or of a run, hashed.
 
     journals: a dataset's folder `<root>.journals` goes along as `journals/`, and those inside a run. extra: files that
     take the place of the folder's own, by path. Left out is what begins with a dot and what a killed writer left.
@@ -69,14 +69,14 @@ def kind_of(root: Path) -> Kind:
 
 
 def entry_of(name: str, path: Path) -> FileEntry:
-    """The entry of a local file."""
+    """Return the entry of a local file."""
     digest = hashlib.sha256()
     size = hash_file(path, digest)
     return FileEntry(name, size, digest.hexdigest())
 
 
 def is_left_out(name: str) -> bool:
-    """Whether no push takes a file or folder of this name along."""
+    """Return whether no push takes a file or folder of this name along."""
     return bool(_LEFT_OUT.fullmatch(name))
 
 

@@ -151,7 +151,7 @@ _CUT = (errno.ECONNRESET, errno.EPIPE, errno.ETIMEDOUT, errno.EHOSTUNREACH, errn
 
 
 def quick_transport(sock: Any, /, **more: Any) -> paramiko.Transport:
-    """The quickest ciphers first, and answers to a read in one packet each."""
+    """Return the quickest ciphers first, and answers to a read in one packet each."""
     transport = paramiko.Transport(sock, default_max_packet_size=PACKET, **more)
     options = transport.get_security_options()
     options.ciphers = sorted(options.ciphers, key=lambda name: "gcm" not in name)

@@ -63,7 +63,7 @@ class Held:
         return self.seen() == self._word
 
     def take(self) -> bool:
-        """Whether it could be made."""
+        """Return whether it could be made."""
         try:
             with self._sftp.open(self._path, "wx") as file:
                 file.write(self._word)
@@ -76,7 +76,7 @@ class Held:
         return True
 
     def seen(self) -> str:
-        """The word of who holds it; empty where nobody does."""
+        """Return the word of who holds it; empty where nobody does."""
         try:
             with self._sftp.open(self._path, "r") as file:
                 return file.read(64).decode(errors="replace")
@@ -84,7 +84,7 @@ class Held:
             return ""
 
     def touched(self) -> tuple[str, int]:
-        """The word of who holds it, and when that one last touched it, by the clock over there [s]."""
+        """Return the word of who holds it, and when that one last touched it, by the clock over there [s]."""
         word = self.seen()
         with contextlib.suppress(FileNotFoundError):
             return word, self._sftp.stat(self._path).st_mtime or 0

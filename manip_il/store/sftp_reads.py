@@ -19,7 +19,7 @@ UNDER_WAY = 2**22  # twice what ssh lets be on its way [bytes]
 
 
 def read_ahead(sftp: SFTPClient, file: SFTPFile, offset: int, size: int) -> Iterator[bytes]:
-    """The bytes of an open file from `offset` up to `size`, in order; fewer where it has ended before.
+    """Yield the bytes of an open file from `offset` up to `size`, in order; fewer where it has ended before.
 
     Raises what paramiko does.
     """

@@ -30,7 +30,7 @@ HASH_TIME = 600.0  # the other machine may take so long over sha256sum [s]
 
 
 def open_sftp(url: RemoteUrl) -> ObjectRemote:
-    """The remote of an `sftp://` URL; nothing is connected yet."""
+    """Return the remote of an `sftp://` URL; nothing is connected yet."""
     return ObjectRemote(SftpBlobs(url))
 
 
@@ -48,11 +48,11 @@ class SftpBlobs:
         self._left: list[str] = []
 
     def describe(self) -> str:
-        """The URL, without the password."""
+        """Return the URL, without the password."""
         return self._name
 
     def manifest(self) -> tuple[bytes, str] | None:
-        """Content and its hash."""
+        """Return content and its hash."""
         with self._sftp("read") as sftp:
             try:
                 with sftp.open(self._at(MANIFEST_FILE), "rb") as file:
@@ -134,7 +134,7 @@ class SftpBlobs:
         return found
 
     def list(self) -> dict[str, Stored]:
-        """Every object."""
+        """Return every object."""
         found: dict[str, Stored] = {}
         self._left = []
         with self._sftp("list") as sftp:

@@ -77,7 +77,7 @@ class RemoteUrl:
 
 
 def open_remote(url: RemoteUrl, *, private: bool = False) -> Remote:
-    """The remote of a URL; nothing is asked of it yet. private: of a repo that a push would make on the Hub."""
+    """Return the remote of a URL; nothing is asked of it yet. private: of a repo that a push would make on the Hub."""
     module, _, name = _REMOTES[url.scheme].partition(":")
     make = getattr(importlib.import_module(module), name)
     return make(url, private=private) if url.scheme == "hf" else make(url)

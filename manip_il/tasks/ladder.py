@@ -73,7 +73,7 @@ class Grasp(NamedTuple):
 
 
 def grasp_of(world: World, name: str) -> Grasp:
-    """How the hand stands to an object; worked out once for a state."""
+    """Return how the hand stands to an object; worked out once for a state."""
     return world.remember(("grasp", name), partial(_grasp, world, name))
 
 
@@ -103,7 +103,7 @@ def _grasp(world: World, name: str) -> Grasp:
 
 
 def held(world: World, name: str) -> bool:
-    """The object is between the fingers, and each of them touches it."""
+    """Return the object is between the fingers, and each of them touches it."""
     g = grasp_of(world, name)
     x, y, z = IN_HAND
     return _inside(g.offset, (g.width / 2 + x, y, g.half + z)) and world.touched(name)
@@ -134,7 +134,7 @@ def close_on(world: World, name: str) -> Target:
 
 
 def carry(world: World, name: str, to: F64) -> Target:
-    """The held object's centre to a point (3,), over its height first and then down to it."""
+    """Return the held object's centre to a point (3,), over its height first and then down to it."""
     way = to - world.pose(name).position
     lift = carry_lift(math.hypot(way[0], way[1]))
     position = world.ee.position + way + [0.0, 0.0, lift]
@@ -143,12 +143,12 @@ def carry(world: World, name: str, to: F64) -> Target:
 
 
 def carry_lift(distance: float) -> float:
-    """How high over its goal an object is carried at a horizontal distance from it [m]."""
+    """Return how high over its goal an object is carried at a horizontal distance from it [m]."""
     return min(CARRY_LIFT, CARRY_SLOPE * max(0.0, distance - CARRY_FREE))
 
 
 def pick_rungs(name: str) -> tuple[Rung, ...]:
-    """The ladder that grasps an object and carries it to the goal."""
+    """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
         return held(world, name) and math.dist(world.pose(name).position, world.goal) < AT_GOAL
@@ -201,13 +201,13 @@ def nearness(rest: float) -> float:
 
 
 def hand_down(yaw: float) -> F64:
-    """Rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
+    """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
 def grasp_yaw(object_yaw: float, hand: F64) -> float:
-    """The one of a cube's four grasps that is nearest to the hand's yaw, and a little to none [rad].
+    """Return the one of a cube's four grasps that is nearest to the hand's yaw, and a little to none [rad].
 
     hand: rotation of `ee`, (3, 3). Nearest to the hand, not to zero: a learner that averages both sides of the boundary
     between two grasps then leaves it by any turn, and does not stand still in the middle.
@@ -219,7 +219,7 @@ def grasp_yaw(object_yaw: float, hand: F64) -> float:
 
 
 def cube_yaw(rotation: F64) -> tuple[float, float]:
-    """A resting cube's yaw modulo a quarter turn, in [-pi/4, pi/4], and its tilt off a face [rad].
+    """Return a resting cube's yaw modulo a quarter turn, in [-pi/4, pi/4], and its tilt off a face [rad].
 
     A cube looks the same on every face, so the yaw is that of the side most along x or y once the axis
     nearest the vertical is set aside. rotation: of the cube, (3, 3).
@@ -242,7 +242,7 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
 
 
 def angle_between(a: F64, b: F64) -> float:
-    """Angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
+    """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
     return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))
 
 

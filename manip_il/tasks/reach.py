@@ -56,6 +56,6 @@ class ReachGoal:
 
 
 def see_hand(world: World) -> Observed:
-    """Where the hand is and which way it points: the beginning of every `environment_state`."""
+    """Return where the hand is and which way it points: the beginning of every `environment_state`."""
     ee = world.ee
     return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

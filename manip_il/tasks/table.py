@@ -16,7 +16,7 @@ TASKS: dict[str, Task] = {
 
 
 def get_task(name: str) -> Task:
-    """The table's entry; raises `UnknownName`."""
+    """Return the table's entry; raises `UnknownName`."""
     if name not in TASKS:
         raise UnknownName("task", name, TASKS)
     return TASKS[name]

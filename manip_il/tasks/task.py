@@ -87,16 +87,16 @@ class Task(Protocol):
         ...
 
     def error(self, world: World) -> float:
-        """How far the task is from being solved [m]; within the tolerance it is."""
+        """Return how far the task is from being solved [m]; within the tolerance it is."""
         ...
 
     def progress(self, world: World) -> float:
-        """How much is done, 0 to 1; it never falls while the task is being done right."""
+        """Return how much is done, 0 to 1; it never falls while the task is being done right."""
         ...
 
 
 def phases(task: Task) -> tuple[str, ...]:
-    """Names of a task's phases by their number in `expert_phase`: none, then the rungs from the first on."""
+    """Return names of a task's phases by their number in `expert_phase`: none, then the rungs from the first on."""
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 

@@ -44,7 +44,7 @@ class KeypointEncoder(nn.Module):
         self.size = NUMBERS * keypoints
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Numbers of the keypoints, (B, 4 K) in single precision, from pictures (B, 3, H, W) from 0 to 1."""
+        """Return numbers of the keypoints, (B, 4 K) in single precision, from pictures (B, 3, H, W) from 0 to 1."""
         # Channels last is faster on a CPU. The weights stay contiguous, as safetensors wants an optimiser's state.
         features = self.layers(_light_and_colour(pictures).contiguous(memory_format=torch.channels_last))
         # In half precision a keypoint would jump from pixel to pixel.

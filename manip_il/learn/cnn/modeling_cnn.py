@@ -33,7 +33,7 @@ class CNNPolicy(MLPPolicy):
     @override
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """One absolute action a row, (B, n), each the same bits whatever the other rows are."""
+        """Return one absolute action a row, (B, n), each the same bits whatever the other rows are."""
         state = batch[STATE]
         if len(state) == 0:
             return torch.empty_like(state)

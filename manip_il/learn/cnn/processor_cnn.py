@@ -17,5 +17,8 @@ def make_cnn_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """The mlp's: rename, batch, device, and a normaliser that is the identity; LeRobot looks for them by this name."""
+    """Return the mlp's: rename, batch, device, and a normaliser that is the identity.
+
+    LeRobot looks for them by this name.
+    """
     return make_mlp_pre_post_processors(config, dataset_stats)

@@ -59,7 +59,7 @@ class MLPConfig(PreTrainedConfig):
             raise UsageError(f"policy.{error}") from error
 
     def network_shape(self) -> Shape:
-        """The part that the network is built from."""
+        """Return the part that the network is built from."""
         return Shape(**{field.name: getattr(self, field.name) for field in fields(Shape)})
 
     @override

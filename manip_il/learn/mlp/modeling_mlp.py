@@ -40,7 +40,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Mean loss over the rows with a valid label; with `reduction="none"` each row's, 0 without one."""
+        """Return mean loss over the rows with a valid label; with `reduction="none"` each row's, 0 without one."""
         losses = self._row_losses(self._inputs(batch), batch)
         valid = self._valid(batch)
         # `where`, as 0 * inf is NaN
@@ -52,12 +52,12 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """One absolute action a row, (B, n)."""
+        """Return one absolute action a row, (B, n)."""
         return self.model.act(self._inputs(batch))
 
     @override
     def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """A chunk of one action a row, (B, 1, n)."""
+        """Return a chunk of one action a row, (B, 1, n)."""
         return self.select_action(batch).unsqueeze(1)
 
     @override
