@@ -17,8 +17,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "manip_il"
 MOST_LINES, MOST_FUNCTION_LINES = 300, 50
-VERBS = frozenset(
-    """
+_VERBS = """
     accept add advance align allow answer append apply approach arrange ask assign attach average begin bind blend block
     blur bring build call cancel carry check choose clean clear clip clone close collect combine command compare compile
     compute copy count create crop cut decide decode define delete describe disable divide draw drive drop dump enable
@@ -32,14 +31,12 @@ VERBS = frozenset(
     select send serve set settle shift show shuffle shut simulate skip solve sort split standardise start state step
     stop store stream strip summarise sum switch take tell test throw time train transform translate trim try turn
     undo unpack update upload use validate verify wait walk warn watch weigh wipe wrap write yield
-    """.split()
-)
-NO_NOUN = frozenset(
-    """
+"""
+_NO_NOUN = """
     and as at between by for from further how in it its nobody of on once or somebody something than that those to under
     until what when where which while who whose with within without
-    """.split()
-)
+"""
+VERBS, NO_NOUN = frozenset(_VERBS.split()), frozenset(_NO_NOUN.split())
 ARRAY = re.compile(r"\b(NDArray|ndarray|Tensor|F32|F64|I64|U8|Array)\b")
 SHAPE = re.compile(r"\([\w.* +-]*,[\w.,* +-]*\)|\[[^\]]+\]")
 
