@@ -32,7 +32,7 @@ def record(warm_lerobot: Warm) -> Record:
     """In a process of its own, which may be killed."""
 
     def run(root: Path, kind: str, *, episodes: int, end: str = "finalize") -> None:
-        done = warm_lerobot.run("python", HERE / "record_lerobot.py", root, kind, episodes, end)
+        done = warm_lerobot.run("python", HERE.parent / "data" / "record_lerobot.py", root, kind, episodes, end)
         assert done.returncode == (0 if end == "finalize" else -9), done.stderr
 
     return run
