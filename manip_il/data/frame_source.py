@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import Feature, Info, read_info
 from manip_il.data.picture import open_picture
 from manip_il.data.video_read import VideoReader
-from manip_il.doctor.info import Feature, Info, read_info
 from manip_il.doctor.shards import UNREADABLE, Shard, find_shards, floats, integers
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
@@ -112,9 +112,7 @@ def find_frames(root: Path, key: str) -> FrameSource:
     Raises `ManipError` for a folder that is no dataset, one without frames, one whose files do not hold each frame
     once, and for depth maps; `UnknownName` for a column that is no camera.
     """
-    info, findings = read_info(root)
-    if info is None:
-        raise ManipError(f"{root}: {findings[0].place} {findings[0].text}")
+    info = read_info(root)
     cameras = {feature.key: feature for feature in info.of_dtype("video", "image")}
     if key not in cameras:
         raise UnknownName(f"camera in {root}", key, cameras)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.info import LARGEST_META, info_problems
 from manip_il.data.parquet_limits import check_parquet
 from manip_il.data.video_read import DatasetPictures
-from manip_il.doctor.info import LARGEST_META, info_problems
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 

@@ -13,8 +13,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import NUMBERS, Info, InvalidInfo, read_info, read_object
 from manip_il.doctor.finding import Finding, error
-from manip_il.doctor.info import NUMBERS, Info, read_info, read_object
 from manip_il.doctor.scan import Scan, scan
 from manip_il.doctor.shards import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
 from manip_il.doctor.stored import stored_quantiles
@@ -57,17 +57,20 @@ class Dataset:
     on_file: Callable[[], None] = field(default=lambda: None, compare=False)
 
     @cached_property
-    def _info(self) -> tuple[Info | None, list[Finding]]:
-        return read_info(self.root)
+    def _info(self) -> tuple[Info | None, list[str]]:
+        try:
+            return read_info(self.root), []
+        except InvalidInfo as invalid:
+            return None, invalid.problems
 
     @property
     def info(self) -> Info | None:
-        """What `meta/info.json` says; None where it cannot be used."""
+        """Content of `meta/info.json`; None where it cannot be used."""
         return self._info[0]
 
     @property
-    def info_findings(self) -> list[Finding]:
-        """What is wrong with `meta/info.json`."""
+    def info_problems(self) -> list[str]:
+        """Lines that say what is wrong with `meta/info.json`."""
         return self._info[1]
 
     @property

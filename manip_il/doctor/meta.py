@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import chain
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import INDEX_FEATURES, PICTURES, Info
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, plural, some
 from manip_il.doctor.shards import UNREADABLE, BadColumn, integers, open_shard
@@ -17,8 +19,14 @@ EPISODES = "meta/episodes"
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
-    """`meta/info.json` is there, of the right version, and says what everything else is read by."""
-    yield from dataset.info_findings
+    """Check that `meta/info.json` can be used, has the columns of every dataset, and names for each number."""
+    for text in dataset.info_problems:
+        yield error(layout.INFO, text)
+    if dataset.info is None:
+        return
+    if missing := [key for key in INDEX_FEATURES if key not in dataset.info.features]:
+        yield error(layout.INFO, f"features lack {', '.join(missing)}, which every LeRobot dataset has")
+    yield from _check_names(dataset.info)
 
 
 def check_footers(dataset: Dataset) -> Iterator[Finding]:
@@ -102,3 +110,24 @@ def _contiguous(episodes: Episodes) -> Iterator[Finding]:
             )
     if len(bad := np.flatnonzero(episodes.length < 1)):
         yield error(f"{EPISODES}: length", f"episode {episodes.index[bad[0]]} has {episodes.length[bad[0]]} frames")
+
+
+def _check_names(info: Info) -> Iterator[Finding]:
+    for feature in info.features.values():
+        count = _name_count(feature.names)
+        wanted = len(feature.shape) if feature.dtype in PICTURES else feature.size
+        fits = count in (None, wanted) or (len(feature.shape) > 1 and count == len(feature.shape))
+        if not fits:
+            shape = list(feature.shape)
+            yield error(f"{layout.INFO}: {feature.key}", f"{count} names for shape {shape}; expected {wanted}")
+
+
+def _name_count(names: Any) -> int | None:
+    """How many names; None where there are none, or in a form that cannot be counted."""
+    if isinstance(names, list):
+        return len(cast(list[Any], names))
+    if isinstance(names, dict) and names:
+        values = list(cast(dict[str, Any], names).values())
+        lists = [cast(list[Any], value) for value in values if isinstance(value, list)]
+        return sum(map(len, lists)) if len(lists) == len(values) else len(values) if not lists else None
+    return None

@@ -8,9 +8,9 @@ from typing import Any
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
+from manip_il.data.info import Feature, Info, read_object
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, some, warning
-from manip_il.doctor.info import Feature, Info, read_object
 from manip_il.errors import ManipError
 
 _NEEDED = {"spec", "fingerprint", "provenance"}

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import Feature
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error
-from manip_il.doctor.info import Feature
 from manip_il.doctor.stored import stored
 
 _TOLERANCE = 0.1  # of the range of levels: LeRobot samples frames and pixels, before they are compressed with loss

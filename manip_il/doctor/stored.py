@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.data.info import Feature
 from manip_il.data.lerobot_layout import QUANTILES
-from manip_il.doctor.info import Feature
 
 F64 = NDArray[np.float64]
 

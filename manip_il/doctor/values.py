@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, error, plural, some, warning
-from manip_il.doctor.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
 from manip_il.doctor.moments import Moments
 from manip_il.doctor.stored import stored
 

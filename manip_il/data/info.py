@@ -1,4 +1,4 @@
-"""`meta/info.json` of any LeRobot dataset, checked field by field: everything else is read by what it says."""
+"""Read `meta/info.json` of any LeRobot dataset and check it field by field."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any, cast
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.schema import LONGEST_SIDE
-from manip_il.doctor.finding import Finding, error
 from manip_il.errors import ManipError
 
 PICTURES = ("video", "image")
@@ -56,14 +55,14 @@ class Feature:
 
     @property
     def channels(self) -> int:
-        """Of a picture."""
+        """Channels of a picture."""
         height, width = self.picture_size
         return self.size // (height * width) if height and width else 0
 
 
 @dataclass(frozen=True)
 class Info:
-    """What `meta/info.json` says."""
+    """Content of `meta/info.json`, checked."""
 
     fps: float
     features: dict[str, Feature]
@@ -79,23 +78,30 @@ class Info:
         return [feature for feature in self.features.values() if feature.dtype in dtypes]
 
 
-def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
-    """Return the file's content, or None where nothing else can be read by it; and what is wrong with it."""
+class InvalidInfo(ManipError):
+    """Raised for a `meta/info.json` that cannot be used. problems: all that is wrong with it, one line each."""
+
+    def __init__(self, root: Path, problems: list[str]):
+        super().__init__(f"{root}: {layout.INFO} {problems[0]}")
+        self.problems = problems
+
+
+def read_info(root: Path) -> Info:
+    """Read and check `meta/info.json` of a dataset. Raises `InvalidInfo`."""
     try:
         raw = read_object(root / layout.INFO)
     except FileNotFoundError:
         text = f"is missing: {root} is not a LeRobot dataset, or its recorder died before it wrote anything"
-        return None, [error(layout.INFO, text)]
+        raise InvalidInfo(root, [text]) from None
     except (OSError, ValueError, RecursionError) as problem:
-        return None, [error(layout.INFO, f"cannot be read: {problem}")]
+        raise InvalidInfo(root, [f"cannot be read: {problem}"]) from problem
     version = raw.get("codebase_version")
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
-        return None, [error(layout.INFO, f"codebase_version is {version!r}; expected {layout.VERSION!r}{older}")]
-    findings = [error(layout.INFO, text) for text in info_problems(raw)]
-    if findings:
-        return None, findings
-    info = Info(
+        raise InvalidInfo(root, [f"codebase_version is {version!r}; expected {layout.VERSION!r}{older}"])
+    if problems := list(info_problems(raw)):
+        raise InvalidInfo(root, problems)
+    return Info(
         fps=float(raw["fps"]),
         features={key: _feature(key, value) for key, value in raw["features"].items()},
         episodes=raw["total_episodes"],
@@ -105,11 +111,10 @@ def read_info(root: Path) -> tuple[Info | None, list[Finding]]:
         data_path=raw.get("data_path", layout.DATA_PATH),
         video_path=raw.get("video_path") or layout.VIDEO_PATH,
     )
-    return info, list(_feature_findings(info))
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Return a JSON object. Raises `OSError`, or `ValueError` for anything else."""
+    """Return the object in a JSON file of at most 16 MiB. Raises `OSError`, or `ValueError` for any other content."""
     with path.open("rb") as file:
         content = file.read(LARGEST_META + 1)
     if len(content) > LARGEST_META:
@@ -124,7 +129,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def info_problems(raw: dict[str, Any]) -> Iterator[str]:
-    """What of the file's content no reader may rely on, one line each: values of other types, paths that lead out."""
+    """Yield what is wrong with the file's content, one line each: values of wrong types, paths out of the dataset."""
     fps: Any = raw.get("fps")
     if not _is_number(fps) or not 1 <= fps < 1e6:
         yield f"fps is {checks.shorten(fps)}; expected a number of at least 1"
@@ -171,12 +176,8 @@ def _is_feature(value: Any) -> bool:
     if not isinstance(value, dict):
         return False
     table = cast(dict[str, Any], value)
-    shape = table.get("shape")
-    if (
-        not isinstance(table.get("dtype"), str)
-        or not isinstance(shape, list)
-        or len(cast(list[Any], shape)) > _MOST_AXES
-    ):
+    shape: Any = table.get("shape")
+    if not isinstance(table.get("dtype"), str) or not isinstance(shape, list) or len(cast(Any, shape)) > _MOST_AXES:
         return False
     return all(_is_count(size) for size in cast(list[Any], shape)) and math.prod(cast(list[int], shape)) < 2**31
 
@@ -185,29 +186,6 @@ def _feature(key: str, value: dict[str, Any]) -> Feature:
     details = value.get("info") or value.get("video_info") or {}
     details = cast(dict[str, Any], details) if isinstance(details, dict) else {}
     return Feature(key, value["dtype"], tuple(value["shape"]), value.get("names"), details)
-
-
-def _feature_findings(info: Info) -> Iterator[Finding]:
-    if missing := [key for key in INDEX_FEATURES if key not in info.features]:
-        yield error(layout.INFO, f"features lack {', '.join(missing)}, which every LeRobot dataset has")
-    for feature in info.features.values():
-        count = _name_count(feature.names)
-        wanted = len(feature.shape) if feature.dtype in PICTURES else feature.size
-        fits = count in (None, wanted) or (len(feature.shape) > 1 and count == len(feature.shape))
-        if not fits:
-            shape = list(feature.shape)
-            yield error(f"{layout.INFO}: {feature.key}", f"{count} names for shape {shape}; expected {wanted}")
-
-
-def _name_count(names: Any) -> int | None:
-    """How many names; None where there are none, or in a form that cannot be counted."""
-    if isinstance(names, list):
-        return len(cast(list[Any], names))
-    if isinstance(names, dict) and names:
-        values = list(cast(dict[str, Any], names).values())
-        lists = [cast(list[Any], value) for value in values if isinstance(value, list)]
-        return sum(map(len, lists)) if len(lists) == len(values) else len(values) if not lists else None
-    return None
 
 
 def _is_number(value: Any) -> bool:
