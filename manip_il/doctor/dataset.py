@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Info, InvalidInfo, read_info, read_object
+from manip_il.data.shards import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
 from manip_il.doctor.finding import Finding, error
 from manip_il.doctor.scan import Scan, scan
-from manip_il.doctor.shards import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
 from manip_il.doctor.stored import stored_quantiles
 
 I64 = NDArray[np.int64]

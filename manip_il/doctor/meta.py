@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import INDEX_FEATURES, PICTURES, Info
+from manip_il.data.shards import UNREADABLE, BadColumn, integers, open_shard
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, plural, some
-from manip_il.doctor.shards import UNREADABLE, BadColumn, integers, open_shard
 
 EPISODES = "meta/episodes"
 

@@ -10,10 +10,10 @@ import numpy as np
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature
 from manip_il.data.picture import open_picture
+from manip_il.data.shards import UNREADABLE, Shard
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, plural
 from manip_il.doctor.pixels import Brightness, check_brightness
-from manip_il.doctor.shards import UNREADABLE, Shard
 
 _BATCH = 64  # pictures held at once
 _SAMPLE = 20  # of so many, one is looked at

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from manip_il.data.shards import NO_FOOTER
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, count_frames, error, plural, some
 from manip_il.doctor.leftovers import IMAGES
-from manip_il.doctor.shards import NO_FOOTER
 
 
 def check_recorder(dataset: Dataset) -> Iterator[Finding]:

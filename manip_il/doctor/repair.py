@@ -16,11 +16,11 @@ from manip_il.data.atomic import exclusive, write_file
 from manip_il.data.build import build
 from manip_il.data.info import Feature
 from manip_il.data.lerobot_stats import RunningStats
+from manip_il.data.shards import to_array
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, Severity, plural, some
 from manip_il.doctor.journals import readable_episodes
 from manip_il.doctor.leftovers import BESIDE
-from manip_il.doctor.shards import to_array
 from manip_il.errors import ManipError
 
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.shards import UNREADABLE
 from manip_il.doctor.dataset import I64, Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, plural, some
 from manip_il.doctor.meta import EPISODES, read_tasks
 from manip_il.doctor.scan import Runs, episodes_text
-from manip_il.doctor.shards import UNREADABLE
 
 _DATA = "data"
 

@@ -14,9 +14,9 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, Info
 from manip_il.data.parquet_limits import check_parquet
+from manip_il.data.shards import UNREADABLE, BadColumn, Shard, to_array
 from manip_il.doctor.finding import Finding, error, plural, some
 from manip_il.doctor.moments import Moments
-from manip_il.doctor.shards import UNREADABLE, BadColumn, Shard, to_array
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
