@@ -39,9 +39,8 @@ class DoctorOptions:
 
     def run(self) -> None:
         """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
-        from manip_il.doctor.examine import has_errors, verdict
+        from manip_il.doctor.examine import has_errors, repair, verdict
         from manip_il.doctor.finding import NotWhole
-        from manip_il.doctor.repair import repair
 
         dataset, findings = self._examine()
         if self.repair and any(finding.remedy.name != "NONE" for finding in findings):
@@ -74,7 +73,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     from manip_il.data.lerobot_layout import OURS
     from manip_il.data.lerobot_read import read_fingerprint
     from manip_il.doctor.finding import error, warning
-    from manip_il.doctor.ours import read_spec
+    from manip_il.doctor.meta import read_spec
 
     if not dataset.is_ours:
         return

@@ -1,8 +1,8 @@
-"""Parquet files as they are found: footers, columns as numpy arrays, and what is wrong with either."""
+"""Parquet files of any dataset: footers and columns are checked as they are read, and what is wrong is named."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il.data import lerobot_layout as layout
 from manip_il.data.parquet_limits import check_parquet
 
 MAGIC = b"PAR1"
@@ -55,7 +56,7 @@ class Shard:
                     groups, held = [], 0
 
     def batches(self, column: str, rows: int) -> Iterator[pa.Array]:
-        """Yield one column, at most `rows` at a time: pictures need not fit in memory."""
+        """Yield one column's values, (T,) of at most `rows` at a time: pictures need not fit in memory."""
         with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
             for batch in file.iter_batches(rows, columns=[column], use_threads=False):
                 yield batch.column(0)
@@ -89,6 +90,20 @@ def open_shard(name: str, path: Path) -> Shard:
         return Shard(name, path, f"cannot be read: {problem}")
 
 
+def read_tasks(root: Path) -> tuple[list[int], list[str]]:
+    """Return numbers and names of a dataset's tasks. Raises one of `UNREADABLE`."""
+    if not (root / layout.TASKS).is_file():
+        raise FileNotFoundError(root / layout.TASKS)
+    shard = open_shard(layout.TASKS, root / layout.TASKS)
+    if shard.problem:
+        raise BadColumn(shard.problem)
+    table = pa.concat_tables(shard.tables())
+    names = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
+    if len(names) != 1:  # pandas names the index `task`, or leaves it without a name of its own
+        raise BadColumn(f"has {len(names)} columns of text; expected the tasks' names in one")
+    return integers(table, layout.TASK_INDEX).tolist(), table.column(names[0]).to_pylist()
+
+
 def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
     """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
     array: Any = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
@@ -112,22 +127,22 @@ def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
     """Return a column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
-    if name not in table.column_names:
-        raise BadColumn(f"has no column {name!r}")
-    column = table.column(name)
-    if not pa.types.is_integer(column.type) or column.null_count:
-        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} missing values; expected integers")
-    return column.to_numpy().astype(np.int64)
+    return _numbers(table, name, "integers", pa.types.is_integer).astype(np.int64)
 
 
 def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
     """Return a column of numbers, (T,). Raises `BadColumn` as `integers` does."""
+    return _numbers(table, name, "numbers", pa.types.is_floating, pa.types.is_integer).astype(np.float64)
+
+
+def _numbers(table: pa.Table, name: str, expected: str, *types: Callable[[pa.DataType], bool]) -> NDArray[Any]:
     if name not in table.column_names:
         raise BadColumn(f"has no column {name!r}")
     column = table.column(name)
-    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)) or column.null_count:
-        raise BadColumn(f"column {name!r} is {column.type} with {column.null_count} missing values; expected numbers")
-    return column.to_numpy().astype(np.float64)
+    if column.null_count or not any(is_type(column.type) for is_type in types):
+        found = f"{column.type} with {column.null_count} missing values"
+        raise BadColumn(f"column {name!r} is {found}; expected {expected}")
+    return column.to_numpy()
 
 
 def _is_list(kind: pa.DataType) -> bool:

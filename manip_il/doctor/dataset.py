@@ -1,4 +1,4 @@
-"""A dataset folder as it is: read once and leniently, so that one broken file hides nothing of the others."""
+"""A dataset's folder, read once and leniently: one broken file hides nothing of the others."""
 
 from __future__ import annotations
 
@@ -6,27 +6,23 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Info, InvalidInfo, read_info, read_object
 from manip_il.data.shards import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
 from manip_il.doctor.finding import Finding, error
-from manip_il.doctor.scan import Scan, scan
-from manip_il.doctor.stored import stored_quantiles
+from manip_il.doctor.scan import F64, I64, Scan, concatenate, scan
 
-I64 = NDArray[np.int64]
-F64 = NDArray[np.float64]
 _WHOLE = ("length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 
 
 @dataclass(frozen=True)
 class Clips:
-    """Where one camera's episodes lie: a file and times in it [s], one entry an episode."""
+    """Places of one camera's episodes, one entry an episode: a video file, start and stop in it [s]."""
 
     files: list[str]
     starts: F64
@@ -35,7 +31,7 @@ class Clips:
 
 @dataclass(frozen=True)
 class Episodes:
-    """The readable rows of `meta/episodes`, one entry an episode. files: the data file that each one names."""
+    """Readable rows of `meta/episodes`, one entry an episode. files: the data file that each one names."""
 
     index: I64
     length: I64
@@ -43,7 +39,7 @@ class Episodes:
     stop: I64
     files: list[str]
     tasks: list[list[str]]
-    clips: dict[str, Clips]  # camera column -> where
+    clips: dict[str, Clips]  # camera column -> places
 
     def __len__(self) -> int:
         return len(self.index)
@@ -51,27 +47,27 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Dataset:
-    """What a folder holds. on_file is called after every file that takes a while to read."""
+    """Content of a folder. on_file is called after every file that takes a while to read."""
 
     root: Path
     on_file: Callable[[], None] = field(default=lambda: None, compare=False)
 
-    @cached_property
-    def _info(self) -> tuple[Info | None, list[str]]:
-        try:
-            return read_info(self.root), []
-        except InvalidInfo as invalid:
-            return None, invalid.problems
-
     @property
     def info(self) -> Info | None:
         """Content of `meta/info.json`; None where it cannot be used."""
-        return self._info[0]
+        return self._info if isinstance(self._info, Info) else None
 
     @property
     def info_problems(self) -> list[str]:
-        """Lines that say what is wrong with `meta/info.json`."""
-        return self._info[1]
+        """Lines that say why `meta/info.json` cannot be used."""
+        return [] if isinstance(self._info, Info) else self._info.problems
+
+    @cached_property
+    def _info(self) -> Info | InvalidInfo:
+        try:
+            return read_info(self.root)
+        except InvalidInfo as invalid:
+            return invalid
 
     @property
     def is_ours(self) -> bool:
@@ -80,36 +76,74 @@ class Dataset:
 
     @property
     def journals(self) -> Path:
-        """The folder of journals that stands beside it, if one does."""
+        """Folder of the dataset's journals, beside it; it may be missing."""
         root = self.root.absolute()
         return root.with_name(f"{root.name}.journals")
 
     @cached_property
     def data_shards(self) -> list[Shard]:
-        """The data files that LeRobot would read: all that match, whoever refers to them."""
+        """Data files that LeRobot reads: all that match its pattern, whether or not an episode names them."""
         return find_shards(self.root, layout.DATA_FILES)
 
     @cached_property
     def episode_shards(self) -> list[Shard]:
-        """The files of `meta/episodes`."""
+        """Files of `meta/episodes`."""
         return find_shards(self.root, layout.EPISODES_FILES)
 
-    @cached_property
+    @property
     def episodes(self) -> Episodes | None:
-        """None where no row can be read."""
+        """Readable rows of `meta/episodes`; None where there are none."""
         return self._episodes[0]
 
     @property
     def episode_findings(self) -> list[Finding]:
-        """What is wrong with the content of files of `meta/episodes` whose footers are there."""
+        """Damage behind the footers of `meta/episodes`: columns and pages."""
         return self._episodes[1]
+
+    @cached_property
+    def _episodes(self) -> tuple[Episodes | None, list[Finding]]:
+        parts: list[Episodes] = []
+        findings: list[Finding] = []
+        for shard in self.episode_shards:
+            if self.info is None or shard.problem:
+                continue
+            try:
+                for table in shard.tables(rows=500):
+                    parts.append(_read_episodes(table, self.info))
+            except BadColumn as problem:
+                findings.append(error(shard.name, str(problem)))
+            except UNREADABLE as problem:
+                findings.append(error(shard.name, f"cannot be read: {problem}"))
+        return (concatenate(parts) if parts else None), findings
+
+    @property
+    def reads_all_episodes(self) -> bool:
+        """Whether every row of `meta/episodes` can be read."""
+        return not self.episode_findings and not any(shard.problem for shard in self.episode_shards)
 
     @property
     def knows_all_episodes(self) -> bool:
-        """Whether `meta/episodes` can be read and holds as many as `meta/info.json` counts."""
-        if self.info is None or self.episodes is None or self.episode_findings:
+        """Whether `meta/episodes` can be read and holds as many episodes as `meta/info.json` counts."""
+        if self.info is None or self.episodes is None:
             return False
-        return not any(shard.problem for shard in self.episode_shards) and len(self.episodes) == self.info.episodes
+        return self.reads_all_episodes and len(self.episodes) == self.info.episodes
+
+    @cached_property
+    def scan(self) -> Scan:
+        """Result of reading all data files once."""
+        if self.info is None:
+            return Scan()
+        quantiles: dict[str, F64] = {}
+        for feature in self.info.of_dtype(*NUMBERS) if self.is_ours else []:
+            rows = [self.statistic(feature.key, name) for name in layout.QUANTILES]
+            if all(row is not None and len(row) == feature.size for row in rows):
+                quantiles[feature.key] = np.array(rows)
+        return scan(self.data_shards, self.info, quantiles, self.on_file)
+
+    @property
+    def reads_all_rows(self) -> bool:
+        """Whether there are data files and each of them can be read to its end."""
+        return bool(self.data_shards) and len(self.scan.readable) == len(self.data_shards)
 
     @cached_property
     def stats(self) -> dict[str, Any] | None:
@@ -119,36 +153,16 @@ class Dataset:
         except (OSError, ValueError, RecursionError):
             return None
 
-    @cached_property
-    def scan(self) -> Scan:
-        """What one reading of all data files gives."""
-        if self.info is None:
-            return Scan()
-        quantiles = stored_quantiles(self.stats, self.info.of_dtype(*NUMBERS)) if self.is_ours else {}
-        return scan(self.data_shards, self.info, quantiles, self.on_file)
-
-    @property
-    def reads_all_rows(self) -> bool:
-        """Whether there are data files and each of them can be read to its end."""
-        return bool(self.data_shards) and len(self.scan.readable) == len(self.data_shards)
-
-    @cached_property
-    def _episodes(self) -> tuple[Episodes | None, list[Finding]]:
-        info = self.info
-        if info is None:
-            return None, []
-        parts: list[Episodes] = []
-        findings: list[Finding] = []
-        for shard in self.episode_shards:
-            if shard.problem:
-                continue
-            try:
-                parts.extend(_read_episodes(table, info) for table in shard.tables(rows=500))
-            except BadColumn as problem:
-                findings.append(error(shard.name, str(problem)))
-            except UNREADABLE as problem:
-                findings.append(error(shard.name, f"cannot be read: {problem}"))
-        return (_join(parts) if parts else None), findings
+    def statistic(self, key: str, name: str) -> F64 | None:
+        """Return a column's statistic in `meta/stats.json`, flat, (n,); None for all but finite numbers."""
+        table: Any = (self.stats or {}).get(key)
+        if not isinstance(table, dict) or name not in table:
+            return None
+        try:
+            values = np.asarray(cast(dict[str, Any], table)[name], dtype=np.float64).reshape(-1)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        return values if np.isfinite(values).all() else None
 
 
 def _read_episodes(table: pa.Table, info: Info) -> Episodes:
@@ -181,20 +195,3 @@ def _texts(table: pa.Table) -> list[list[str]]:
     if not all(isinstance(row, list) and all(isinstance(text, str) for text in row) for row in rows):
         raise BadColumn("column 'tasks' does not hold lists of strings")
     return rows
-
-
-def _join(parts: list[Episodes]) -> Episodes:
-    def joined(name: str) -> I64:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    clips = {
-        key: Clips(
-            [file for part in parts for file in part.clips[key].files],
-            np.concatenate([part.clips[key].starts for part in parts]),
-            np.concatenate([part.clips[key].stops for part in parts]),
-        )
-        for key in parts[0].clips
-    }
-    files = [file for part in parts for file in part.files]
-    tasks = [row for part in parts for row in part.tasks]
-    return Episodes(joined("index"), joined("length"), joined("start"), joined("stop"), files, tasks, clips)

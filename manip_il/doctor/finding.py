@@ -1,4 +1,4 @@
-"""What the doctor says: one finding a line."""
+"""Findings: what the doctor reports, one line each."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class Severity(Enum):
 
 
 class Remedy(Enum):
-    """How `repair` may put it right."""
+    """Means by which `repair` may correct a finding."""
 
     NONE = "none"
-    MOVE = "move"  # the file or folder at `place` goes into the kept copy
+    MOVE = "move"  # the file or folder at `place` is moved to the kept copy
     STATISTICS = "statistics"  # computed again from the data
     REBUILD = "rebuild"  # the whole dataset is built again from its journals
 
 
 @dataclass(frozen=True)
 class Finding:
-    """place: a file in the dataset, `FILE: column`, or a path beside it. text: what is wrong and what to do."""
+    """One line of a report. place: a file in the dataset, `FILE: column`, or a path beside the dataset."""
 
     severity: Severity
     place: str
@@ -45,34 +45,27 @@ class NotWhole(ManipError):
 
 
 def error(place: str, text: str, remedy: Remedy = Remedy.REBUILD) -> Finding:
-    """Return something wrong, which a rebuild from journals cures unless said otherwise."""
+    """Return an error, by default one that a rebuild from journals corrects."""
     return Finding(Severity.ERROR, place, text, remedy)
 
 
 def warning(place: str, text: str, remedy: Remedy = Remedy.NONE) -> Finding:
-    """Return something to know."""
+    """Return a warning."""
     return Finding(Severity.WARNING, place, text, remedy)
 
 
-def count_text(findings: Iterable[Finding]) -> str:
-    """`2 errors, 1 warning`; empty for none."""
-    severities = [finding.severity for finding in findings]
-    counts = {kind.value: severities.count(kind) for kind in Severity}
-    return ", ".join(plural(count, name) for name, count in counts.items() if count)
-
-
 def plural(count: int, name: str) -> str:
-    """`1 frame`, `1,200 frames`."""
+    """Return a count with its noun: `1 frame`, `1,200 frames`."""
     return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
 def count_frames(episodes: int, frames: int) -> str:
-    """`12 episodes, 246 frames`."""
+    """Return both counts as text: `12 episodes, 246 frames`."""
     return f"{plural(episodes, 'episode')}, {plural(frames, 'frame')}"
 
 
-def some(values: Iterable[object], most: int = 3) -> str:
-    """`3, 7, 9 and 2 more`."""
+def list_first(values: Iterable[object]) -> str:
+    """List the first three values, and count the rest: `3, 7, 9 and 2 more`."""
     texts = [str(value) for value in values]
-    rest = f" and {len(texts) - most:,} more" if len(texts) > most else ""
-    return ", ".join(texts[:most]) + rest
+    rest = f" and {len(texts) - 3:,} more" if len(texts) > 3 else ""
+    return ", ".join(texts[:3]) + rest

@@ -1,4 +1,4 @@
-"""Checks of what stands once a dataset: info.json, tasks, the list of episodes, readable footers."""
+"""Checks of the files in `meta/`, statistics apart: info.json, tasks, episodes, and this program's own file."""
 
 from __future__ import annotations
 
@@ -7,30 +7,39 @@ from itertools import chain
 from typing import Any, cast
 
 import numpy as np
-import pyarrow as pa
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.info import INDEX_FEATURES, PICTURES, Info
-from manip_il.data.shards import UNREADABLE, BadColumn, integers, open_shard
+from manip_il.data import schema as s
+from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
+from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature, read_object
+from manip_il.data.shards import UNREADABLE, read_tasks
 from manip_il.doctor.dataset import Dataset, Episodes
-from manip_il.doctor.finding import Finding, error, plural, some
+from manip_il.doctor.finding import Finding, error, list_first, plural, warning
+from manip_il.errors import ManipError
 
 EPISODES = "meta/episodes"
+_NEEDED = {"spec", "fingerprint", "provenance"}
+_HASH = "_sha256"
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
-    """Check that `meta/info.json` can be used, has the columns of every dataset, and names for each number."""
+    """Check that `meta/info.json` can be used, has the columns of every dataset, and as many names as numbers."""
     for text in dataset.info_problems:
         yield error(layout.INFO, text)
     if dataset.info is None:
         return
-    if missing := [key for key in INDEX_FEATURES if key not in dataset.info.features]:
+    features = dataset.info.features
+    if missing := [key for key in INDEX_FEATURES if key not in features]:
         yield error(layout.INFO, f"features lack {', '.join(missing)}, which every LeRobot dataset has")
-    yield from _check_names(dataset.info)
+    for key, feature in features.items():
+        count, axes = _count_names(feature.names), len(feature.shape)
+        wanted = axes if feature.dtype in PICTURES else feature.size
+        if count not in (None, wanted) and not (axes > 1 and count == axes):
+            yield error(f"{layout.INFO}: {key}", f"{count} names for shape {list(feature.shape)}; expected {wanted}")
 
 
 def check_footers(dataset: Dataset) -> Iterator[Finding]:
-    """Yield every parquet file of data and of episodes is there and has a readable footer."""
+    """Check that parquet files of data and of episodes are there and have readable footers."""
     info = dataset.info
     for pattern, shards in ((layout.DATA_FILES, dataset.data_shards), (layout.EPISODES_FILES, dataset.episode_shards)):
         if not shards and info is not None and info.episodes:
@@ -41,14 +50,14 @@ def check_footers(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_episodes(dataset: Dataset) -> Iterator[Finding]:
-    """`meta/episodes` counts from 0, each episode begins where the one before ends, and info.json agrees."""
+    """Check that episodes count from 0, that each begins where the one before ends, and info.json's totals."""
     yield from dataset.episode_findings
     info, episodes = dataset.info, dataset.episodes
     if info is None or episodes is None:
         return
-    yield from _contiguous(episodes)
-    if dataset.episode_findings or any(shard.problem for shard in dataset.episode_shards):
-        return  # the rows that cannot be read are named; without them no sum is right
+    yield from _check_sequence(episodes)
+    if not dataset.reads_all_episodes:
+        return  # the rows that cannot be read are reported; without them no sum is right
     for what, counted, found in (
         ("episodes", info.episodes, len(episodes)),
         ("frames", info.frames, int(episodes.length.sum())),
@@ -58,12 +67,12 @@ def check_episodes(dataset: Dataset) -> Iterator[Finding]:
 
 
 def check_tasks(dataset: Dataset) -> Iterator[Finding]:
-    """`meta/tasks.parquet` numbers the tasks, and episodes name no other."""
+    """Check that `meta/tasks.parquet` numbers the tasks, and that episodes name no other."""
     info = dataset.info
     if info is None or (info.episodes == 0 and not (dataset.root / layout.TASKS).exists()):
         return
     try:
-        numbers, names = read_tasks(dataset)
+        numbers, names = read_tasks(dataset.root)
     except FileNotFoundError:
         yield error(layout.TASKS, "is missing: no row's task has a name")
         return
@@ -71,59 +80,73 @@ def check_tasks(dataset: Dataset) -> Iterator[Finding]:
         yield error(layout.TASKS, str(problem))
         return
     if sorted(numbers) != list(range(len(numbers))):
-        yield error(layout.TASKS, f"task_index holds {some(numbers)}; expected 0 to {len(numbers) - 1}, each once")
+        found = list_first(numbers)
+        yield error(layout.TASKS, f"task_index holds {found}; expected 0 to {len(numbers) - 1}, each once")
     if info.tasks not in (None, len(numbers)):
         yield error(layout.INFO, f"total_tasks is {info.tasks}; {layout.TASKS} holds {len(numbers)}")
     if dataset.episodes is not None and (unknown := set(chain.from_iterable(dataset.episodes.tasks)) - set(names)):
-        yield error(EPISODES, f"names the task {some(map(repr, sorted(unknown)))}, which {layout.TASKS} does not hold")
+        found = list_first(map(repr, sorted(unknown)))
+        yield error(EPISODES, f"names the task {found}, which {layout.TASKS} does not hold")
 
 
-def read_tasks(dataset: Dataset) -> tuple[list[int], list[str]]:
-    """Return numbers and names of the tasks. Raises one of `UNREADABLE`."""
-    path = dataset.root / layout.TASKS
-    if not path.is_file():
-        raise FileNotFoundError(path)
-    shard = open_shard(layout.TASKS, path)
-    if shard.problem:
-        raise BadColumn(shard.problem)
-    table = pa.concat_tables(shard.tables())
-    names = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
-    if len(names) != 1:  # pandas names the index `task`, or leaves it without a name of its own
-        raise BadColumn(f"has {plural(len(names), 'column')} of text; expected the tasks' names in one")
-    return integers(table, layout.TASK_INDEX).tolist(), table.column(names[0]).to_pylist()
+def check_spec(dataset: Dataset) -> Iterator[Finding]:
+    """Check that columns, names and rate are those of the robot and task in this program's own file."""
+    info = dataset.info
+    if info is None:
+        return
+    if not dataset.is_ours:
+        if {s.SIM_STATE, s.EXECUTED_ACTION} <= info.features.keys():
+            yield warning(layout.OURS, "is missing (LeRobot's tools drop it): the task and the fingerprint are unknown")
+        return
+    try:
+        spec = read_spec(dataset)
+    except (OSError, ValueError, TypeError, RecursionError, ManipError) as problem:
+        yield error(layout.OURS, f"cannot be read: {problem}")
+        return
+    for what, said, found in (("fps", spec.fps, info.fps), ("robot_type", spec.robot, info.robot)):
+        if said != found:
+            yield error(layout.INFO, f"{what} is {found!r}; {layout.OURS} says {said!r}")
+    wanted = layout.all_features(spec)
+    for key, feature in wanted.items():
+        yield from _check_feature(key, feature, info.features.get(key))
+    if extra := sorted(info.features.keys() - wanted.keys()):
+        yield warning(layout.INFO, f"has {list_first(extra)} beside the columns of {spec.robot} {spec.task}")
 
 
-def _contiguous(episodes: Episodes) -> Iterator[Finding]:
-    expected = np.arange(len(episodes))
-    before = np.concatenate([[0], episodes.stop[:-1]])
-    for name, found, wanted in (
-        (layout.EPISODE_INDEX, episodes.index, expected),
-        ("dataset_from_index", episodes.start, before),
-        ("dataset_to_index", episodes.stop, episodes.start + episodes.length),
-    ):
-        bad = np.flatnonzero(found != wanted)
-        if len(bad):
-            row = bad[0]
-            yield error(
-                f"{EPISODES}: {name}",
-                f"row {row:,} has {found[row]:,}; expected {wanted[row]:,} ({plural(len(bad), 'row')} like this)",
-            )
-    if len(bad := np.flatnonzero(episodes.length < 1)):
-        yield error(f"{EPISODES}: length", f"episode {episodes.index[bad[0]]} has {episodes.length[bad[0]]} frames")
+def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
+    """Check that the dataset was recorded with the versions that are installed here."""
+    if not dataset.is_ours:
+        return
+    try:
+        fingerprint: Any = read_object(dataset.root / layout.OURS).get("fingerprint")
+    except (OSError, ValueError, RecursionError):
+        return  # reported by the check of the spec
+    if not isinstance(fingerprint, dict) or not fingerprint:
+        yield warning(layout.OURS, "has no fingerprint: what the dataset was recorded with is not known")
+        return
+    theirs, here = (
+        {str(key): value for key, value in table.items() if not str(key).endswith(_HASH) and key != "processor"}
+        for table in (cast(dict[Any, Any], fingerprint), environment_fingerprint(b"", {}))
+    )  # versions alone: another processor is no fault of a dataset
+    for text in compare_fingerprints("the dataset", theirs, "this installation", here):
+        yield warning(layout.OURS, text)
 
 
-def _check_names(info: Info) -> Iterator[Finding]:
-    for feature in info.features.values():
-        count = _name_count(feature.names)
-        wanted = len(feature.shape) if feature.dtype in PICTURES else feature.size
-        fits = count in (None, wanted) or (len(feature.shape) > 1 and count == len(feature.shape))
-        if not fits:
-            shape = list(feature.shape)
-            yield error(f"{layout.INFO}: {feature.key}", f"{count} names for shape {shape}; expected {wanted}")
+def read_spec(dataset: Dataset) -> s.RobotTaskSpec:
+    """Read the spec in this program's own file.
+
+    Raises `OSError`, `ValueError`, `TypeError` or `ManipError` for anything else.
+    """
+    ours = read_object(dataset.root / layout.OURS)
+    if missing := _NEEDED - ours.keys():
+        raise ValueError(f"it lacks {list_first(sorted(missing))}")
+    if not isinstance(ours["spec"], dict):
+        raise ValueError(f"its spec is {type(ours['spec']).__name__}; expected an object")
+    return s.RobotTaskSpec.from_json(ours["spec"])
 
 
-def _name_count(names: Any) -> int | None:
-    """How many names; None where there are none, or in a form that cannot be counted."""
+def _count_names(names: Any) -> int | None:
+    """Return how many names there are; None for none, and for a form that cannot be counted."""
     if isinstance(names, list):
         return len(cast(list[Any], names))
     if isinstance(names, dict) and names:
@@ -131,3 +154,35 @@ def _name_count(names: Any) -> int | None:
         lists = [cast(list[Any], value) for value in values if isinstance(value, list)]
         return sum(map(len, lists)) if len(lists) == len(values) else len(values) if not lists else None
     return None
+
+
+def _check_sequence(episodes: Episodes) -> Iterator[Finding]:
+    ends_before = np.concatenate([[0], episodes.stop[:-1]])
+    for name, found, wanted in (
+        (layout.EPISODE_INDEX, episodes.index, np.arange(len(episodes))),
+        ("dataset_from_index", episodes.start, ends_before),
+        ("dataset_to_index", episodes.stop, episodes.start + episodes.length),
+    ):
+        if len(bad := np.flatnonzero(found != wanted)):
+            row, like = bad[0], plural(len(bad), "row")
+            text = f"row {row:,} has {found[row]:,}; expected {wanted[row]:,} ({like} like this)"
+            yield error(f"{EPISODES}: {name}", text)
+    if len(bad := np.flatnonzero(episodes.length < 1)):
+        yield error(f"{EPISODES}: length", f"episode {episodes.index[bad[0]]} has {episodes.length[bad[0]]} frames")
+
+
+def _check_feature(key: str, wanted: dict[str, Any], found: Feature | None) -> Iterator[Finding]:
+    if found is None:
+        yield error(layout.INFO, f"features lack {key!r}, which every dataset of this program has")
+        return
+    for what, mine in (("dtype", wanted["dtype"]), ("shape", tuple(wanted["shape"])), ("names", wanted["names"])):
+        theirs = getattr(found, what)
+        if what == "dtype" and key.startswith(s.IMAGES) and theirs == "image":
+            continue  # a camera may be stored as video or as pictures
+        if theirs != mine:
+            yield error(f"{layout.INFO}: {key}", f"{what} {_shorten(theirs)}; {layout.OURS} makes it {_shorten(mine)}")
+
+
+def _shorten(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

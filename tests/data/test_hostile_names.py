@@ -19,7 +19,7 @@ from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, build, local_id
 from manip_il.data.lerobot_io import camera_keys, dataset_info, read_frames, read_spec, write_dataset
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.repair import repair
+from manip_il.doctor.examine import repair
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.export import open_source
 from manip_il.mdp import Episode

@@ -20,8 +20,8 @@ from manip_il.data import schema as s
 from manip_il.data.frame_source import ParquetPart
 from manip_il.data.lerobot_io import write_dataset
 from manip_il.data.picture import open_picture
+from manip_il.doctor.cameras import check_pictures
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.pictures import check_pictures
 from manip_il.errors import ManipError
 from manip_il.mcap.frames import DatasetFrames, decode_bytes
 from manip_il.mdp import Episode

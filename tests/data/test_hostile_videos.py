@@ -15,7 +15,7 @@ from av.video.codeccontext import VideoCodecContext
 from manip_il.data import video_open
 from manip_il.data.video_open import open_video
 from manip_il.data.video_read import VideoReader, count_frames, count_packets
-from manip_il.doctor import videos
+from manip_il.doctor import cameras
 from manip_il.errors import ManipError
 
 FRAMES, FPS = 6, 10
@@ -49,7 +49,7 @@ def refuse(path: Path, words: str) -> None:
             read(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
-    found = videos.decode(path, FRAMES)
+    found = cameras.decode(path, FRAMES)
     assert found.problem
     assert not len(found.times)
 
@@ -66,7 +66,7 @@ def claim(path: Path, box: bytes, at: int, value: int) -> Path:
 def test_a_plain_film_is_read(tmp_path: Path) -> None:
     path = film(tmp_path / "film.mp4", SIZE)
     assert VideoReader().read(path, 2, 3, FPS).shape == (3, *SIZE, 3)
-    assert count_frames(path) == count_packets(path) == len(videos.decode(path, FRAMES).times) == FRAMES
+    assert count_frames(path) == count_packets(path) == len(cameras.decode(path, FRAMES).times) == FRAMES
 
 
 @pytest.mark.parametrize("name", ["a:b.mp4", "concat:x|y.mp4", "http:x.mp4", "%03d.mp4"])
@@ -110,7 +110,7 @@ def test_pictures_may_not_grow_beyond_it(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setitem(video_open._OPTIONS, "max_pixels", str(2 * 48 * 64))
     with pytest.raises(ManipError, match="cannot read"):
         count_frames(path)
-    found = videos.decode(path, 2 * FRAMES)
+    found = cameras.decode(path, 2 * FRAMES)
     assert found.problem.startswith(f"cannot be decoded beyond {FRAMES} frames")
 
 
@@ -146,7 +146,7 @@ def test_what_lies_among_the_coded_frames_is_not_looked_at(tmp_path: Path) -> No
 
 def test_decoding_stops_one_frame_behind_what_is_expected(tmp_path: Path) -> None:
     path = film(tmp_path / "film.mp4", SIZE)
-    assert [len(videos.decode(path, expected).times) for expected in (2, 5, 6, 7)] == [3, 6, 6, 6]
+    assert [len(cameras.decode(path, expected).times) for expected in (2, 5, 6, 7)] == [3, 6, 6, 6]
 
 
 def test_a_place_beyond_all_time_is_one_line(tmp_path: Path) -> None:

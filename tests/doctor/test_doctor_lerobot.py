@@ -13,7 +13,7 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.repair import repair
+from manip_il.doctor.examine import repair
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table, findings, lines
 from ..warm import Warm

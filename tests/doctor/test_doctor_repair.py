@@ -18,9 +18,9 @@ from manip_il.data.atomic import exclusive
 from manip_il.data.build import build
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
-from manip_il.doctor import repair as module
+from manip_il.doctor import examine as module
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.repair import repair
+from manip_il.doctor.examine import repair
 from manip_il.errors import FolderBusyError, ManipError
 from manip_il.mdp import Episode
 

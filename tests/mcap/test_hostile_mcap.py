@@ -19,7 +19,7 @@ from mcap.records import Attachment, McapRecord, Metadata
 
 from manip_il.data import journal
 from manip_il.data import schema as s
-from manip_il.doctor.journals import readable_episodes
+from manip_il.doctor.leftovers import count_readable
 from manip_il.errors import ManipError
 from manip_il.mcap import read as mcap_read
 from manip_il.mcap import records as mcap_records
@@ -271,7 +271,7 @@ def test_a_resumed_recording_sets_a_bomb_aside(tmp_path: Path, small: s.RobotTas
 def test_the_doctor_reads_no_more_than_headers(tmp_path: Path, small: s.RobotTaskSpec, at_most: AtMost) -> None:
     path = forged(tmp_path, about(small), action(), forge.chunk("zstd", forge.zeros("zstd", BOMB), BOMB))
     with at_most(20):
-        assert readable_episodes(path.parent) == 1
+        assert count_readable(path.parent) == 1
 
 
 @pytest.mark.slow
