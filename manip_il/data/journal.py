@@ -33,7 +33,6 @@ from manip_il.data.episodes import final_columns, take_final
 from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
 from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mcap import foxglove
-from manip_il.mcap.foxglove_episode import channels, frame_times
 from manip_il.mcap.records import (
     MIB,
     Budget,
@@ -234,7 +233,7 @@ def _check_limits(stream: io.BytesIO, seed: int) -> None:
 
 
 def _add_channels(writer: Writer, episode: Episode, spec: RobotTaskSpec) -> None:
-    foxglove.add_channels(writer, list(channels(episode, spec)), frame_times(episode, spec))
+    foxglove.add_channels(writer, list(foxglove.episode_channels(episode, spec)), foxglove.frame_times(episode, spec))
 
 
 def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:

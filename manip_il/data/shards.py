@@ -98,10 +98,11 @@ def read_tasks(root: Path) -> tuple[list[int], list[str]]:
     if shard.problem:
         raise BadColumn(shard.problem)
     table = pa.concat_tables(shard.tables())
+    numbers = integers(table, layout.TASK_INDEX)
     names = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
     if len(names) != 1:  # pandas names the index `task`, or leaves it without a name of its own
         raise BadColumn(f"has {len(names)} columns of text; expected the tasks' names in one")
-    return integers(table, layout.TASK_INDEX).tolist(), table.column(names[0]).to_pylist()
+    return numbers.tolist(), table.column(names[0]).to_pylist()
 
 
 def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:

@@ -1,7 +1,7 @@
-"""Any LeRobot v3.0 dataset as MCAP: one file an episode, one topic a column, every number bit for bit.
+"""Export any LeRobot v3.0 dataset as MCAP: one file an episode, one topic a column, every number bit for bit.
 
 Joint-like columns become `foxglove.JointStates`, other numbers LeRobot's scalars, pictures `foxglove.RawImage` as
-decoded, text `foxglove.Log`. `mapping.yaml` beside the files is what `mcap_import` needs to make the dataset again.
+decoded, text `foxglove.Log`. `mapping.yaml` beside the files is what an import needs to make the dataset again.
 """
 
 from __future__ import annotations
@@ -14,28 +14,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import dataset_info, read_table
-from manip_il.data.parquet_limits import check_parquet
+from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
+from manip_il.data.lerobot_read import dataset_info, read_frames, read_table
+from manip_il.data.shards import UNREADABLE, find_shards, read_tasks
 from manip_il.errors import ManipError
 from manip_il.mcap import foxglove
-from manip_il.mcap.frames import DatasetFrames, is_depth
-from manip_il.mcap.mapping import INDEX_COLUMNS, NUMBERS, TEXT, Camera, Mapping, Values
+from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values
 from manip_il.mcap.path import parse_path
+from manip_il.mcap.read import decode_picture
 from manip_il.mdp import require_finite
+
+U8 = NDArray[np.uint8]
 
 MAPPING = "mapping.yaml"
 TASK_TOPIC = "/task"
+_HEADER = """\
+# manip-il mcap import FOLDER NEW_DATASET --mapping=FOLDER/mapping.yaml recreates the dataset.
+# Pictures are kept as they are (video: false); with video: true they are re-encoded, with loss.
+"""
 _JOINTS = (s.STATE, s.ACTION, s.EXECUTED_ACTION)
-_PICTURES = ("image", "video")
 _TOLERANCE = 0.25  # of a frame: our own stamps are exact
+_BATCH = 64  # encoded pictures held at a time
 
 
 @dataclass(frozen=True)
@@ -50,18 +55,20 @@ class Source:
     @property
     def cameras(self) -> list[str]:
         """Columns of pictures."""
-        return [key for key, feature in self.features.items() if feature["dtype"] in _PICTURES]
+        return [key for key, feature in self.features.items() if feature["dtype"] in PICTURES]
 
 
 def open_source(root: Path) -> Source:
-    """Look at a dataset. Raises `ManipError` for what is none, or a column that MCAP gets no place for here."""
+    """Open a dataset. Raises `ManipError` for a folder that is none, and for a column that cannot be exported."""
     dataset_info(root)
     info = checks.read_json(root / layout.INFO, "a LeRobot dataset's description")
-    features = {key: feature for key, feature in info["features"].items() if key not in INDEX_COLUMNS}
+    features = {key: feature for key, feature in info["features"].items() if key not in INDEX_FEATURES}
     for key, feature in features.items():
-        if feature["dtype"] not in (*NUMBERS, TEXT, *_PICTURES):
-            raise ManipError(f"{root}: column {key!r} is {feature['dtype']}, which is not exported; remove it first")
-        if feature["dtype"] in _PICTURES and is_depth(feature):
+        dtype, details = feature["dtype"], feature.get("info")
+        if dtype not in (*NUMBERS, TEXT, *PICTURES):
+            raise ManipError(f"{root}: column {key!r} is {dtype}, which is not exported; remove it first")
+        is_depth = isinstance(details, dict) and (details.get("is_depth_map") or details.get("video.is_depth_map"))
+        if dtype in PICTURES and is_depth:
             raise ManipError(f"{root}: column {key!r} is a depth map, which is not exported; remove it first")
     return Source(root, int(info["fps"]), info["robot_type"], features)
 
@@ -77,28 +84,27 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
     for key in columns:
         require_finite(f"{source.root}, column {key!r}", table[key])
     index, task_index = table.pop(layout.EPISODE_INDEX), table.pop(layout.TASK_INDEX)
-    tasks = _tasks(source.root)
-    pictures = DatasetFrames(source.root, {key: source.features[key]["dtype"] for key in source.cameras})
+    tasks = _read_tasks(source.root, set(task_index.tolist()))
+    stored = {
+        key: stored_pictures(source.root, key) for key in source.cameras if source.features[key]["dtype"] == "image"
+    }
     starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()
     for start, stop in itertools.pairwise([*starts, len(index)]):
         episode = int(index[start])
-        rows = {key: values[start:stop] for key, values in table.items()}
-        lines = [_task(source.root, tasks, int(task)) for task in task_index[start:stop]]
-        frames = {key: pictures.read(key, episode, stop - start) for key in source.cameras}
+        rows: dict[str, Any] = {key: values[start:stop] for key, values in table.items()}
+        for key in source.cameras:
+            if key in stored:
+                rows[key] = itertools.islice(stored[key], stop - start)
+            else:
+                rows[key] = read_frames(source.root, key, episode)
         path = folder / f"episode_{episode:06d}.mcap"
-        _write(path, source, episode, lines, rows, frames)
+        _write(path, source, episode, [tasks[int(task)] for task in task_index[start:stop]], rows)
         yield path
     (folder / MAPPING).write_text(_HEADER + mapping_of(source).to_yaml(), encoding="utf-8")
 
 
-_HEADER = """\
-# manip-il mcap import FOLDER NEW_DATASET --mapping=FOLDER/mapping.yaml recreates the dataset.
-# Pictures are kept as they are (video: false); with video: true they are re-encoded, with loss.
-"""
-
-
 def mapping_of(source: Source) -> Mapping:
-    """Return the mapping that makes the dataset again from its export."""
+    """Return the mapping by which an import makes the dataset again."""
     near = ("nearest", round(_TOLERANCE / source.fps, 6))
     features: dict[str, Values | Camera] = {}
     for key, feature in source.features.items():
@@ -114,42 +120,30 @@ def mapping_of(source: Source) -> Mapping:
     return Mapping(source.fps, source.robot_type, task, features)
 
 
-def _write(
-    path: Path,
-    source: Source,
-    episode: int,
-    tasks: Sequence[str],
-    rows: dict[str, NDArray[Any]],
-    frames: dict[str, Iterator[NDArray[np.uint8]]],
-) -> None:
+def _write(path: Path, source: Source, episode: int, tasks: Sequence[str], rows: dict[str, Any]) -> None:
     times = [foxglove.log_time(frame, source.fps) for frame in range(len(tasks))]
     channels = [foxglove.texts(TASK_TOPIC, "task", tasks, times)]
-    for key, feature in source.features.items():
-        if key in frames:
-            channels.append(foxglove.images(_topic(key), key, frames[key], times))
-        else:
-            channels.append(_channel(key, feature, rows[key], times))
+    channels += [_channel(key, feature, rows[key], times) for key, feature in source.features.items()]
     with path.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library="manip_il")
-        writer.add_metadata("lerobot", _metadata(source, episode, tasks))
+        metadata = {
+            "codebase_version": layout.VERSION,
+            "fps": str(source.fps),
+            "robot_type": source.robot_type or "",
+            "episode_index": str(episode),
+            "frames": str(len(tasks)),
+            "tasks": json.dumps(list(dict.fromkeys(tasks)), ensure_ascii=False),
+            "features": json.dumps(source.features, ensure_ascii=False),
+        }
+        writer.add_metadata("lerobot", metadata)
         foxglove.add_channels(writer, channels, times)
         writer.finish()
 
 
-def _metadata(source: Source, episode: int, tasks: Sequence[str]) -> dict[str, str]:
-    return {
-        "codebase_version": layout.VERSION,
-        "fps": str(source.fps),
-        "robot_type": source.robot_type or "",
-        "episode_index": str(episode),
-        "frames": str(len(tasks)),
-        "tasks": json.dumps(list(dict.fromkeys(tasks)), ensure_ascii=False),
-        "features": json.dumps(source.features, ensure_ascii=False),
-    }
-
-
-def _channel(key: str, feature: dict[str, Any], values: NDArray[Any], times: foxglove.Times) -> foxglove.Channel:
+def _channel(key: str, feature: dict[str, Any], values: Any, times: foxglove.Times) -> foxglove.Channel:
+    if feature["dtype"] in PICTURES:
+        return foxglove.images(_topic(key), key, values, times)
     if feature["dtype"] == TEXT:
         return foxglove.texts(_topic(key), key, values.reshape(-1).tolist(), times)
     values = values.reshape(len(times), -1)
@@ -167,7 +161,7 @@ def _is_joints(key: str, feature: dict[str, Any]) -> bool:
 
 
 def _labels(key: str, feature: dict[str, Any], width: int) -> list[str]:
-    """The names, where there is one for each value; else numbered, as LeRobot labels such a column."""
+    """Return the names, where there is one for each value; else numbers, as LeRobot labels such a column."""
     names = feature.get("names")
     if isinstance(names, dict):  # {"motors": [...]}
         names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
@@ -177,25 +171,32 @@ def _labels(key: str, feature: dict[str, Any], width: int) -> list[str]:
 
 
 def _topic(key: str) -> str:
-    """A dot would part a topic in Foxglove's message paths; no feature's name has a slash."""
+    """Return a column's topic: a dot would part it in Foxglove's paths, and no column's name has a slash."""
     return "/" + key.replace(".", "/")
 
 
-def _tasks(root: Path) -> dict[int, str]:
+def _read_tasks(root: Path, wanted: set[int]) -> dict[int, str]:
     try:
-        check_parquet([root / layout.TASKS])
-        table = pq.read_table(root / layout.TASKS, columns=[layout.TASK_INDEX, "task"]).to_pydict()
-    except (OSError, ValueError, pa.ArrowException) as error:
+        tasks = dict(zip(*read_tasks(root), strict=True))
+    except UNREADABLE as error:
         raise ManipError(
             f"cannot read {root / layout.TASKS}: {error}; run `manip-il doctor` to see what is left"
         ) from error
-    numbers, texts = table[layout.TASK_INDEX], table["task"]
-    if not all(isinstance(number, int) for number in numbers):
-        raise ManipError(f"{root / layout.TASKS}: column {layout.TASK_INDEX!r} holds values that are not whole numbers")
-    return dict(zip(numbers, texts, strict=True))
+    for number in sorted(wanted):
+        if not isinstance(tasks.get(number), str):
+            raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
+    return tasks
 
 
-def _task(root: Path, tasks: dict[int, str], number: int) -> str:
-    if not isinstance(task := tasks.get(number), str):
-        raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
-    return task
+def stored_pictures(root: Path, key: str) -> Iterator[U8]:
+    """Yield every picture of an `image` column, (height, width, 3), in stored order."""
+    for shard in find_shards(root, layout.DATA_FILES):
+        try:
+            if shard.problem or key not in shard.columns:
+                raise ValueError(f"it {shard.problem or 'has no such column'}")
+            for batch in shard.batches(key, _BATCH):
+                for cell in batch.to_pylist():
+                    content = cell.get("bytes") if isinstance(cell, dict) else None
+                    yield decode_picture(content if isinstance(content, bytes) else b"")
+        except (*UNREADABLE, ManipError) as error:
+            raise ManipError(f"cannot read the pictures {key!r} in {shard.path}: {error}") from error

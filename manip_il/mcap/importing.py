@@ -1,4 +1,4 @@
-"""MCAP files with named topics as a LeRobot dataset: one episode a file, at the dataset's rate, nothing made up.
+"""Import MCAP files as a LeRobot dataset: one episode a file, resampled to the dataset's rate, gaps refused.
 
 An episode lasts from the latest of its topics' first messages to the earliest of their last ones, by log time.
 """
@@ -17,17 +17,43 @@ from numpy.typing import NDArray
 from manip_il.data.atomic import new_folder
 from manip_il.data.schema import MOST_FRAMES
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.mcap.mapping import TEXT, Camera, Mapping, Source, Values
+from manip_il.mcap.foxglove import NANOSECONDS, log_time
+from manip_il.mcap.mapping import TEXT, Camera, Mapping, Method, Source, Values
 from manip_il.mcap.read import Topics, read_pictures, read_topics
-from manip_il.mcap.resample import I64, NANOSECONDS, Pick, frame_times, pick
 
+I64 = NDArray[np.int64]
+F64 = NDArray[np.float64]
 Column = list[str] | NDArray[Any]
-Pictures = dict[str, Iterator[NDArray[np.uint8]]]
+
+
+@dataclass(frozen=True)
+class Pick:
+    """Messages of T frames: for each the one before, the one after, and the frame's place between them, 0 to 1."""
+
+    left: I64
+    right: I64  # equal to `left` where one message is taken as it is
+    weight: F64
+
+    def blend(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Interpolate values (N, ...) of the messages to values (T, ...) of the frames.
+
+        A message that is taken as it is keeps every bit.
+        """
+        left, right = values[self.left], values[self.right]
+        if (self.left == self.right).all():
+            return left
+        weight = self.weight.reshape(-1, *[1] * (values.ndim - 1))
+        between = np.clip(left + (right - left) * weight, np.minimum(left, right), np.maximum(left, right))
+        return np.where(weight == 0, left, between)
+
+    def used(self) -> I64:
+        """Return the numbers of the messages that are in some frame, ascending, (M,)."""
+        return np.union1d(self.left, self.right)
 
 
 @dataclass(frozen=True)
 class Import:
-    """One file's episode. columns: of numbers and text, T rows each; used: topic -> messages with a part in it."""
+    """One file's episode. columns: of numbers and text, T rows each; used: topic -> messages that are in a frame."""
 
     path: Path
     frames: int
@@ -51,24 +77,24 @@ def list_files(source: Path) -> list[Path]:
 
 
 def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Import]:
-    """Write the files as a dataset that appears at `root` when all are in; yield each one's account as it is done.
+    """Write the files as a dataset that appears at `root` when all are in; yield each one's import as it is done.
 
     Raises `FolderExistsError` where `root` holds something, and what `read_import` and `frames_of` raise.
     """
-    accounts: list[Import] = []
+    done: list[Import] = []
     first = read_import(paths[0], mapping)
     features = features_of(mapping, first)
     from manip_il.data.lerobot_library import write_with_library  # imports torch
 
     def episodes() -> Iterator[Iterator[dict[str, Any]]]:
         for number, path in enumerate(paths):
-            accounts.append(first if number == 0 else read_import(path, mapping))
-            yield frames_of(accounts[-1], mapping, features)
+            done.append(first if number == 0 else read_import(path, mapping))
+            yield frames_of(done[-1], mapping, features)
 
     with new_folder(root) as folder:
         work = folder / root.name  # LeRobot makes its folder itself
         for _ in write_with_library(work, mapping.fps, mapping.robot_type, features, episodes()):
-            yield accounts.pop()
+            yield done.pop()
         for path in list(work.iterdir()):
             path.rename(folder / path.name)
         work.rmdir()
@@ -85,20 +111,20 @@ def read_import(path: Path, mapping: Mapping) -> Import:
     times = _times(topics, mapping.fps)
     used: dict[str, I64] = {}
 
-    def choose(source: Source) -> Pick:
+    def resample(source: Source) -> Pick:
         who = f"{path}, topic {source.topic}"
-        chosen = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
-        used[source.topic] = np.union1d(used.get(source.topic, chosen.left), chosen.used())
-        return chosen
+        picked = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
+        used[source.topic] = np.union1d(used.get(source.topic, picked.left), picked.used())
+        return picked
 
-    columns = {key: _column(path, key, source, topics.rows[key], choose(source)) for key, source in values.items()}
+    columns = {key: _column(path, key, source, topics.rows[key], resample(source)) for key, source in values.items()}
     tasks = columns.pop("", None)
     return Import(
         path,
         len(times),
         [str(mapping.task)] * len(times) if tasks is None else list(tasks),
         columns,
-        {key: choose(camera) for key, camera in mapping.cameras.items()},
+        {key: resample(camera) for key, camera in mapping.cameras.items()},
         dict(topics.counts),
         {topic: len(numbers) for topic, numbers in used.items()},
     )
@@ -124,7 +150,7 @@ def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, A
 
     Raises `MismatchError` where a column's width or a picture's size is not that of the first file.
     """
-    pictures: Pictures = {}
+    pictures: dict[str, Iterator[NDArray[np.uint8]]] = {}
     for key, camera in mapping.cameras.items():
         pictures[key] = read_pictures(episode.path, camera.topic, episode.picks[key].left)
     columns: dict[str, Column] = {}
@@ -139,10 +165,43 @@ def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, A
         frame: dict[str, Any] = {key: column[number] for key, column in columns.items()}
         for key, stream in pictures.items():
             frame[key] = next(stream)
-            if frame[key].shape != features[key]["shape"]:
-                size = features[key]["shape"]
+            if frame[key].shape != (size := features[key]["shape"]):
                 raise MismatchError(f"{key!r}", f"{episode.path}", frame[key].shape, "the first file", size)
         yield {**frame, "task": task}
+
+
+def frame_times(start: int, end: int, fps: int) -> I64:
+    """Return stamps [ns] of frames at `fps` from `start` on, none later than `end`, (T,)."""
+    count = ((end - start + 1) * fps - 1) // NANOSECONDS + 1
+    return np.array([start + log_time(frame, fps) for frame in range(count)], dtype=np.int64)
+
+
+def pick(who: str, method: Method, stamps: I64, times: I64, tolerance: float) -> Pick:
+    """Pick messages with `stamps` (N,) for frames at `times` (T,), both [ns] and ascending, `stamps` strictly.
+
+    nearest: the one with the smallest distance in time, the earlier of two; at most `tolerance` [s] away.
+    hold: the last one not later than the frame; at most `tolerance` old.
+    interpolate: the two around the frame, at most `tolerance` apart; one alone where it has the frame's stamp.
+    Raises `ManipError` with `who`, the gap's place and the tolerance for the first frame that has none.
+    """
+    limit = tolerance * NANOSECONDS
+    before = np.searchsorted(stamps, times, side="right") - 1  # -1: none
+    after = np.minimum(before + 1, len(stamps) - 1)
+    left = np.maximum(before, 0)
+    to_left, to_right = np.abs(times - stamps[left]), np.abs(stamps[after] - times)
+    right = left
+    if method == "nearest":
+        left = right = np.where(to_left <= to_right, left, after)
+        bad = np.minimum(to_left, to_right) > limit
+    elif method == "hold":
+        bad = (before < 0) | (to_left > limit)
+    else:
+        right = np.where(to_left == 0, left, after)
+        bad = (before < 0) | (stamps[right] - stamps[left] > limit) | (stamps[right] < times)
+    if bad.any():
+        raise _gap(who, method, stamps, times, int(np.argmax(bad)), tolerance)
+    span = np.maximum(stamps[right] - stamps[left], 1)
+    return Pick(left, right, np.where(left == right, 0.0, to_left / span))
 
 
 def _times(topics: Topics, fps: int) -> I64:
@@ -162,14 +221,14 @@ def _times(topics: Topics, fps: int) -> I64:
     return frame_times(start, end, fps)
 
 
-def _column(path: Path, key: str, source: Values, rows: list[list[Any]], chosen: Pick) -> Column:
+def _column(path: Path, key: str, source: Values, rows: list[list[Any]], picked: Pick) -> Column:
     who = f"{path}, topic {source.topic}, {key or 'task'}"
     for number, row in enumerate(rows):
         if len(row) != len(rows[0]):
             raise ManipError(f"{who}: message {number} has {len(row)} values, the first one {len(rows[0])}")
     if source.dtype == TEXT:
-        return [_text(who, rows[number]) for number in chosen.left.tolist()]
-    return chosen.blend(_numbers(who, rows, np.dtype(source.dtype))).astype(source.dtype)
+        return [_text(who, rows[number]) for number in picked.left.tolist()]
+    return picked.blend(_numbers(who, rows, np.dtype(source.dtype))).astype(source.dtype)
 
 
 def _text(who: str, row: list[Any]) -> str:
@@ -179,7 +238,7 @@ def _text(who: str, row: list[Any]) -> str:
 
 
 def _numbers(who: str, rows: list[list[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Rows (N, width): float64 for a dtype of floats, else the dtype. Every value must be one of the dtype."""
+    """Return rows (N, width), as float64 for a dtype of floats, else as the dtype, which must hold every value."""
     is_float = dtype.kind == "f"
     low, high = _limits(dtype)
     for number, row in enumerate(rows):
@@ -201,3 +260,14 @@ def _limits(dtype: np.dtype[Any]) -> tuple[float, float]:
         limit = float(np.finfo(dtype).max)
         return -limit, limit
     return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+
+
+def _gap(who: str, method: Method, stamps: I64, times: I64, frame: int, tolerance: float) -> ManipError:
+    time = times[frame]
+    around = [f"{(time - stamps[stamps <= time][-1]) / NANOSECONDS:g} s before"] if (stamps <= time).any() else []
+    around += [f"{(stamps[stamps > time][0] - time) / NANOSECONDS:g} s after"] if (stamps > time).any() else []
+    return ManipError(
+        f"{who}: a gap at {(time - times[0]) / NANOSECONDS:g} s (stamp {time} ns, frame {frame}): "
+        f"the messages next to it are {' and '.join(around)}, {method} allows {tolerance:g} s; "
+        "raise its tolerance in the mapping, or leave out this file"
+    )

@@ -1,4 +1,4 @@
-"""The mapping file of `manip-il mcap import`: which topics and fields make which columns of the dataset.
+"""Mapping files of `manip-il mcap import`: which topics and fields make which columns of the dataset.
 
 fps: 20
 robot_type: panda
@@ -16,33 +16,32 @@ features:
     video: false                    # false: PNG, without loss; true: an encoded video
     resample: nearest
     tolerance: 0.05
+
+A field is a path to values in a message, or a list of paths (see `path`).
 """
 
 from __future__ import annotations
 
 import math
+import sys
 import typing
 from collections.abc import Iterable
-from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
 from manip_il import checks
-from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import INDEX_FEATURES, NUMBERS
 from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mcap.path import FieldPath, parse_path
-from manip_il.mcap.resample import Method
 from manip_il.yaml_file import read_yaml
 
-TEXT = "string"  # LeRobot's dtype of text
-_WHOLE = tuple(f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64))
-NUMBERS = ("bool", *_WHOLE, "float16", "float32", "float64")
-INDEX_COLUMNS = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
+Method = Literal["nearest", "hold", "interpolate"]
 
+TEXT = "string"  # LeRobot's dtype of text
 _MOST_VALUES = 1_000_000  # in one frame of a column
 _MOST_AXES = 32  # as many as an array of numpy's has
 
@@ -54,7 +53,7 @@ _TASK_KEYS = ("topic", "field", "resample", "tolerance")
 
 @dataclass(frozen=True)
 class Source:
-    """A topic, and how its messages are brought to the dataset's rate. tolerance: [s]."""
+    """A topic, and how its messages are resampled to the dataset's rate. tolerance: [s]."""
 
     topic: str
     resample: Method
@@ -64,14 +63,13 @@ class Source:
         _require("topic", self.topic, "text", isinstance(self.topic, str) and self.topic)
         if self.resample not in _METHODS:
             raise UnknownName("resample", str(self.resample), _METHODS)
-        is_number = isinstance(self.tolerance, int | float) and not isinstance(self.tolerance, bool)
-        is_span = is_number and math.isfinite(self.tolerance) and self.tolerance >= 0
+        is_span = type(self.tolerance) in (int, float) and 0 <= self.tolerance <= sys.float_info.max
         _require("tolerance", self.tolerance, "seconds, 0 or more", is_span)
 
 
 @dataclass(frozen=True)
 class Values(Source):
-    """A column of numbers or text: what the paths lead to, side by side. shape: (values,) where it is None."""
+    """A column of numbers or text: the values of all paths, in order. shape: (values,) where it is None."""
 
     field: tuple[FieldPath, ...]
     dtype: str
@@ -85,15 +83,13 @@ class Values(Source):
         if self.resample == "interpolate" and not self.dtype.startswith("float"):
             raise UsageError(f"resample is interpolate, which {self.dtype} cannot be; expected nearest or hold")
         sizes = self.shape or (1,)
-        is_shape = all(
-            isinstance(size, int) and not isinstance(size, bool) and 0 < size <= _MOST_VALUES for size in sizes
-        )
-        is_shape = is_shape and len(sizes) <= _MOST_AXES and math.prod(sizes) <= _MOST_VALUES
+        are_sizes = len(sizes) <= _MOST_AXES and all(type(size) is int and 0 < size <= _MOST_VALUES for size in sizes)
+        is_shape = are_sizes and math.prod(sizes) <= _MOST_VALUES
         _require("shape", self.shape, f"a list of whole numbers, at most {_MOST_VALUES:,} values in all", is_shape)
 
     @property
     def width(self) -> int | None:
-        """How many values make a row, where the mapping says so."""
+        """Number of values in a row; None where the mapping leaves it open."""
         if self.shape is not None:
             return math.prod(self.shape)
         return len(self.names) if isinstance(self.names, list) else None
@@ -122,15 +118,18 @@ class Mapping:
     features: dict[str, Values | Camera]
 
     def __post_init__(self) -> None:
-        is_rate = isinstance(self.fps, int) and not isinstance(self.fps, bool) and 0 < self.fps <= MOST_FPS
+        is_rate = type(self.fps) is int and 0 < self.fps <= MOST_FPS
         _require("fps", self.fps, f"a whole number above 0 and up to {MOST_FPS}", is_rate)
         is_robot = self.robot_type is None or _is_text(self.robot_type, checks.LONGEST_NAME)
         _require("robot_type", self.robot_type, "text or null", is_robot)
-        is_task = isinstance(self.task, Values) or (bool(self.task) and _is_text(self.task, checks.LONGEST_TEXT))
+        is_task = isinstance(self.task, Values) or (self.task and _is_text(self.task, checks.LONGEST_TEXT))
         _require("task", self.task, "text or a topic", is_task)
-        _require("features", self.features, "at least one feature", bool(self.features))
+        _require("features", self.features, "at least one feature", self.features)
         for key in self.features:
-            _require_column(key)
+            try:
+                checks.name("a column's name", key)  # LeRobot names folders and files by it
+            except ManipError as error:
+                raise UsageError(str(error)) from None
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -171,60 +170,50 @@ class _Dumper(yaml.SafeDumper):
 def load_mapping(path: Path) -> Mapping:
     """Read a mapping file. Raises `UsageError` naming file, key, value and what was expected."""
     tree = read_yaml(path, "a mapping file")
+    place = ""
     try:
         table = _table(tree, ("fps", "robot_type", "task", "features"), optional=("robot_type",))
-        features = table["features"]
-        _require("features", features, "a mapping of column names", isinstance(features, dict))
-        return Mapping(
-            table["fps"],
-            table.get("robot_type"),
-            _at("task", _task, table["task"]),
-            {key: _at(f"features: {key}", _feature, (key, value)) for key, value in features.items()},
-        )
+        _require("features", table["features"], "a mapping of column names", isinstance(table["features"], dict))
+        place = "task: "
+        task = _load_task(table["task"])
+        features: dict[str, Values | Camera] = {}
+        for key, value in table["features"].items():
+            place = f"features: {key}: "
+            features[key] = _load_feature(key, value)
+        place = ""
+        return Mapping(table["fps"], table.get("robot_type"), task, features)
     except UsageError as error:
-        raise UsageError(f"{path}: {error}") from error
+        raise UsageError(f"{path}: {place}{error}") from error
 
 
-def _at(where: str, parse: Any, value: Any) -> Any:
-    try:
-        return parse(value)
-    except UsageError as error:
-        raise UsageError(f"{where}: {error}") from error
-
-
-def _task(value: Any) -> str | Values:
+def _load_task(value: Any) -> str | Values:
     if not isinstance(value, dict):
         _require("task", value, "text, or topic, field, resample and tolerance", isinstance(value, str))
         return value
-    table = _table(value, _TASK_KEYS)
-    table["field"] = _paths(table["field"])
-    return Values(**table, dtype=TEXT)
+    return _load_values({**_table(value, _TASK_KEYS), "dtype": TEXT})
 
 
-def _feature(item: tuple[Any, Any]) -> Values | Camera:
-    key, value = item
-    _require_column(key)
-    if key in INDEX_COLUMNS:
+def _load_feature(key: Any, value: Any) -> Values | Camera:
+    if key in INDEX_FEATURES:
         raise UsageError(f"LeRobot counts {key} itself; leave it out")
     if isinstance(value, dict) and "video" in value:
         return Camera(**_table(value, _CAMERA_KEYS))
-    table = _table(value, _VALUE_KEYS, optional=("names", "shape"))
+    return _load_values(_table(value, _VALUE_KEYS, optional=("names", "shape")))
+
+
+def _load_values(table: dict[str, Any]) -> Values:
     if (shape := table.get("shape")) is not None:
         _require("shape", shape, "a list of whole numbers", isinstance(shape, list) and shape)
         table["shape"] = tuple(shape)
-    table["field"] = _paths(table["field"])
+    value = table["field"]
+    texts = value if isinstance(value, list) else [value]
+    _require("field", value, "a path or a list of paths", texts and all(isinstance(text, str) for text in texts))
+    table["field"] = tuple(map(parse_path, texts))
     return Values(**table)
 
 
-def _paths(value: Any) -> tuple[FieldPath, ...]:
-    texts = value if isinstance(value, list) else [value]
-    is_text = bool(texts) and all(isinstance(text, str) for text in texts)
-    _require("field", value, "a path or a list of paths", is_text)
-    return tuple(map(parse_path, texts))
-
-
 def _table(value: Any, keys: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Any]:
-    """A mapping with all of the keys and no others."""
+    """Check that a mapping has all of the keys and no others."""
     if not isinstance(value, dict):
         raise UsageError(f"got {checks.shorten(value)}; expected a mapping of {', '.join(keys)}")
     for key in value:
@@ -241,23 +230,16 @@ def _require(what: str, value: Any, expected: str, is_right: Any) -> None:
         raise UsageError(f"{what} is {checks.shorten(value)}; expected {expected}")
 
 
-def _require_column(key: Any) -> None:
-    """Raise `UsageError` for a column that no file or folder may be named by."""
-    try:
-        checks.name("a column's name", key)
-    except ManipError as error:
-        raise UsageError(str(error)) from None
-
-
 def _is_text(value: Any, longest: int) -> bool:
     return isinstance(value, str) and len(value) <= longest
 
 
-def _plain(source: Source, keys: Iterable[str]) -> Table[str, Any]:
+def _plain(source: Source, keys: Iterable[str]) -> dict[str, Any]:
+    """Return a source as it is in a mapping file, without the keys that are None."""
     table = {key: getattr(source, key) for key in keys if getattr(source, key) is not None}
     if isinstance(source, Values):
         paths = [str(path) for path in source.field]
         table["field"] = paths[0] if len(paths) == 1 else paths
-        if source.shape is not None and "shape" in table:
-            table["shape"] = list(source.shape)
+        if "shape" in table:
+            table["shape"] = list(table["shape"])
     return table

@@ -1,4 +1,8 @@
-"""Paths to values inside a decoded message: `joints[name=elbow].position`, `scalars[:].value`, `pose.position.x`."""
+"""Paths to values in a message: `pose.position.x`, `data[0]`, `scalars[:].value`, `joints[name=elbow].position`.
+
+`[:]` is every element of a list, `[name=elbow]` the one whose name is elbow. Names and texts of other characters are
+quoted: `"odd name".x`, `joints[name="wrist [2]"]`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,8 @@ from google.protobuf.message import Message
 
 from manip_il.errors import ManipError, UsageError, nearest
 
+Step = str | int | slice | tuple[str, str]  # .name, [3], [:], [name=elbow]
+
 _WORD = r"[^\W\d]\w*"
 _QUOTED = r'"(?:[^"\\]|\\.)*"'
 _NAME = re.compile(rf"\.?(?:(?P<word>{_WORD})|(?P<quoted>{_QUOTED}))")
@@ -21,46 +27,16 @@ _SELECTOR = re.compile(
 
 
 @dataclass(frozen=True)
-class Field:
-    """`.name`; `."any text"` where it is no plain word."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Index:
-    """`[3]`: one element of a list, from 0."""
-
-    index: int
-
-
-@dataclass(frozen=True)
-class All:
-    """`[:]`: every element of a list, in order."""
-
-
-@dataclass(frozen=True)
-class Where:
-    """`[name=elbow]`: the one element whose field has this text; `[name="a]b"]` where a bracket is in it."""
-
-    key: str
-    text: str
-
-
-Step = Field | Index | All | Where
-
-
-@dataclass(frozen=True)
 class FieldPath:
-    """A parsed path; `str` gives its text."""
+    """Path to values in a message; `str` gives its text."""
 
     steps: tuple[Step, ...]
 
     def __str__(self) -> str:
-        return "".join(map(_text, self.steps)).removeprefix(".")
+        return "".join(map(_step_text, self.steps)).removeprefix(".")
 
     def values(self, message: Any) -> list[Any]:
-        """What the path leads to: one value, or several in order. A list at its end stands for its elements.
+        """Return the values that the path leads to, in order. A list at its end stands for its elements.
 
         Raises `ManipError` naming the step that leads nowhere, with the nearest name that does.
         """
@@ -74,7 +50,7 @@ class FieldPath:
 
 
 def parse_path(text: str) -> FieldPath:
-    """Parse a path. Raises `UsageError` that shows where it goes wrong."""
+    """Parse a path. Raises `UsageError` that shows where it is wrong."""
     steps: list[Step] = []
     place = 0
     while place < len(text) or not steps:
@@ -84,57 +60,57 @@ def parse_path(text: str) -> FieldPath:
                 f"the path {text!r} is invalid at character {place + 1}; expected names and selectors, "
                 "as in joints[name=elbow].position, scalars[:].value, data[0]"
             )
-        steps.append(_step(match))
+        steps.append(_parse_step(match.groupdict()))
         place = match.end()
     return FieldPath(tuple(steps))
 
 
-def _step(match: re.Match[str]) -> Step:
-    found = match.groupdict()
-    if match.re is _NAME:
-        return Field(found["word"] or _unquoted(found["quoted"]))
-    if found["all"]:
-        return All()
-    if found["index"]:
-        return Index(int(found["index"]))
-    return Where(found["key"], found["text"] or _unquoted(found["quoted"]))
+def _parse_step(found: dict[str, str | None]) -> Step:
+    if found.get("all"):
+        return slice(None)
+    if index := found.get("index"):
+        return int(index)
+    text = found.get("word") or found.get("text") or _unquote(found["quoted"] or "")
+    return (key, text) if (key := found.get("key")) else text
 
 
-def _unquoted(text: str) -> str:
+def _unquote(text: str) -> str:
     try:
         return json.loads(text, strict=False)
     except ValueError as error:
         raise UsageError(f"{text} is not a valid JSON string: {error}") from error
 
 
-def _text(step: Step) -> str:
-    if isinstance(step, Field):
-        return "." + (step.name if re.fullmatch(_WORD, step.name) else json.dumps(step.name))
-    if isinstance(step, Index):
-        return f"[{step.index}]"
-    if isinstance(step, All):
+def _step_text(step: Step) -> str:
+    if isinstance(step, str):
+        return "." + (step if re.fullmatch(_WORD, step) else json.dumps(step))
+    if isinstance(step, int):
+        return f"[{step}]"
+    if isinstance(step, slice):
         return "[:]"
-    is_plain = step.text and not set('"]') & set(step.text)
-    return f"[{step.key}={step.text if is_plain else json.dumps(step.text)}]"
+    key, text = step
+    is_plain = text and not set('"]') & set(text)
+    return f"[{key}={text if is_plain else json.dumps(text)}]"
 
 
 def _take(node: Any, step: Step) -> Sequence[Any]:
-    """The nodes one step further. Raises `LookupError` saying why there is none."""
-    if isinstance(step, Field):
-        return [_field(node, step.name)]
+    """Return the nodes one step further. Raises `LookupError` saying why there is none."""
+    if isinstance(step, str):
+        return [_field(node, step)]
     if not _is_list(node):
         raise LookupError("not a list")
-    if isinstance(step, All):
+    if isinstance(step, slice):
         return node
-    if isinstance(step, Index):
-        if step.index >= len(node):
+    if isinstance(step, int):
+        if step >= len(node):
             raise LookupError(f"the list has {len(node)} elements")
-        return [node[step.index]]
-    found = [element for element in node if str(_field(element, step.key)) == step.text]
+        return [node[step]]
+    key, text = step
+    known = [str(_field(element, key)) for element in node]
+    found = [element for element, one in zip(node, known, strict=True) if one == text]
     if len(found) != 1:
-        known = [str(_field(element, step.key)) for element in node]
-        hint = "" if found else nearest(step.text, known)
-        raise LookupError(f"{len(found)} elements have this {step.key}{hint}; known: {', '.join(known) or 'none'}")
+        hint = "" if found else nearest(text, known)
+        raise LookupError(f"{len(found)} elements have this {key}{hint}; known: {', '.join(known) or 'none'}")
     return found
 
 

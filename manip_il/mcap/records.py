@@ -1,8 +1,7 @@
-"""The records of an MCAP file one by one, bounded before they are unpacked and while they are.
+"""Read the records of an MCAP file one by one, with limits on their size before and while they are unpacked.
 
-The library's readers unpack a chunk to whatever its bytes make of it, by the size that a file declares or by none, and
-hold all of its messages at once: 262 kB became 9 GB. Here a declaration is a limit that is kept, and a chunk's messages
-are cut out as they are taken.
+The library's readers unpack a chunk to any size, declared or not, and hold all of its messages at once: 262 kB became
+9 GB. Here the declared size is a limit too, and a chunk's messages are cut out one by one.
 """
 
 from __future__ import annotations
@@ -10,9 +9,9 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from io import BytesIO
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -47,7 +46,7 @@ _LIMITS = {
 
 
 class Budget:
-    """What a file may unpack to in all [bytes]: `least`, or `ratio` times its size where that is more."""
+    """Limit of what a file may unpack to in all [bytes]: `least`, or `ratio` times its size where that is more."""
 
     def __init__(self, path_size: int, least: int, ratio: int):
         self._limit = self._left = max(least, ratio * path_size)
@@ -94,36 +93,50 @@ def read_records(stream: BinaryIO, *wanted: Opcode, check: bool = False) -> Iter
         if opcode == Opcode.FOOTER:
             return
         if opcode == Opcode.DATA_END:
-            _compare_checksum(stream.read(length), checksum, check=check)
+            declared = int.from_bytes(stream.read(length)[:4], "little")
+            if check and declared not in (0, checksum):
+                raise ValueError("its data does not match its checksum")
             continue
         if opcode in wanted:
             _refuse_large(f"a {Opcode(opcode).name.lower()} record", length, _LIMITS[Opcode(opcode)])
             body = stream.read(length)
             yield Record(opcode, body)
-            pieces = iter((head, body))
+            checksum = zlib.crc32(body, zlib.crc32(head, checksum)) if check else 0
         elif check:
-            pieces = _pieces(stream, head, length)
+            checksum = _add_sum(stream, length, zlib.crc32(head, checksum))
         else:
             stream.seek(length, os.SEEK_CUR)
-            continue
-        if check:
-            for piece in pieces:
-                checksum = zlib.crc32(piece, checksum)
 
 
 def read_messages(stream: BinaryIO, budget: Budget) -> Iterator[tuple[Schema | None, Channel, Message]]:
     """Yield every message as stored, with its channel and schema. All checksums that the file has are compared.
 
-    Raises `ValueError` for what `read_records`, `unpack` or `budget` refuse, and for a channel that is not there.
+    A writer may repeat a schema or channel; the first of every number counts. Raises `ValueError` for what
+    `read_records`, `unpack` or `budget` refuse, and for a schema or channel that is missing.
     """
-    known = _Channels()
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    size = 0
     for record in read_records(stream, Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, check=True):
         for one in chunk_records(unpack(record, budget), budget) if record.opcode == Opcode.CHUNK else (record,):
             if one.opcode == Opcode.MESSAGE:
                 message = to_message(one.body)
-                yield (*known.of(message), message)
-            else:
-                known.add(one)
+                channel = channels.get(message.channel_id)
+                if channel is None:
+                    raise ValueError(f"a message of channel {message.channel_id}, which it does not define")
+                if channel.schema_id and channel.schema_id not in schemas:
+                    what = f"channel {channel.topic} has schema {channel.schema_id}"
+                    raise ValueError(f"{what}, which it does not define")
+                yield schemas.get(channel.schema_id), channel, message
+            elif int.from_bytes(one.body[:2], "little") not in (schemas if one.opcode == Opcode.SCHEMA else channels):
+                size += len(one.body)
+                _refuse_large("its schemas and channels together", size, LARGEST_NOTES)
+                if one.opcode == Opcode.SCHEMA:
+                    schema = Schema.read(ReadDataStream(BytesIO(one.body)))
+                    schemas[schema.id] = schema
+                else:
+                    channel = to_channel(one.body)
+                    channels[channel.id] = channel
 
 
 def unpack(record: Record, budget: Budget, *, check: bool = True) -> bytes:
@@ -137,7 +150,7 @@ def unpack(record: Record, budget: Budget, *, check: bool = True) -> bytes:
     _refuse_large("a chunk, unpacked,", size, LARGEST_CHUNK)
     budget.take(size)
     try:
-        data = _unpacker(chunk.compression)(chunk.data, size)
+        data = _decompress(chunk, size)
     except (zstandard.ZstdError, RuntimeError) as error:  # lz4 raises the latter
         raise ValueError(f"a chunk that cannot be unpacked: {error}") from error
     if len(data) != size:
@@ -214,78 +227,35 @@ def check_both_sums(stream: BinaryIO) -> None:
     opcode, _, data_sum = _DATA_END.unpack(stream.read(_DATA_END.size))
     if opcode != Opcode.DATA_END or data_sum == 0:
         raise ValueError("no checksum over its data")
-    if _sum_of(stream, 0, data_end) != data_sum:
+    stream.seek(0)
+    if _add_sum(stream, data_end) != data_sum:
         raise ValueError("its data does not match its checksum")
-    if _sum_of(stream, summary, size - len(_MAGIC) - 4) != summary_sum:
+    stream.seek(summary)
+    if _add_sum(stream, size - len(_MAGIC) - 4 - summary) != summary_sum:
         raise ValueError("its summary does not match its checksum")
 
 
-class _Channels:
-    """Schemas and channels of a file, the first of every number: writers may repeat them, but not change them."""
-
-    def __init__(self) -> None:
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
-        self._size = 0
-
-    def add(self, record: Record) -> None:
-        number = int.from_bytes(record.body[:2], "little")
-        table: dict[int, Any] = self._schemas if record.opcode == Opcode.SCHEMA else self._channels
-        if number in table:
-            return
-        self._size += len(record.body)
-        _refuse_large("its schemas and channels together", self._size, LARGEST_NOTES)
-        kind: Any = Schema if record.opcode == Opcode.SCHEMA else Channel
-        table[number] = kind.read(ReadDataStream(BytesIO(record.body)))
-
-    def of(self, message: Message) -> tuple[Schema | None, Channel]:
-        channel = self._channels.get(message.channel_id)
-        if channel is None:
-            raise ValueError(f"a message of channel {message.channel_id}, which it does not define")
-        if channel.schema_id and channel.schema_id not in self._schemas:
-            raise ValueError(f"channel {channel.topic} has schema {channel.schema_id}, which it does not define")
-        return self._schemas.get(channel.schema_id), channel
+def _decompress(chunk: Chunk, size: int) -> bytes:
+    """Return at most one byte more than `size`."""
+    if chunk.compression == "zstd":
+        declared = zstandard.frame_content_size(chunk.data)  # -1: the frame does not say
+        if declared not in (-1, size):
+            raise ValueError(f"a chunk declares {size:,} bytes, its zstd frame {declared:,}")
+        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=max(size, 1))
+    if chunk.compression == "lz4":
+        return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    if chunk.compression == "":
+        return chunk.data
+    raise ValueError(f"a chunk compressed by {chunk.compression[:20]!r}; expected zstd, lz4 or none")
 
 
-def _unpacker(compression: str) -> Callable[[bytes, int], bytes]:
-    """What unpacks data to at most one byte more than a size."""
-    table = {"zstd": _unpack_zstd, "lz4": _unpack_lz4, "": lambda data, size: data}
-    if compression not in table:
-        raise ValueError(f"a chunk compressed by {compression[:20]!r}; expected zstd, lz4 or none")
-    return table[compression]
-
-
-def _unpack_zstd(data: bytes, size: int) -> bytes:
-    declared = zstandard.frame_content_size(data)  # -1: the frame does not say
-    if declared not in (-1, size):
-        raise ValueError(f"a chunk declares {size:,} bytes, its zstd frame {declared:,}")
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
-
-
-def _unpack_lz4(data: bytes, size: int) -> bytes:
-    return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-
-
-def _compare_checksum(body: bytes, found: int, *, check: bool) -> None:
-    declared = int.from_bytes(body[:4], "little")
-    if check and declared not in (0, found):
-        raise ValueError("its data does not match its checksum")
-
-
-def _pieces(stream: BinaryIO, head: bytes, length: int) -> Iterator[bytes]:
-    yield head
+def _add_sum(stream: BinaryIO, length: int, checksum: int = 0) -> int:
+    """Return the checksum with the next `length` bytes added, of which little is held at a time."""
     while length > 0:
         piece = stream.read(min(length, _PIECE))
         if not piece:
             raise ValueError("it ends too early")
         length -= len(piece)
-        yield piece
-
-
-def _sum_of(stream: BinaryIO, start: int, stop: int) -> int:
-    stream.seek(start)
-    checksum = 0
-    for piece in _pieces(stream, b"", stop - start):
         checksum = zlib.crc32(piece, checksum)
     return checksum
 

@@ -23,7 +23,8 @@ from manip_il.data.picture import open_picture
 from manip_il.doctor.cameras import check_pictures
 from manip_il.doctor.dataset import Dataset
 from manip_il.errors import ManipError
-from manip_il.mcap.frames import DatasetFrames, decode_bytes
+from manip_il.mcap.export import stored_pictures
+from manip_il.mcap.read import decode_picture
 from manip_il.mdp import Episode
 
 from ..damage import edit_json
@@ -99,9 +100,9 @@ def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) 
     with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
         list(ParquetPart(name, 0).read(pictured, KEY, 20))
     with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
-        list(DatasetFrames(pictured, {KEY: "image"}).read(KEY, 0, 1))
+        list(stored_pictures(pictured, KEY))
     with pytest.raises(ManipError, match="it is not a PNG or JPEG"):
-        decode_bytes(EPS)
+        decode_picture(EPS)
     assert not marker.exists()
 
 
@@ -114,7 +115,7 @@ def test_other_formats_are_refused(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
 def test_a_picture_of_a_robots_camera_is_read(kind: str) -> None:
     level = np.full((1080, 1920, 3), 90, np.uint8)
-    assert (decode_bytes(saved(level, kind)) == 90).all()
+    assert (decode_picture(saved(level, kind)) == 90).all()
 
 
 @pytest.mark.parametrize(("width", "height"), [(5_000, 5_000), (10_000, 10_000), (60_000, 60_000)])
@@ -122,4 +123,4 @@ def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(wi
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # nor does Pillow's own warning appear
         with pytest.raises(ManipError, match="pixels"):
-            decode_bytes(png(width, height))
+            decode_picture(png(width, height))

@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import schema as s
 from manip_il.errors import ManipError
-from manip_il.mcap import foxglove, foxglove_episode
+from manip_il.mcap import foxglove
 from manip_il.mcap.records import Budget, chunk_records
 from manip_il.mdp import Episode
 
@@ -83,7 +83,7 @@ def test_whole_numbers_stay_whole() -> None:
 def test_pictures_come_back_bit_for_bit(pictures: np.ndarray) -> None:
     columns = {s.IMAGES + "front": pictures, s.IMAGES + "wrist": pictures[:, ::-1]}
     episode = Episode(1, columns, True, True)
-    data = written(list(foxglove_episode.channels(episode, SPEC)), foxglove_episode.frame_times(episode, SPEC))
+    data = written(list(foxglove.episode_channels(episode, SPEC)), foxglove.frame_times(episode, SPEC))
     chunks = (one for one in StreamReader(io.BytesIO(data), emit_chunks=True).records if isinstance(one, Chunk))
     unpacked = (get_chunk_data_stream(chunk)[0].read(2**30) for chunk in chunks)
     records = (one for data in unpacked for one in chunk_records(data, Budget(0, 2**30, 0)))
@@ -111,4 +111,4 @@ def test_the_scalars_schema_is_lerobots() -> None:
 @pytest.mark.parametrize("pictures", [np.zeros((2, 4, 4, 3)), np.zeros((2, 4, 4, 1), np.uint8), np.zeros(2, np.uint8)])
 def test_pictures_of_another_kind_are_refused(pictures: np.ndarray) -> None:
     with pytest.raises(ManipError, match=r"column 'observation\.images\.front' is .*expected pictures"):
-        list(foxglove_episode.channels(Episode(1, {s.IMAGES + "front": pictures}, True, True), SPEC))
+        list(foxglove.episode_channels(Episode(1, {s.IMAGES + "front": pictures}, True, True), SPEC))

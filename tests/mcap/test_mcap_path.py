@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.mcap.path import All, Field, FieldPath, Index, Where, parse_path
+from manip_il.mcap.path import FieldPath, parse_path
 
 words = st.from_regex(r"[a-z_][a-z0-9_]*", fullmatch=True)
-selectors = st.one_of(st.builds(Index, st.integers(0, 99)), st.just(All()), st.builds(Where, words, st.text()))
-steps = st.lists(st.one_of(st.builds(Field, st.text()), selectors), max_size=5)
-paths = st.builds(lambda first, rest: FieldPath((Field(first), *rest)), st.text(), steps)
+steps = st.one_of(st.text(), st.integers(0, 99), st.just(slice(None)), st.tuples(words, st.text()))
+paths = st.builds(lambda first, rest: FieldPath((first, *rest)), st.text(), st.lists(steps, max_size=5))
 
 
 @given(paths)

@@ -10,7 +10,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError
-from manip_il.mcap.resample import NANOSECONDS, Method, frame_times, pick
+from manip_il.mcap.foxglove import NANOSECONDS
+from manip_il.mcap.importing import frame_times, pick
+from manip_il.mcap.mapping import Method
 
 SECOND = NANOSECONDS
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
