@@ -22,8 +22,6 @@ pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
 KINDS = ("state", "video", "image")
 MATRIX = "matrix"
-
-
 Record = Callable[..., None]
 
 
@@ -75,16 +73,16 @@ def test_what_lerobots_tools_make_of_it_has_no_errors(recorded: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_recorder_killed_before_finalize_is_told_in_plain_words(record: Record, tmp_path: Path, kind: str) -> None:
+def test_a_recorder_killed_before_finalize_is_named(record: Record, tmp_path: Path, kind: str) -> None:
     record(tmp_path / "dead", kind, episodes=12, end="kill")
     found = lines(tmp_path / "dead")
-    story = found[0]
-    assert story.startswith("error")
-    assert "LeRobot's recorder died here before finalize(): it had saved 12 episodes, 246 frames" in story
-    assert f"the rows of 12 episodes are lost, as it never closed {DATA}, {EPISODES}" in story
-    assert "LeRobot can neither read nor resume this: record again" in story
-    assert ("2 video files remain" in story) == (kind == "video")
-    assert ("pictures of episode-000012 that it had not encoded" in story) == (kind != "state")
+    first = found[0]
+    assert first.startswith("error")
+    assert "LeRobot's recorder died here before finalize(): it had saved 12 episodes, 246 frames" in first
+    assert f"the rows of 12 episodes are lost, as it never closed {DATA}, {EPISODES}" in first
+    assert "LeRobot can neither read nor resume this: record again" in first
+    assert ("2 video files remain" in first) == (kind == "video")
+    assert ("pictures of episode-000012 that it had not encoded" in first) == (kind != "state")
     for name in (DATA, EPISODES):
         assert any(line.startswith("error") and name in line and "has no footer" in line for line in found)
     assert any("8 pictures that LeRobot's recorder" in line for line in found) == (kind != "state")
@@ -97,20 +95,19 @@ def test_a_recorder_killed_before_its_list_of_episodes_was_begun(record: Record,
 
 def test_a_recorder_killed_in_its_first_episode(record: Record, tmp_path: Path) -> None:
     record(tmp_path / "dead", "video", episodes=0, end="kill")
-    story = lines(tmp_path / "dead")[0]
-    assert "a recorder was started here, but no episode was saved; pictures of episode-000000" in story
+    text = "a recorder was started here, but no episode was saved; pictures of episode-000000"
+    assert text in lines(tmp_path / "dead")[0]
 
 
 def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record: Record, recorded: Path, tmp_path: Path) -> None:
     """What the advice says makes a dataset of it again."""
-    root = tmp_path / "resumed"
-    shutil.copytree(recorded / "state", root)
+    root = shutil.copytree(recorded / "state", tmp_path / "resumed")
     record(root, "state", episodes=11, end="resume")
-    story = lines(root)[0]
-    assert "the rows of 11 episodes are lost" in story
-    assert "the first 4 episodes, 66 frames are intact" in story
+    first = lines(root)[0]
+    assert "the rows of 11 episodes are lost" in first
+    assert "the first 4 episodes, 66 frames are intact" in first
     for name in ("data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-001.parquet"):
-        assert name in story
+        assert name in first
         (root / name).unlink()
     edit_json(root / layout.INFO, lambda info: info.update(total_episodes=4, total_frames=66, splits={"train": "0:4"}))
     list(repair(Dataset(root), findings(root)))
@@ -119,8 +116,7 @@ def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record: Record, reco
 
 
 def test_a_picture_that_cannot_be_decoded(recorded: Path, tmp_path: Path) -> None:
-    root = tmp_path / "image"
-    shutil.copytree(recorded / "image", root)
+    root = shutil.copytree(recorded / "image", tmp_path / "image")
     key = "observation.images.front"
 
     def change(table: dict[str, list[Any]]) -> None:
@@ -135,17 +131,15 @@ def test_a_picture_that_cannot_be_decoded(recorded: Path, tmp_path: Path) -> Non
 
 def test_a_matrix_is_held_against_its_statistics(recorded: Path, tmp_path: Path) -> None:
     """LeRobot has those of a matrix over its last axis."""
-    root = tmp_path / MATRIX
-    shutil.copytree(recorded / MATRIX, root)
+    root = shutil.copytree(recorded / MATRIX, tmp_path / MATRIX)
     edit_json(root / layout.STATS, lambda stats: stats["grid"]["mean"].__setitem__(2, 7.0))
     assert any("meta/stats.json: grid: mean[2] is 7; the data's is" in line for line in lines(root))
 
 
 def test_names_in_a_dictionary_are_counted(recorded: Path, tmp_path: Path) -> None:
-    root = tmp_path / "state"
-    shutil.copytree(recorded / "state", root)
+    root = shutil.copytree(recorded / "state", tmp_path / "state")
     edit_json(root / layout.INFO, lambda info: info["features"]["action"]["names"]["motors"].append("z"))
-    assert lines(root) == [str_of("meta/info.json: action", "3 names for shape [2]; expected 2")]
+    assert lines(root) == ["error    meta/info.json: action: 3 names for shape [2]; expected 2"]
 
 
 def test_statistics_of_a_column_far_from_zero_pass(recorded: Path) -> None:
@@ -156,12 +150,7 @@ def test_statistics_of_a_column_far_from_zero_pass(recorded: Path) -> None:
 
 
 def test_a_cut_video_of_theirs(recorded: Path, tmp_path: Path) -> None:
-    root = tmp_path / "video"
-    shutil.copytree(recorded / "video", root)
+    root = shutil.copytree(recorded / "video", tmp_path / "video")
     name = "videos/observation.images.wrist/chunk-000/file-000.mp4"
     cut(root / name, 0.6)
     assert any(name in line and "66 rows of 4 episodes" in line for line in lines(root))
-
-
-def str_of(place: str, text: str) -> str:
-    return f"error    {place}: {text}"

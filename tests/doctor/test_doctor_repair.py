@@ -15,7 +15,6 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import exclusive
-from manip_il.data.build import build
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
 from manip_il.doctor import examine as module
@@ -28,26 +27,6 @@ from ..damage import DATA, cut, digests, edit_json, edit_table, findings, lines
 
 MakeEpisode = Callable[..., Episode]
 FINGERPRINT = environment_fingerprint(b"", {})
-
-
-@pytest.fixture
-def journals(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
-    for episode in episodes:
-        write_episode(tmp_path / "lift.journals", episode, spec, FINGERPRINT)
-    return tmp_path / "lift.journals"
-
-
-@pytest.fixture
-def root(journals: Path) -> Path:
-    build(journals, journals.with_name("lift"))
-    return journals.with_name("lift")
-
-
-@pytest.fixture
-def alone(root: Path, journals: Path) -> Path:
-    """The dataset without its journals."""
-    journals.rename(journals.with_name("elsewhere"))
-    return root
 
 
 def mend(root: Path) -> list[str]:
