@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, override
 
@@ -30,7 +30,7 @@ def write_with_library(
     robot_type: str | None,
     features: dict[str, dict[str, Any]],
     episodes: Iterable[Iterable[Frame]],
-) -> Iterator[int]:
+) -> Generator[int]:
     """Write a dataset to `root`, which must not exist; yield every episode's number of frames.
 
     Not atomic: write into a `new_folder`. Tasks are numbered as they first appear. The repository's name is not
@@ -40,16 +40,21 @@ def write_with_library(
     dataset = LeRobotDataset.create(
         f"local/{root.name}", fps, features, root=root, robot_type=robot_type, use_videos=with_video
     )
-    for frames in episodes:
-        count = 0
-        tasks: dict[str, None] = {}
-        for frame in frames:
-            count += 1
-            tasks[frame["task"]] = None
-            dataset.add_frame(frame)
-        dataset.meta.save_episode_tasks(list(tasks))  # LeRobot would number an episode's tasks in random order
-        _save(dataset)
-        yield count
+    try:
+        for frames in episodes:
+            count = 0
+            tasks: dict[str, None] = {}
+            for frame in frames:
+                count += 1
+                tasks[frame["task"]] = None
+                dataset.add_frame(frame)
+            dataset.meta.save_episode_tasks(list(tasks))  # LeRobot would number an episode's tasks in random order
+            _save(dataset)
+            yield count
+    except BaseException:
+        with contextlib.suppress(Exception):
+            dataset.finalize()  # else it writes when it is collected, into the folder that was removed
+        raise
     dataset.finalize()
     shutil.rmtree(root / "images", ignore_errors=True)  # empty folders: the pictures are in the data by now
 

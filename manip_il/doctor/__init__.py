@@ -1,8 +1,8 @@
 """Examine any folder of a LeRobot v3.0 dataset, and repair what can be repaired.
 
 - `examine.examine` only reads. `repair` is the one function that writes: it builds a dataset again from its journals,
-  or else computes statistics and moves leftovers away. It deletes nothing: what it replaces or moves is kept in
-  `DATASET.before-repair`. It changes nothing outside the dataset's folder, also where links lead there.
+  or else computes statistics and moves leftovers away, in the dataset's folder and beside it, but not through links. It
+  deletes nothing: what it replaces or moves is kept in `DATASET.before-repair`.
 - No content of a folder ends the examination: a file that cannot be read is a finding, and so is a check that fails;
   all other files and checks are still examined. Files are read in bounded memory (`data.parquet_limits`,
   `data.video_open`).

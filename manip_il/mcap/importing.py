@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,8 +94,9 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Im
 
     with new_folder(root) as folder:
         work = folder / root.name  # LeRobot makes its folder itself
-        for _ in write_with_library(work, mapping.fps, mapping.robot_type, features, episodes()):
-            yield done.pop()
+        with closing(write_with_library(work, mapping.fps, mapping.robot_type, features, episodes())) as written:
+            for _ in written:
+                yield done.pop()
         for path in list(work.iterdir()):
             path.rename(folder / path.name)
         work.rmdir()
