@@ -26,7 +26,7 @@ LARGEST_META = 16 * 1024 * 1024  # of a JSON file in `meta` [bytes]
 _LONGEST_PATH = 1_000  # [characters]
 _MOST_AXES = 32  # as many as an array of numpy's has
 
-# the placeholders that LeRobot fills in, and nothing that `str.format` could be made to do beside that
+# LeRobot's placeholders alone: `str.format` would also read attributes
 _TEMPLATE = re.compile(r"(?:[^{}/]|/(?!/)|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
 
 

@@ -14,7 +14,7 @@ index columns and numbers, `meta/stats.json`, every video frame and picture, lef
 beside the dataset, and, in datasets of this program, the spec and the fingerprint.
 
 The doctor shares the reading of `meta/info.json` (`data.info`) and of parquet files (`data.shards`) with the loader in
-`data.lerobot_read`, but not the loader itself: the loader stops at the first damage, the doctor goes on behind it.
+`data.lerobot_read`, but not the loader itself: the loader stops at the first damage, the doctor reads on.
 
 `examine.py` is the list of checks and the repair, `dataset.py` what all checks read, `scan.py` the one pass over the
 data files, `finding.py` what is reported; the other files are the checks.

@@ -24,7 +24,7 @@ from manip_il.doctor.scan import F64, I64
 _TOLERANCE = 1e-4  # LeRobot's reader refuses a frame that is further from its row [s]
 _SAMPLES = 50  # frames a video file whose brightness is measured
 _BATCH = 64  # pictures held at once
-_SAMPLE_EVERY = 20  # pictures: the brightness of one of so many is measured
+_SAMPLE_EVERY = 20  # the brightness of every 20th picture is measured
 _LEVEL_TOLERANCE = 0.1  # of the range: LeRobot samples frames and pixels, before they are compressed with loss
 
 

@@ -1,4 +1,4 @@
-"""A dataset's folder, read once and leniently: one broken file hides nothing of the others."""
+"""Content of a dataset's folder, read once; a damaged file does not keep the others from being read."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Content of a folder. on_file is called after every file that takes a while to read."""
+    """Content of a folder. on_file is called after every data file, video and journal."""
 
     root: Path
     on_file: Callable[[], None] = field(default=lambda: None, compare=False)

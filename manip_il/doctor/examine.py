@@ -19,15 +19,7 @@ from manip_il.data.lerobot_stats import RunningStats
 from manip_il.data.shards import to_array
 from manip_il.doctor.cameras import check_pictures, check_videos
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.finding import (
-    Finding,
-    Remedy,
-    Severity,
-    count_frames,
-    error,
-    list_first,
-    plural,
-)
+from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
 from manip_il.doctor.leftovers import (
     BESIDE,
     check_journals,

@@ -143,7 +143,7 @@ def concatenate(parts: Sequence[Any]) -> Any:
 
 
 def _scan_shard(shard: Shard, info: Info, result: Scan) -> Iterator[Runs]:
-    """Add what the file holds to `result`; nothing of it where it cannot be read to its end."""
+    """Add a file to `result`, and yield its runs where it can be read to its end."""
     kept: dict[str, list[NDArray[Any]]] = {key: [] for key in (*INDEX_FEATURES, s.SEED)}
     rows, bad_columns = result.rows, set[str]()
     numbers = [key for key in result.moments if key in shard.columns]

@@ -36,7 +36,7 @@ class FieldPath:
         return "".join(map(_step_text, self.steps)).removeprefix(".")
 
     def values(self, message: Any) -> list[Any]:
-        """Return the values that the path leads to, in order. A list at its end stands for its elements.
+        """Return the values that the path leads to, in order. A list at its end counts as its elements.
 
         Raises `ManipError` naming the step that leads nowhere, with the nearest name that does.
         """

@@ -27,7 +27,7 @@ I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
 LARGEST_FILE = 2048 * MIB  # messages and pictures, unpacked [bytes]
-_LARGEST_RATIO = 1000  # or so many times the file's size, where that is more: a dark JPEG reaches 200
+_LARGEST_RATIO = 1000  # times the file's size, where that is more: a dark JPEG reaches 200
 LARGEST_NUMBERS = 8 * MIB  # a message of JSON, or of protobuf that is no picture [bytes]
 LARGEST_DECODED = 512 * MIB  # all of those that are decoded [bytes]
 LARGEST_ROWS = 256 * MIB  # the values that are kept until the file is read to its end, as Python has them [bytes]

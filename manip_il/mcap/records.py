@@ -34,7 +34,7 @@ _ATTACHMENT_TIMES = 16  # [bytes]
 _FOOTER = struct.Struct("<BQQQI")  # opcode, size, where the summary starts, where its offsets start, checksum
 _DATA_END = struct.Struct("<BQI")  # opcode, size, checksum
 _PIECE = MIB  # read at a time where nothing is kept [bytes]
-_PACKED = LARGEST_CHUNK + MIB  # of a chunk as it lies in the file [bytes]: what cannot be compressed is a little longer
+_PACKED = LARGEST_CHUNK + MIB  # of a packed chunk [bytes]: what cannot be compressed becomes a little longer
 _LIMITS = {
     Opcode.CHUNK: _PACKED,
     Opcode.MESSAGE: LARGEST_MESSAGE,
@@ -66,7 +66,7 @@ class Budget:
 
 
 class Record(NamedTuple):
-    """One record as it lies in the file. opcode: of a wanted kind."""
+    """One record as stored. opcode: of a wanted kind."""
 
     opcode: int
     body: bytes
