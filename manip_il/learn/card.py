@@ -11,7 +11,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 
 from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.learn.observation import observation_of
+from manip_il.learn.pretrained import observation_of
 
 CARD_FILE = "README.md"
 
@@ -67,5 +67,5 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
 
 
 def _task_id(meta: CheckpointMeta) -> str:
-    """As the gymnasium ids have it: `PandaPickPlace-v0`."""
+    """The gymnasium id, `PandaPickPlace-v0`."""
     return "".join(word.capitalize() for word in f"{meta.robot}_{meta.task}".split("_")) + "-v0"

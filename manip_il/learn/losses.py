@@ -55,7 +55,7 @@ class Distribution(Head):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """What one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
+        """Draw what one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
 
     @abstractmethod
     def sample(self, params: Tensor, draws: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
 
 
 def floored_log_std(raw: Tensor) -> Tensor:
-    """Return log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
+    """Return log-deviations of the shape of `raw`, (B, n), that go smoothly to `MIN_LOG_STD` from above."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
 
 
