@@ -25,7 +25,7 @@ _LEARNER_ALONE = BetaSchedule("constant", 0.0)
 class RunConfig:
     """Options of `manip-il dagger` by their names; round 0 is always the expert's own demonstrations.
 
-    method: a name in `ALGORITHMS`, see `check_method`. rounds: after round 0, fewer where label_budget, the sound labels
+    method: a name in `ALGORITHMS` (`check_method`). rounds: after round 0, fewer where label_budget, the sound labels
     of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
     branch_steps: what the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many
     as the policy plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble:

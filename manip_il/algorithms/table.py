@@ -63,7 +63,7 @@ def check_method(config: RunConfig) -> None:
 
 
 def run_algorithm(config: RunConfig, folder: Path, engine: Engine, watch: Watch | None = None) -> Iterator[RoundResult]:
-    """Run, or go on with, the rounds of `config.method` in `folder`; see `Run.follow`. Raises as `check_method` does."""
+    """Run, or go on with, the rounds of `config.method`; see `Run.follow`. Raises what `check_method` raises."""
     from manip_il.algorithms.run import Run
 
     check_method(config)

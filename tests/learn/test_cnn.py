@@ -6,8 +6,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.configs import NormalizationMode
@@ -17,26 +15,24 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.cnn import CNNConfig
-from manip_il.learn.cnn.encoder import KeypointEncoder
-from manip_il.learn.cnn.modeling_cnn import CNNPolicy
+from manip_il.learn.cnn.modeling_cnn import CNNPolicy, KeypointEncoder
+from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
-from manip_il.learn.observation import policy_features
 
 SIDE = 32
 SMALL = {"channels": (4, 4), "keypoints": 3, "width": 16, "depth": 1, "device": "cpu"}
-LEARNING = ("observation.state", "observation.environment_state", "action", "label_valid")
 
 
 @pytest.fixture
-def meta(table, spec, tmp_path):
+def table(gapped):
+    return gapped
+
+
+@pytest.fixture
+def meta(dataset, spec):
     """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
-    table["label_valid"][::10] = 0
-    columns = {key: pa.array(list(table[key])) for key in LEARNING}
-    columns |= {"label_valid": pa.array(table["label_valid"][:, 0]), "index": pa.array(np.arange(len(table["action"])))}
-    (tmp_path / "dataset/data").mkdir(parents=True)
-    pq.write_table(pa.table(columns), tmp_path / "dataset/data/file-000.parquet")
     seen = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
-    return SimpleNamespace(features=features(seen), root=tmp_path / "dataset", stats={})
+    return SimpleNamespace(features=features(seen), root=dataset.root, stats={})
 
 
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
@@ -54,7 +50,10 @@ def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
 def make_batch(table, rows: int = 20, seed: int = 0) -> dict[str, torch.Tensor]:
     """The first rows, as LeRobot's preprocessor passes them on, with pictures of noise."""
     generator = torch.Generator().manual_seed(seed)
-    batch = {key: torch.from_numpy(table[key][:rows]) for key in LEARNING[:3]}
+    batch = {
+        key: torch.from_numpy(table[key][:rows])
+        for key in ("observation.state", "observation.environment_state", "action")
+    }
     for camera in ("front", "wrist"):
         batch[f"observation.images.{camera}"] = torch.rand(rows, 3, SIDE, SIDE, generator=generator)
     return batch | {"index": torch.arange(rows)}

@@ -132,9 +132,9 @@ def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
     policy = LearnedPolicy.load(checkpoint)
     states, environments = observations(0)
     policy.act(states[:2], environments[:2], None, [4, 5])
-    chooser = policy._chooser
-    assert isinstance(chooser, EpisodePolicy)
-    one, two = (memory.policy for memory in chooser._memories.values())
+    inner = policy._policy
+    assert isinstance(inner, EpisodePolicy)
+    one, two = (memory.policy for memory in inner._memories.values())
     assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
     name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_queues"
     name = name if hasattr(one, name) else "_action_queue"

@@ -15,13 +15,13 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.limits import threads
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
-from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import Interface
-from manip_il.learn.threads import threads
-from manip_il.learn.train import TrainConfig, fit
+from manip_il.learn.train import fit
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def checkpoint(table, spec, tmp_path):
     return make_checkpoint(table, spec, tmp_path)
 
 
-def make_checkpoint(table, spec, folder, loss="mse", width=256):
-    config = TrainConfig(steps=3, batch_size=32, policy=MLPConfig(loss=loss, width=width))
+def make_checkpoint(table, spec, folder, loss="mse"):
+    config = FitConfig({"loss": loss}, steps=3, batch_size=32)
     return fit(table, config, folder / loss, spec=spec)
 
 
@@ -141,17 +141,17 @@ def test_pictures_go_in_as_lerobot_feeds_them():
             self.batch, self.episodes = batch, list(episodes)
             return torch.zeros(2, 4)
 
-    chooser = Seen()
+    inner = Seen()
     interface = Interface("act", {"observation.state": 4}, {"front": (5, 6)}, 4)
-    policy = LearnedPolicy(chooser, interface)
+    policy = LearnedPolicy(inner, interface)
     picture = np.arange(2 * 5 * 6 * 3, dtype=np.uint8).reshape(2, 5, 6, 3)
     states, environments = observations(2)
     policy.act(states, environments, {"front": picture, "wrist": picture}, [40, 30])
     theirs = preprocess_observation({"pixels": {"front": picture}, "agent_pos": states})
-    assert chooser.batch.keys() == theirs.keys()
-    assert all(torch.equal(chooser.batch[key], theirs[key]) for key in theirs)
-    assert chooser.batch["observation.images.front"].is_contiguous()
-    assert chooser.episodes == [40, 30]
+    assert inner.batch.keys() == theirs.keys()
+    assert all(torch.equal(inner.batch[key], theirs[key]) for key in theirs)
+    assert inner.batch["observation.images.front"].is_contiguous()
+    assert inner.episodes == [40, 30]
     with pytest.raises(MismatchError, match=r"\['front'\].*\['wrist'\]"):
         policy.act(states, environments, {"wrist": picture})
     with pytest.raises(MismatchError, match="the states has 2, the episodes has 1"):

@@ -13,8 +13,19 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 
 from manip_il.data.schema import RobotTaskSpec, features
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
-from manip_il.learn.choices import policy_types
-from manip_il.learn.observation import policy_features
+from manip_il.learn.lerobot_config import policy_features, policy_types
+
+ACT = {  # a policy that plans, by its options
+    "type": "act",
+    "device": "cpu",
+    "chunk_size": 4,
+    "n_action_steps": 2,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 16,
+    "n_encoder_layers": 1,
+    "n_vae_encoder_layers": 1,
+}
 
 TINY: dict[str, dict[str, Any]] = {
     "act": {

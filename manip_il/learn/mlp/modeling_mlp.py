@@ -36,9 +36,9 @@ class MLPPolicy(PreTrainedPolicy):
         self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
             roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
-            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, INDEX)
-            columns = read_tables(roots, [key for key in wanted if key in dataset_meta.features])
-            self._learn_columns(columns, config.loss)
+            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
+            names = [key for key in wanted if key in dataset_meta.features]
+            self._learn_columns(read_tables(roots, [*names, INDEX]), config.loss)
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
