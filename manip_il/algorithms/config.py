@@ -110,10 +110,10 @@ class RunConfig:
 
 def check_cameras(config: RunConfig) -> None:
     """Raise `UsageError` unless pictures are rendered exactly where the policy takes some."""
-    sees = config.fit.sees
-    if sees and config.cameras is None:
+    takes_images = config.fit.takes_images
+    if takes_images and config.cameras is None:
         raise UsageError("the policy takes images, but none are rendered; give --cameras=front,wrist")
-    if config.cameras is not None and not sees:
+    if config.cameras is not None and not takes_images:
         raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
 
 

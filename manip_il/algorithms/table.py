@@ -55,7 +55,7 @@ def check_method(config: RunConfig) -> None:
     algorithm = ALGORITHMS[config.method]
     if config.has_queries and not algorithm.learner_drives:
         raise UsageError(f"method {config.method!r} has the expert drive throughout; leave out label, query and beta")
-    if config.fit.sees and not algorithm.takes_images:
+    if config.fit.takes_images and not algorithm.takes_images:
         raise UsageError(
             f"method {config.method!r} measures the learner's errors from state vectors; it is not for a policy on "
             "images"

@@ -157,8 +157,8 @@ class Augment:
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
         moves, factors = self._draw(len(pictures), math.prod(pictures.shape[1:-3]), generator)
         numbers = factors.to(flat.device)
-        sides = (each.split(_AT_ONCE) for each in (changed, flat, moves, numbers))
-        for target, source, move, factor in zip(*sides, strict=True):
+        parts = (each.split(_AT_ONCE) for each in (changed, flat, moves, numbers))
+        for target, source, move, factor in zip(*parts, strict=True):
             _crop(source, move, self.shift, target)
             if self.brightness or self.contrast or self.saturation:
                 _jitter(target, factor)

@@ -95,8 +95,8 @@ class FitConfig:
         return "path" not in self.policy and self.policy.get("type", MLP) == MLP
 
     @property
-    def sees(self) -> bool:
-        """Whether the policy looks at pictures; `ManipError` where that is for the checkpoint in `path` to say."""
+    def takes_images(self) -> bool:
+        """Whether pictures are among the policy's inputs. Raises `ManipError` for a `path` without a policy."""
         if self.is_mlp or self.observation is not None:
             return not self.is_mlp and self.observation != "state"
         path = self.policy.get("path")

@@ -79,8 +79,8 @@ class PolicyTrainer:
         weights: F64 | None = None,
     ):
         self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config)
-        asked, observation = self.lerobot.resume_options(), self.lerobot.observation
-        self.meta = CheckpointMeta.of(spec, fingerprint, asked, observation, look)
+        options, observation = self.lerobot.resume_options(), self.lerobot.observation
+        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look)
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir)
@@ -89,7 +89,7 @@ class PolicyTrainer:
         roots = [root] if isinstance(root, Path) else list(root)
         self.dataset = read_metadata(*roots)
         set_features(self.lerobot.policy, self.dataset, observation)
-        self.options = self.lerobot.resume_options()  # with the features, too
+        self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
             self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
         self.digest = _digest(self.samples.digest, weights)
@@ -139,7 +139,7 @@ class PolicyTrainer:
                 try:
                     if on_step is not None:
                         on_step(record)
-                except KeyboardInterrupt:  # asked for between two steps: nothing is lost
+                except KeyboardInterrupt:  # by the user, between two steps: nothing is lost
                     if not saved:
                         self.save(record)
                     raise

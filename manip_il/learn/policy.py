@@ -78,11 +78,6 @@ class LearnedPolicy:
         return cls(load_policy(path, config, device, task, trust), interface, meta)
 
     @property
-    def widths(self) -> dict[str, int]:
-        """Size of each vector among its inputs."""
-        return self.interface.numbers
-
-    @property
     def cameras(self) -> tuple[str, ...]:
         """Cameras among its inputs."""
         return tuple(self.interface.pictures)
@@ -91,11 +86,6 @@ class LearnedPolicy:
     def module(self) -> torch.nn.Module:
         """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
         return self._policy.module
-
-    @property
-    def observation(self) -> str:
-        """Inputs besides the joints: `state`, `images` or `both`."""
-        return self.interface.observation
 
     @torch.inference_mode()
     def act(

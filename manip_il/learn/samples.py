@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, override
+from typing import Any, override
 
 import numpy as np
 import torch
@@ -92,14 +92,6 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
     return Windows(episodes, deltas)
 
 
-class Source(Protocol):
-    """Batches for given samples."""
-
-    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """Return one batch for every array of sample numbers, (B,), in that order. Pictures are uint8 or float32."""
-        ...
-
-
 class JoinedFrames:
     """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
 
@@ -133,7 +125,7 @@ class MemorySource:
     tasks: tuple[str, ...]
 
     def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """Return one batch for every array of sample numbers, (B,)."""
+        """Return one batch for every array of sample numbers, (B,), in that order; pictures are uint8."""
         return (self.batch(one) for one in samples)
 
     def batch(self, samples: I64) -> Batch:
@@ -164,7 +156,7 @@ class LibrarySource:
     workers: int
 
     def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """Return one batch for every array of sample numbers, (B,)."""
+        """Return one batch for every array of sample numbers, (B,), in that order; pictures are float32 or uint8."""
         loader = torch.utils.data.DataLoader(
             self.dataset,
             batch_sampler=_Batches(samples),
@@ -188,7 +180,7 @@ class _Batches(torch.utils.data.Sampler[list[int]]):
 class Samples:
     """The data of one fit. train, held_out: sample numbers; digest: of everything that is learnt from."""
 
-    source: Source
+    source: MemorySource | LibrarySource
     train: I64
     held_out: I64
     cameras: tuple[str, ...]

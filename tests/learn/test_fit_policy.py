@@ -423,7 +423,10 @@ def test_lerobot_train_goes_on_with_our_run(warm_lerobot, demos, tmp_path) -> No
     done = warm_lerobot.run("lerobot-train", *words)
     assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / "r/checkpoints/last").resolve().name == "000006"
-    assert LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model").widths["observation.state"] == 8
+    policy = LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model")
+    assert policy.interface.numbers["observation.state"] == 8
+        LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model").interface.numbers["observation.state"] == 8
+    )
 
 
 def test_the_options_of_a_fit_are_checked() -> None:

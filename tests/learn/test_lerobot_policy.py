@@ -225,7 +225,7 @@ def test_pictures_must_be_those_of_the_checkpoint(spec, tmp_path):
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
     meta = CheckpointMeta.of(pictured, observation="images", look={})
     policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "act", pictured, "images", meta=meta))
-    assert (policy.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
+    assert (policy.interface.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
     states, environments = (column[:2] for column in observations(0))
     picture = np.zeros((2, 32, 48, 3), np.uint8)
     dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])
