@@ -83,11 +83,6 @@ def test_pictures_are_rendered_exactly_where_the_policy_takes_them(fit, cameras,
         check_cameras(RunConfig(fit=fit, cameras=CameraConfig(cameras) if cameras else None))
 
 
-def test_an_mlp_that_is_to_see_is_refused_where_it_is_configured():
-    with pytest.raises(UsageError, match="mlp does not take images"):
-        FitConfig(observation="images")
-
-
 def test_a_branch_is_as_long_as_the_policy_needs_for_a_whole_plan():
     assert [fit.plan_length for fit in (FitConfig(), ACT, DIFFUSION)] == [1, 8, 16]
     lengths = [RunConfig(fit=fit, label="branch").steps_of_branch for fit in (FitConfig(), ACT, DIFFUSION)]

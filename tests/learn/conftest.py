@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.limits import threads
 
@@ -80,6 +84,19 @@ def dataset(spec, tmp_path_factory):
             made.save_episode()
     made.finalize()
     return LeRobotDataset("manip/test", root=root)
+
+
+@pytest.fixture
+def act(spec, tmp_path) -> Path:
+    """A checkpoint of LeRobot's `act`."""
+    from .tiny_policies import write_checkpoint
+
+    return write_checkpoint(tmp_path / "policy", "act", spec, meta=CheckpointMeta.of(spec))
+
+
+@pytest.fixture
+def pictured(spec) -> RobotTaskSpec:
+    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from urllib.error import URLError
@@ -16,7 +15,7 @@ from huggingface_hub import ModelCard
 from manip_il.cli.main import main
 from manip_il.data.lerobot_io import read_spec, read_table
 from manip_il.data.lerobot_library import lerobot_windows, read_metadata
-from manip_il.errors import FolderExistsError, ManipError, MismatchError, UsageError
+from manip_il.errors import FolderExistsError, ManipError, MismatchError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.fit_policy import PolicyTrainer
@@ -313,12 +312,6 @@ def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, monkeypa
     assert list((tmp_path / "r" / "wandb").glob("offline-run-*"))
 
 
-def test_weights_and_biases_that_is_not_installed_is_named(demos, tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(UsageError, match="pip install wandb"):
-        fit(demos, tmp_path / "r", wandb={"enable": True, "mode": "offline"})
-
-
 def test_a_checkpoint_to_start_from_that_does_not_fit_is_one_line(demos, tmp_path) -> None:
     path = fit(demos, tmp_path / "r")
     (path / "model.safetensors").write_bytes(b"\x08" + bytes(7) + b"nothing}")
@@ -344,12 +337,6 @@ def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(demos, tmp_path
     path.write_text(json.dumps(values))
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         fit(demos, tmp_path / "r", resume=True)
-
-
-def test_tensorboard_that_is_not_installed_is_named(demos, tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(UsageError, match=r"manip_il\[tensorboard\]"):
-        fit(demos, tmp_path / "r", tensorboard=True)
 
 
 @pytest.fixture
@@ -425,11 +412,3 @@ def test_lerobot_train_goes_on_with_our_run(warm_lerobot, demos, tmp_path) -> No
     assert (tmp_path / "r/checkpoints/last").resolve().name == "000006"
     policy = LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model")
     assert policy.interface.numbers["observation.state"] == 8
-        LearnedPolicy.load(tmp_path / "r/checkpoints/last/pretrained_model").interface.numbers["observation.state"] == 8
-    )
-
-
-def test_the_options_of_a_fit_are_checked() -> None:
-    for changes in ({"steps": 0}, {"eval_split": 1.0}, {"lr": 0.0}, {"num_workers": -1}):
-        with pytest.raises(UsageError):
-            replace(config(), **changes)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -14,7 +14,7 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.data.schema import features
 from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.learn.fit_config import NOT_OURS, check_names, policy_files, policy_options
+from manip_il.learn.fit_config import NOT_OURS, FitConfig, check_names, policy_files, policy_options
 from manip_il.learn.lerobot_config import (
     choice,
     option_lines,
@@ -23,7 +23,7 @@ from manip_il.learn.lerobot_config import (
     policy_features,
     policy_types,
 )
-from manip_il.learn.pretrained import OBSERVATIONS, observation_of
+from manip_il.learn.pretrained import observation_of
 
 
 def test_every_policy_of_lerobot_and_ours_is_known() -> None:
@@ -34,10 +34,7 @@ def test_options_have_lerobots_names_and_types() -> None:
     config = policy_config({"type": "diffusion", "down_dims": [32, 64], "horizon": "16", "device": "cpu"})
     assert isinstance(config, DiffusionConfig)
     assert (config.down_dims, config.horizon) == ((32, 64), 16)
-
-
-def test_nothing_is_uploaded_unasked() -> None:
-    assert policy_config({"type": "act", "device": "cpu"}).push_to_hub is False
+    assert config.push_to_hub is False  # LeRobot's default is to upload
 
 
 @pytest.mark.parametrize(
@@ -93,7 +90,7 @@ def test_the_help_lists_a_policys_options() -> None:
 
 
 def actions(config: Any) -> int:
-    """Of a plan, before the next one is made."""
+    """The actions that are taken of a plan."""
     return config.n_action_steps
 
 
@@ -152,6 +149,22 @@ def test_a_policys_options_are_the_fields_of_its_class(kind: str):
     assert set(policy_options(kind)) == wanted
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"steps": 0}, "steps is 0; expected at least 1"),
+        ({"num_workers": -1}, "num_workers is -1; expected at least 0"),
+        ({"eval_split": 1.0}, "dataset.eval_split is 1.0; expected at least 0 and less than 1"),
+        ({"lr": 0.0}, "lr is 0.0; expected more than 0"),
+        ({"observation": "images"}, "mlp does not take images"),
+        ({"scheduler": {"type": "cosine"}}, "--scheduler is not for --policy.type=mlp"),
+    ],
+)
+def test_options_of_a_fit_out_of_range_or_not_for_the_mlp_are_refused(changes, says):
+    with pytest.raises(UsageError, match=says):
+        FitConfig(**changes)
+
+
 def test_a_name_that_is_not_there_is_refused_with_the_nearest():
     with pytest.raises(UnknownName, match=r"unknown policy 'atc' \(did you mean 'act'\?\)"):
         check_names({"type": "atc"})
@@ -161,11 +174,6 @@ def test_a_name_that_is_not_there_is_refused_with_the_nearest():
         check_names({"type": "act", "chunksize": 3})
     check_names({"type": "act", "chunk_size": 3})
     check_names({"path": "runs/x", "chunk_sice": 3})  # whose type only the checkpoint knows
-
-
-@pytest.fixture
-def pictured(spec):
-    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
 
 
 @pytest.mark.parametrize(
@@ -186,6 +194,7 @@ def test_a_choice_is_its_columns_and_a_checkpoint_tells_it(observation, inputs, 
     assert list(given) == ["action"]
     assert given["action"].shape == (4,)
     assert observation_of(seen) == observation
+    assert observation_of(["observation.state"]) == "state"
 
 
 def test_pictures_are_channels_first_for_a_policy_and_kinds_are_lerobots(pictured):
@@ -214,7 +223,3 @@ def test_what_is_missing_is_named_with_a_way_out(spec, pictured):
     del table["action"]
     with pytest.raises(ManipError, match="no action"):
         policy_features(table, "images")
-
-
-def test_a_policy_of_the_joints_alone_counts_as_state():
-    assert observation_of(["observation.state"]) == OBSERVATIONS[0]

@@ -12,8 +12,7 @@ import draccus
 import pytest
 
 from manip_il.errors import ManipError, UsageError
-from manip_il.learn.checkpoint import CheckpointMeta, read_meta
-from manip_il.learn.cnn.configuration_cnn import CNNConfig
+from manip_il.learn.checkpoint import read_meta
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.limits import check_numbers
@@ -21,7 +20,7 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import PLAIN
 from manip_il.learn.train import fit
 
-from .tiny_policies import edit_config, write_checkpoint
+from .tiny_policies import edit_config, observations
 
 DEEP = "[" * 100_000
 TINY = FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8)
@@ -30,11 +29,6 @@ TINY = FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8)
 @pytest.fixture
 def mlp(table, spec, tmp_path) -> Path:
     return fit(table, TINY, tmp_path / "run", spec=spec)
-
-
-@pytest.fixture
-def act(spec, tmp_path) -> Path:
-    return write_checkpoint(tmp_path / "policy", "act", spec, meta=CheckpointMeta.of(spec))
 
 
 def refused(policy: Path, words: str) -> None:
@@ -60,7 +54,6 @@ def refused(policy: Path, words: str) -> None:
         ({"activation": "sqrt"}, "unknown activation 'sqrt'"),
         ({"clamp": "10"}, "clamp is '10'"),
         ({"clamp": 0}, "clamp is 0; expected more than 0"),
-        ({"type": None}, "type is None"),
         ({"input_features": {"observation.state": {"type": "STATE", "shape": [10**9]}}}, "a side of observation.state"),
         ({"input_features": {"observation.state": {"type": "STATE", "shape": ["4"]}}}, "a side of observation.state"),
         ({"input_features": {"observation.state": {"type": {}, "shape": [4]}}}, "type of observation.state"),
@@ -136,10 +129,6 @@ def test_options_of_our_own_policies_are_bounded_where_they_are_made(settings, w
         policy_config(settings | {"device": "cpu"})
 
 
-def test_what_is_allowed_is_made():
-    assert CNNConfig(device="cpu", channels=(8, 8)).channels == (8, 8)
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -202,13 +191,7 @@ def test_odd_options_of_a_normaliser_are_found_before_the_first_episode(changes,
     step["config"] |= changes
     path.write_text(json.dumps(values))
     with pytest.raises(ManipError, match=r"LeRobot cannot load it|the policy cannot act"):
-        LearnedPolicy.load(act).act(*_zeros())
-
-
-def _zeros():
-    import numpy as np
-
-    return np.zeros((1, 4), np.float32), np.zeros((1, 6), np.float32)
+        LearnedPolicy.load(act).act(*observations(1))
 
 
 def header(table: Any, length: int | None = None) -> bytes:

@@ -16,16 +16,6 @@ from manip_il.learn.pretrained import Interface, check_interface, read_interface
 from .tiny_policies import edit_config, write_checkpoint
 
 
-@pytest.fixture
-def act(spec, tmp_path) -> Path:
-    return write_checkpoint(tmp_path / "policy", "act", spec)
-
-
-@pytest.fixture
-def pictured(spec):
-    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
-
-
 class Bomb:
     """Says that it was unpickled."""
 

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
@@ -75,6 +76,12 @@ def write_checkpoint(
     if meta is not None:
         (folder / META_FILE).write_text(json.dumps(asdict(meta)))
     return folder
+
+
+def observations(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Joint states (rows, 4) and environment states (rows, 6) of noise."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
 
 
 def edit_config(folder: Path, **changes: Any) -> None:
