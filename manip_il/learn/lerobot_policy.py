@@ -53,7 +53,10 @@ class _Memory:
 
 
 class EpisodePolicy:
-    """A LeRobot policy with its processors and one memory an episode. task: instruction for one that reads language."""
+    """A LeRobot policy with its processors and one memory an episode.
+
+    module: the policy without a memory of any episode. task: instruction for one that reads language.
+    """
 
     def __init__(
         self,
@@ -63,15 +66,10 @@ class EpisodePolicy:
         task: str = "",
     ):
         policy.reset()
-        self._fresh, self._before, self._after, self._task = policy, before, after, task
+        self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
         self._memories: dict[int, _Memory] = {}
-
-    @property
-    def module(self) -> PreTrainedPolicy:
-        """LeRobot's policy, without a memory of any episode."""
-        return self._fresh
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
@@ -92,7 +90,7 @@ class EpisodePolicy:
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
         if episode not in self._memories:
-            self._memories[episode] = _Memory(copy.deepcopy(self._fresh, dict(self._shared)))
+            self._memories[episode] = _Memory(copy.deepcopy(self.module, dict(self._shared)))
         memory = self._memories[episode]
         with _drawing(episode, memory.step, self._device):
             seen = self._before({**row, "task": [self._task]})
@@ -103,7 +101,7 @@ class EpisodePolicy:
 
     def _precision(self) -> contextlib.AbstractContextManager[Any]:
         """Mixed, where the policy was trained so, as lerobot-eval has it."""
-        return torch.autocast(self._device.type) if self._fresh.config.use_amp else contextlib.nullcontext()
+        return torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:

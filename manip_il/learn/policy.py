@@ -148,7 +148,7 @@ class LearnedPolicy:
 
     def require_likelihood(self) -> None:
         """Raise `UsageError` unless the policy tells how likely it finds an action, state by state."""
-        if not isinstance(self._policy, _Perceptron) or self._policy.loss not in LIKELIHOODS:
+        if not isinstance(self._policy, _Perceptron) or self._policy.module.loss not in LIKELIHOODS:
             raise UsageError(NO_LIKELIHOOD)
 
     def _with_spread(self) -> _Perceptron:
@@ -196,40 +196,34 @@ class _Perceptron:
         self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in interface.numbers]
         shape = _shape(config, path / CONFIG)
-        self.loss = shape.loss
         try:
             with Budget(path / WEIGHTS):
-                self._network = MLPNetwork(sum(interface.numbers[key] for key in self._keys), interface.action, shape)
+                self.module = MLPNetwork(sum(interface.numbers[key] for key in self._keys), interface.action, shape)
                 weights = load_file(path / WEIGHTS)
-            self._network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
+            self.module.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
         except (RuntimeError, SafetensorError) as error:
             line = " ".join(str(error).split())
             raise ManipError(f"{path}: weights and {CONFIG} do not match: {line}") from error
         except ManipError as error:
             raise ManipError(f"{path}: {error}") from error
-        self._network.to(device).eval()
-
-    @property
-    def module(self) -> MLPNetwork:
-        """The network."""
-        return self._network
+        self.module.to(device).eval()
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row (B, n).
 
         The mlp's processors are the identity (see MLPConfig), so there is nothing else to do.
         """
-        return self._network.act(self._inputs(batch))
+        return self.module.act(self._inputs(batch))
 
     def sample(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
         """Return absolute actions (B, n), each row's from its own generator."""
-        head = self._network.distribution()
+        head = self.module.distribution()
         draws = torch.from_numpy(np.stack([head.draw(rng) for rng in rngs]))
-        return self._network.sample(self._inputs(batch), draws.to(self._device)).cpu()
+        return self.module.sample(self._inputs(batch), draws.to(self._device)).cpu()
 
     def log_prob(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
         """Return the log-density of absolute actions (B, n) [nats], (B,)."""
-        return self._network.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
+        return self.module.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Forget nothing: the mlp has no memory."""

@@ -220,8 +220,9 @@ def load_samples(
     else:
         columns = {key: torch.from_numpy(np.array(table[key])) for key in (*numbers, *_ALWAYS)}
         source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
-    held_out = _evenly(usable[held_out], _MAX_HELD_OUT)
-    return Samples(source, usable[train], held_out, cameras, _digest(roots, table))
+    if len(held_out) > _MAX_HELD_OUT:
+        held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
+    return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
 
 
 def _library_source(roots: Sequence[Path], meta: Any, windows: Windows, workers: int) -> LibrarySource:
@@ -242,10 +243,6 @@ def _frames(
         limit -= sum(one.nbytes for one in frames.values())
         found.append(frames)
     return {camera: JoinedFrames([frames[camera] for frames in found]) for camera in cameras}
-
-
-def _evenly(samples: I64, most: int) -> I64:
-    return samples if len(samples) <= most else samples[np.linspace(0, len(samples) - 1, most).astype(np.int64)]
 
 
 def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:

@@ -20,7 +20,7 @@ from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import PLAIN
 from manip_il.learn.train import fit
 
-from .tiny_policies import edit_config, observations
+from .tiny_policies import edit_config, observations, refused
 
 DEEP = "[" * 100_000
 TINY = FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8)
@@ -29,13 +29,6 @@ TINY = FitConfig({"width": 8, "depth": 1}, steps=2, batch_size=8)
 @pytest.fixture
 def mlp(table, spec, tmp_path) -> Path:
     return fit(table, TINY, tmp_path / "run", spec=spec)
-
-
-def refused(policy: Path, words: str) -> None:
-    with pytest.raises(ManipError, match=words) as caught:
-        LearnedPolicy.load(policy)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 1_000
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
 from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.learn.lerobot_config import policy_features, policy_types
+from manip_il.learn.policy import LearnedPolicy
 
 ACT = {  # a policy that plans, by its options
     "type": "act",
@@ -82,6 +85,14 @@ def observations(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Joint states (rows, 4) and environment states (rows, 6) of noise."""
     rng = np.random.default_rng(seed)
     return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
+
+
+def refused(policy: Path, words: str) -> None:
+    """Check that a policy is refused in one line."""
+    with pytest.raises(ManipError, match=words) as caught:
+        LearnedPolicy.load(policy)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1_000
 
 
 def edit_config(folder: Path, **changes: Any) -> None:
