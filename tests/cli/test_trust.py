@@ -71,7 +71,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, tmp
     refused(["dagger", f"--policy.path={named}", out], capsys)
     refused(["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out], capsys)
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._config()  # pyright: ignore[reportAttributeAccessIssue]
+        LeRobotFit(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
 
 
