@@ -32,7 +32,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
 from manip_il.engine.engine import Engine
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.normalise import Statistics
+from manip_il.learn.network import Statistics
 from manip_il.robots.ik import ArmIK
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]

@@ -26,8 +26,8 @@ from _machine import describe_machine
 from manip_il.engine.describe import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.evaluation.results import EvalResult
-from manip_il.learn.mlp import MLPConfig
-from manip_il.learn.train import TrainConfig, fit
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.train import fit
 from manip_il.mdp import Episode
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
@@ -64,7 +64,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
     demos = list(run_job(RolloutJob(config, "expert", hold=5), stream_seeds("demonstrations", count)))
     table = {key: np.concatenate([episode.columns[key] for episode in demos]) for key in demos[0].columns}
     table["episode_index"] = np.repeat(np.arange(len(demos)), [len(episode) for episode in demos])
-    return fit(table, TrainConfig(steps=steps, policy=MLPConfig()), folder, spec=env_spec(config))
+    return fit(table, FitConfig(steps=steps), folder, spec=env_spec(config))
 
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:

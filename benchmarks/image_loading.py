@@ -31,10 +31,9 @@ import datasets
 from manip_il.data.image_cache import open_frame_cache
 from manip_il.data.lerobot_io import camera_keys, read_table
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.learn.augment import Augment
-from manip_il.learn.sources import JoinedFrames, MemorySource, pictures_to_float
-from manip_il.learn.threads import threads
-from manip_il.learn.windows import Windows
+from manip_il.learn.batches import Augment, pictures_to_float
+from manip_il.learn.limits import threads
+from manip_il.learn.samples import JoinedFrames, MemorySource, Windows
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time

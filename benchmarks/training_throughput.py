@@ -20,11 +20,14 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 import datasets
+from manip_il.data.lerobot_io import read_table
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
-from manip_il.learn.columns import learning_rows, read_columns
+from manip_il.learn.columns import learning_rows
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import LeRobotFit
+from manip_il.learn.limits import threads
 from manip_il.learn.mlp import MLPConfig
-from manip_il.learn.threads import threads
-from manip_il.learn.train import TrainConfig, Trainer
+from manip_il.learn.train import Trainer
 
 BATCH = 512
 SECONDS = 3.0  # of measuring, each
@@ -66,7 +69,7 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
 
 def our_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[], object]]:
     """A batch from the table in memory; and the same update with it."""
-    table = read_columns(dataset.root)
+    table = read_table(dataset.root, LEARNING)
     names = dataset.meta.features
     spec = RobotTaskSpec(
         robot="benchmark",
@@ -77,7 +80,8 @@ def our_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[]
         sim_state_size=1,
         instruction="",
     )
-    trainer = Trainer(learning_rows(table), TrainConfig(steps=10**9, batch_size=BATCH, log_freq=10**9), spec)
+    config = FitConfig(steps=10**9, batch_size=BATCH, log_freq=10**9)
+    trainer = Trainer(learning_rows(table), LeRobotFit(config), spec)
     updates = trainer.run()
     counter = iter(range(10**9))
     return lambda: trainer.batch(next(counter)), lambda: next(updates)

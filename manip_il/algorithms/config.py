@@ -7,9 +7,8 @@ from typing import Literal
 
 from manip_il.algorithms.beta import BetaSchedule
 from manip_il.algorithms.sampling import Sampling
-from manip_il.algorithms.table import ALGORITHMS
 from manip_il.engine.query import QueryRule
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import MAX_ROUNDS
 from manip_il.sim.env import EnvConfig
@@ -26,11 +25,11 @@ _LEARNER_ALONE = BetaSchedule("constant", 0.0)
 class RunConfig:
     """Options of `manip-il dagger` by their names; round 0 is always the expert's own demonstrations.
 
-    method: a name in `ALGORITHMS`. rounds: after round 0, fewer where label_budget, the sound labels of all rounds
-    together, is reached before. beta: the share of a round's steps that the expert drives. label, branch_steps: what
-    the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many as the policy
-    plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble: policies fitted
-    every round, of which the first drives.
+    method: a name in `ALGORITHMS` (`check_method`). rounds: after round 0, fewer where label_budget, the sound labels
+    of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
+    branch_steps: what the expert gives in a state in which it is queried, see `RolloutJob`; branch_steps None: as many
+    as the policy plans. query_rule: in which states; None: the default of the label mode, see `query`. ensemble:
+    policies fitted every round, of which the first drives.
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
@@ -60,8 +59,6 @@ class RunConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.method not in ALGORITHMS:
-            raise UnknownName("method", self.method, ALGORITHMS)
         for name in _AT_LEAST_1:
             if (value := getattr(self, name)) is not None and value < 1:
                 raise UsageError(f"{name} is {value}; expected at least 1")
@@ -76,9 +73,7 @@ class RunConfig:
         self._check_queries()
 
     def _check_queries(self) -> None:
-        rule, given = self.query_rule or QueryRule(), (self.label, self.query_rule, self.beta)
-        if not ALGORITHMS[self.method].learner_drives and given != ("per_state", None, _LEARNER_ALONE):
-            raise UsageError(f"method {self.method!r} has the expert drive throughout; leave out label, query and beta")
+        rule = self.query_rule or QueryRule()
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
         if self.label == "takeover" and self.query_rule is not None and self.query_rule.kind == "every":
@@ -87,6 +82,11 @@ class RunConfig:
             raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
         if rule.kind != "ensemble" and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
+
+    @property
+    def has_queries(self) -> bool:
+        """Whether label, query or beta is not the default: they are for rounds in which the learner drives."""
+        return (self.label, self.query_rule, self.beta) != ("per_state", None, _LEARNER_ALONE)
 
     def episodes(self, round_: int) -> int:
         """Return episodes of a round."""
@@ -99,33 +99,33 @@ class RunConfig:
 
     @property
     def query(self) -> QueryRule:
-        """When the expert is queried: everywhere; for `takeover` once; for `branch` for as many labels as steps."""
+        """The rule by which the expert is queried, by default one of the label mode.
+
+        `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
+        """
         if self.query_rule is not None or self.label == "per_state":
             return self.query_rule or QueryRule()
         return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)
 
 
-def check_sight(config: RunConfig) -> None:
-    """Raise `UsageError` unless what the policy sees is recorded, and nothing is pictured for a blind one."""
-    sees = config.fit.sees
-    if sees and config.cameras is None:
+def check_cameras(config: RunConfig) -> None:
+    """Raise `UsageError` unless pictures are rendered exactly where the policy takes some."""
+    takes_images = config.fit.takes_images
+    if takes_images and config.cameras is None:
         raise UsageError("the policy takes images, but none are rendered; give --cameras=front,wrist")
-    if config.cameras is not None and not sees:
+    if config.cameras is not None and not takes_images:
         raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
-    if sees and not ALGORITHMS[config.method].takes_images:
-        raise UsageError(
-            f"method {config.method!r} measures the learner's errors from state vectors; it is not for a policy on "
-            "images"
-        )
 
 
 def check_labels(config: RunConfig) -> None:
     """Raise `UsageError` for labels that the policy cannot learn from, or a query rule that it cannot answer.
 
-    The policy's own configuration is made for this, which imports LeRobot; it raises what is wrong with that, too.
+    LeRobot's configurations are made for this, which imports it; they raise what is wrong with them, too.
     """
+    from manip_il.learn.lerobot_config import LeRobotFit
+
     fit, plan = config.fit, config.fit.plan_length
-    fit.mlp(0) if fit.is_mlp else fit.other(0)
+    LeRobotFit(fit)
     name, rule = fit.policy.get("type", "mlp"), config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(

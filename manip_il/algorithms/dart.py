@@ -47,7 +47,7 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
     table = read_table(root, LEARNING_COLUMNS)
     learner = LearnedPolicy.load(policy, trust=trust)
     errors: list[F64] = []
-    for rows in _side_by_side(table[EPISODE_INDEX].reshape(-1)):  # a policy with a memory is asked in the order of time
+    for rows in _rows_by_step(table[EPISODE_INDEX].reshape(-1)):  # in the order of time, for a policy with a memory
         actions = learner.act(
             table[STATE][rows], table[ENVIRONMENT_STATE][rows], {}, table[EPISODE_INDEX][rows].tolist()
         )
@@ -58,8 +58,8 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
     return tuple(map(tuple, (off.T @ off / len(off)).tolist()))
 
 
-def _side_by_side(episodes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Rows of the first frame of every episode, of the second, and so on."""
+def _rows_by_step(episodes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Rows (R,) of the first frame of every episode, of the second, and so on."""
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
     steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(np.append(starts, len(episodes))))
     return [np.flatnonzero(steps == step) for step in range(int(steps.max()) + 1)]

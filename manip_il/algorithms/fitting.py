@@ -28,49 +28,62 @@ CHUNK_STEPS = 20_000  # of a round, for policies other than the mlp, where none 
 def fit_round(
     config: RunConfig, roots: Sequence[Path], folder: Path, init_from: Path | None, on_log: OnLog, member: int
 ) -> Path:
-    """Fit, or go on with fitting, a policy to datasets; the checkpoint's `pretrained_model`.
+    """Fit, or go on with fitting, a policy to datasets; return the checkpoint's `pretrained_model`.
 
     init_from: start there (see `refit`). on_log: sees the metrics, {} at a step without. member: of the ensemble,
     each from a seed of its own.
     """
-    fit = round_fit(config, init_from is not None)
+    fit, weights = round_fit(config, init_from, member), frame_weights(config, roots)
     if fit.is_mlp:
-        table = read_tables(roots, LEARNING_COLUMNS)
-        return fit_table(config, table, folder, init_from, on_log, member, frame_weights(config, roots))
-    from manip_il.learn.checkpoint import CheckpointMeta  # torch stays out of what only rolls out
-    from manip_il.learn.fit_policy import fit_policy
+        return fit_table(config, read_tables(roots, LEARNING_COLUMNS), folder, fit, on_log, weights)
+    from manip_il.learn.fit_policy import PolicyTrainer  # torch stays out of what only rolls out
 
-    wanted = fit.other(stream_base("training", config.seed) + member, init_from)
-    spec, fingerprint = env_spec(config.env, config.cameras), env_fingerprint(config.env, config.cameras)
-    look = asdict(config.cameras.look) if config.cameras is not None else None
-    meta = CheckpointMeta.of(spec, fingerprint, wanted.what_changes_the_weights(), wanted.observation, look)
-    weights = frame_weights(config, roots)
-    return fit_policy(roots, wanted, folder, meta=meta, on_step=on_log, resume=True, weights=weights)
+    trainer = PolicyTrainer(
+        roots,
+        fit,
+        folder,
+        spec=env_spec(config.env, config.cameras),
+        fingerprint=env_fingerprint(config.env, config.cameras),
+        look=asdict(config.cameras.look) if config.cameras is not None else None,
+        resume=True,
+        weights=weights,
+    )
+    return trainer.fit(on_log)
 
 
 def fit_table(
     config: RunConfig,
     table: Table,
     folder: Path,
-    init_from: Path | None = None,
+    fit: FitConfig | None = None,
     on_log: OnLog | None = None,
-    member: int = 0,
     weights: F64 | None = None,
 ) -> Path:
-    """Fit an mlp to `LEARNING_COLUMNS`, as every round's is fitted."""
-    from manip_il.learn.train import fit
+    """Fit an mlp to `LEARNING_COLUMNS`, as every round's is fitted; return the checkpoint's `pretrained_model`.
 
-    wanted = round_fit(config, init_from is not None).mlp(stream_base("training", config.seed) + member, init_from)
-    spec, fingerprint = env_spec(config.env), env_fingerprint(config.env)
-    return fit(table, wanted, folder, spec=spec, fingerprint=fingerprint, on_log=on_log, resume=True, weights=weights)
+    fit: the round's options, by default those of the first. weights: of the frames, (N,).
+    """
+    from manip_il.learn import train
+
+    return train.fit(
+        table,
+        fit or round_fit(config),
+        folder,
+        spec=env_spec(config.env),
+        fingerprint=env_fingerprint(config.env),
+        on_log=on_log,
+        resume=True,
+        weights=weights,
+    )
 
 
-def round_fit(config: RunConfig, warm: bool) -> FitConfig:
-    """Return the options of one round's fit."""
-    fit = config.fit
-    if fit.steps is None and not fit.is_mlp:
-        fit = replace(fit, steps=CHUNK_STEPS)
-    return replace(fit, steps=config.refit_steps) if warm and config.refit_steps is not None else fit
+def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
+    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble."""
+    steps = config.fit.steps or (None if config.fit.is_mlp else CHUNK_STEPS)
+    if init_from is not None:
+        steps = config.refit_steps or steps
+    seed = stream_base("training", config.seed) + member
+    return replace(config.fit, steps=steps, seed=seed, init_from=init_from)
 
 
 def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:

@@ -48,7 +48,7 @@ BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "jour
 
 @dataclass(frozen=True)
 class Watch:
-    """Calls by which a run tells how it goes. Raising in any of them ends the run; what is on disk stays."""
+    """Functions that a run calls with its progress. An exception from one ends the run; what is on disk stays."""
 
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
     on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
@@ -120,7 +120,7 @@ class Run:
         with self._timed("fit"):
             for member, start in enumerate(starts):
                 name = "fit" if config.ensemble == 1 else f"fit {member + 1} of {config.ensemble}"
-                self._watch.on_stage(name, round_, round_fit(config, start is not None).total_steps)
+                self._watch.on_stage(name, round_, round_fit(config, start).total_steps)
                 into = self._folder(round_) / (f"{POLICY}_{member}" if member else POLICY)
                 members.append(fit_round(config, roots, into, start, self._watch.on_log, member))
         self._fitted = Fitted(round_, tuple(members))

@@ -45,7 +45,10 @@ class Sampling:
         return self.demonstrations == self.corrections == self.rollouts
 
     def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
-        """Of every frame of a table with `COLUMNS`, (N,); None where all are the same. scale: see `action_gap`."""
+        """Return the weight of every frame of a table with `COLUMNS`, (N,); None where all are equal.
+
+        scale: see `action_gap`.
+        """
         if self.is_even:
             return None
         gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)

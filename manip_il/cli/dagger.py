@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.algorithms.table import ALGORITHMS, Method, run_algorithm
+from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
 from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
 from manip_il.cli.groups import (
     ENGINE_HELP,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report_data import LearningCurve, Report
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
-METHOD_HELP = f"who drives after round 0: {', '.join(one.who for one in ALGORITHMS.values())}"
+METHOD_HELP = f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
 FREE = ("workers", "engine", "output_dir", "trust")
 
 
@@ -156,7 +156,7 @@ class DaggerOptions:
         env = self.env.config(self.robot.type, self.task.type)
         cameras = self.image.config(self.cameras)
         from manip_il.algorithms.beta import BetaSchedule
-        from manip_il.algorithms.config import RunConfig, check_sight
+        from manip_il.algorithms.config import RunConfig, check_cameras
         from manip_il.algorithms.sampling import Sampling
         from manip_il.engine.query import QueryRule
 
@@ -171,7 +171,8 @@ class DaggerOptions:
             query_rule=None if self.query is None else QueryRule.parse(self.query),
             **{name: getattr(self, name) for name in own},
         )
-        check_sight(config)
+        check_cameras(config)
+        check_method(config)
         return config
 
     def _fit(self) -> FitConfig:

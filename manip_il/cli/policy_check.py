@@ -79,10 +79,9 @@ def _first_sight(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Ob
 
 def looks(cameras: CameraConfig, path: Path) -> str:
     """What a policy of pictures looks at, in words."""
-    from manip_il.learn.observation import observation_of
     from manip_il.learn.pretrained import read_interface
 
-    observation = observation_of(read_interface(path).columns)
+    observation = read_interface(path).observation
     lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
     size = f"{cameras.height} x {cameras.width} pixels"
     return f"observation {observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"

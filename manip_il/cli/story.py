@@ -69,7 +69,7 @@ def clone_with_labels(
     table = read_table(folder / "dataset", LEARNING_COLUMNS)
     so_far = np.cumsum(table[schema.LABEL_VALID])
     rows = int(np.searchsorted(so_far, labels)) + 1
-    stages.start("cloning with as many labels, fit", round_fit(config, False).total_steps)
+    stages.start("cloning with as many labels, fit", round_fit(config).total_steps)
     policy = fit_table(
         config, {key: column[:rows] for key, column in table.items()}, folder / "policy", on_log=stages.log
     )

@@ -26,9 +26,6 @@ from manip_il.learn.fit_config import MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, STEPS, 
 
 if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
-    from manip_il.learn.checkpoint import CheckpointMeta
-    from manip_il.learn.policy_config import PolicyFitConfig
-    from manip_il.learn.train import TrainConfig
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
@@ -92,10 +89,12 @@ class TrainOptions:
         """Read the dataset, fit, and say where the checkpoint is."""
         from manip_il.data.atomic import exclusive
         from manip_il.data.lerobot_io import read_fingerprint, read_spec
+        from manip_il.learn.lerobot_config import LeRobotFit
 
         if not _is_first_process():
             set_quiet(True)
-        config = self._config()
+        config = self._fit_config()
+        LeRobotFit(config)  # refuses what LeRobot would, before anything is written
         spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
         check_dataset(self.dataset.root, spec, fingerprint)
         with contextlib.ExitStack() as held:
@@ -104,79 +103,72 @@ class TrainOptions:
                 prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
                 if self.resume:
                     check_same_options(self.output_dir, self, _FREE)
-            path = self._fit(config, spec, fingerprint)
+            fit = self._fit_mlp if config.is_mlp else self._fit_policy
+            path = fit(config, spec, fingerprint)
         if _is_first_process():
             say(f"checkpoint: {path}")
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
 
-    def _config(self) -> TrainConfig | PolicyFitConfig:
-        fit, seed = self._fit_config()
-        return fit.mlp(seed) if fit.is_mlp else fit.other(seed)
-
-    def _fit_config(self) -> tuple[FitConfig, int]:
-        """What is asked for, and the seed of weights and batches."""
+    def _fit_config(self) -> FitConfig:
         from manip_il.seeding import stream_base
 
-        same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name != "eval_split"}
-        same["policy"] = start_policy(self.policy)
-        return FitConfig(**same, eval_split=self.dataset.eval_split), stream_base("training", self.seed)
-
-    def _fit(self, config: TrainConfig | PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.learn.train import TrainConfig
-
-        if isinstance(config, TrainConfig):
-            self._save_options()
-            with self._stages(config.save_freq) as stages:
-                return self._fit_mlp(config, spec, fingerprint, stages)
-        return self._fit_policy(config, spec, fingerprint)
+        made = ("policy", "eval_split", "seed", "init_from")
+        same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name not in made}
+        policy, seed = start_policy(self.policy), stream_base("training", self.seed)
+        return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
 
     def _save_options(self) -> None:
         if _is_first_process():
             save_options(self.output_dir, self)
 
-    def _stages(self, save_freq: int) -> Stages:
+    def _stages(self, config: FitConfig) -> Stages:
         from manip_il.cli.stages import Stages
 
-        return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
+        steps = config.steps_per_checkpoint
+        return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
-    def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
+    def _fit_mlp(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
         from manip_il.data.lerobot_io import read_table
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
-        table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
-        stages.start(f"train on {len(table['action']):,} frames", config.steps)
-        return fit(
-            table,
-            config,
-            self.output_dir,
-            spec=spec,
-            fingerprint=fingerprint,
-            on_log=stages.log,
-            resume=self.resume,
-            repo_id=f"local/{self.dataset.root.name}",
-        )
+        self._save_options()
+        with self._stages(config) as stages:
+            table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
+            stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
+            return fit(
+                table,
+                config,
+                self.output_dir,
+                spec=spec,
+                fingerprint=fingerprint,
+                on_log=stages.log,
+                resume=self.resume,
+                repo_id=f"local/{self.dataset.root.name}",
+            )
 
-    def _fit_policy(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.learn.fit_policy import PolicyTrainer
-        from manip_il.learn.threads import threads
-
-        root, meta = self.dataset.root, self._meta(config, spec, fingerprint)
-        with threads(config.threads):
-            with self._decoding() as seen:
-                trainer = PolicyTrainer(root, config, self.output_dir, meta, resume=self.resume, on_frames=seen)
-            self._save_options()  # now, as much of what can be wrong has been found by now
-            with self._stages(config.save_freq) as stages:
-                stages.start(f"train {config.policy.type} on {len(trainer.samples.train):,} samples", config.steps)
-                return trainer.fit(stages.log)
-
-    def _meta(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> CheckpointMeta:
+    def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
         from manip_il.data.lerobot_io import read_provenance
-        from manip_il.learn.checkpoint import CheckpointMeta
-        from manip_il.learn.observation import recorded_look
+        from manip_il.learn.checkpoint import recorded_look
+        from manip_il.learn.fit_policy import PolicyTrainer
 
-        look = recorded_look(read_provenance(self.dataset.root), fingerprint)
-        return CheckpointMeta.of(spec, fingerprint, config.what_changes_the_weights(), config.observation, look)
+        root = self.dataset.root
+        with self._decoding() as seen:
+            trainer = PolicyTrainer(
+                root,
+                config,
+                self.output_dir,
+                spec=spec,
+                fingerprint=fingerprint,
+                look=recorded_look(read_provenance(root), fingerprint),
+                resume=self.resume,
+                on_frames=seen,
+            )
+        self._save_options()  # now, as much of what can be wrong has been found by now
+        with self._stages(config) as stages:
+            kind, samples = trainer.lerobot.policy.type, len(trainer.samples.train)
+            stages.start(f"train {kind} on {samples:,} samples", config.total_steps)
+            return trainer.fit(stages.log)
 
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:

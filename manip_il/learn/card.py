@@ -11,7 +11,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 
 from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.learn.observation import observation_of
+from manip_il.learn.pretrained import observation_of
 
 CARD_FILE = "README.md"
 
@@ -41,9 +41,10 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
     policy = pipeline.policy
     assert policy is not None
     optimizer = pipeline.optimizer
-    sees = observation_of(policy.input_features or {})
+    inputs = policy.input_features or {}
+    names = ", ".join(f"`{key}`" for key in inputs)
     rows = [
-        ("policy", f"`{policy.type}`, sees `{sees}`: {', '.join(f'`{key}`' for key in policy.input_features or {})}"),
+        ("policy", f"`{policy.type}`, sees `{observation_of(inputs)}`: {names}"),
         ("robot, task", f"`{meta.robot}`, `{meta.task}`, {meta.fps} actions/s"),
         ("action", f"{meta.action_meaning}: {', '.join(meta.joint_names)}"),
         ("learnt from", f"{dataset.total_episodes:,} episodes, {dataset.total_frames:,} frames of `{dataset.repo_id}`"),
@@ -67,5 +68,5 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
 
 
 def _task_id(meta: CheckpointMeta) -> str:
-    """As the gymnasium ids have it: `PandaPickPlace-v0`."""
+    """The gymnasium id, `PandaPickPlace-v0`."""
     return "".join(word.capitalize() for word in f"{meta.robot}_{meta.task}".split("_")) + "-v0"

@@ -1,12 +1,20 @@
 """Checkpoints in LeRobot's layout, with what a policy was trained for beside the weights.
 
-    OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors
-                                                  policy_preprocessor.json policy_postprocessor.json manip_il.json
-                             /training_state/     optimizer_*.safetensors|json, training_step.json
+    OUTPUT/checkpoints/004000/pretrained_model/   config.json model.safetensors policy_*processor*.json|safetensors
+                                                  manip_il.json; but for the mlp train_config.json README.md
+                             /training_state/     optimizer_*.safetensors|json, training_step.json; but for the mlp
+                                                  scheduler and random state
     OUTPUT/checkpoints/last -> 004000
 
-A checkpoint is written under a temporary name and `last` is switched over in one rename, so a kill
-leaves the one before.
+A checkpoint is written under a temporary name and `last` is switched over in one rename, so that a kill leaves the one
+before. All but the mlp's go on with
+`lerobot-train --config_path=OUTPUT/checkpoints/last/pretrained_model/train_config.json --resume=true`, too.
+
+What is written beside data and policies, for whom: `spec` (names, sizes and rate that a dataset, an environment and a
+policy must share, a `RobotTaskSpec`); `fingerprint` (versions and hashes of the program and the scene that made
+something, compared in warnings); `provenance` (how a dataset was recorded, rendered or merged, kept with it);
+`CheckpointMeta` (the spec's names, the fingerprint and the options of the fit, in `manip_il.json`); `options` or
+settings (what a user asked for, by name).
 """
 
 from __future__ import annotations
@@ -16,21 +24,15 @@ import os
 import shutil
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from manip_il import checks
 from manip_il.data.atomic import umask
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.data.writing import writing
 from manip_il.errors import ManipError, MismatchError
-
-# LeRobot is imported where something is written: its import takes seconds, which a worker that
-# only acts need not spend.
-if TYPE_CHECKING:
-    import torch
-    from lerobot.policies.pretrained import PreTrainedPolicy
 
 META_FILE = "manip_il.json"
 PRETRAINED_MODEL = "pretrained_model"
@@ -51,9 +53,9 @@ _MUST_AGREE = {
 
 @dataclass(frozen=True)
 class CheckpointMeta:
-    """What a policy was trained for and how; `manip_il.json`.
+    """Robot, task and data that a policy was trained for, and the options of its fit; `manip_il.json`.
 
-    observation: what it sees, one of `learn.observation.OBSERVATIONS`. cameras, image_size: of the pictures that it was
+    observation: one of `learn.pretrained.OBSERVATIONS`. cameras, image_size: of the pictures that it was
     trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
     """
 
@@ -99,7 +101,7 @@ class CheckpointMeta:
     ) -> CheckpointMeta:
         """Return the meta of a policy trained on data of `spec`.
 
-        look: `learn.observation.recorded_look` of the dataset.
+        look: `recorded_look` of the dataset.
         """
         pictured = observation != "state"
         return cls(
@@ -155,32 +157,15 @@ def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
             raise MismatchError(what, "the policy", ours, f"{spec.robot}/{spec.task}", theirs)
 
 
-def save_checkpoint(
-    output_dir: Path,
-    step: int,
-    policy: PreTrainedPolicy,
-    meta: CheckpointMeta,
-    optimizer: torch.optim.Optimizer,
-    resume_key: Mapping[str, Any],
-) -> Path:
-    """Write the checkpoint of `step`, make it `last`, remove those before; return its `pretrained_model`.
+def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the light in which a dataset's pictures were made, as arguments of `sim.look.Look`; {} is the default.
 
-    resume_key: what a resumed run must share with this one (JSON values).
+    None where that is not known: another program's dataset, or one without pictures.
     """
-    from lerobot.optim.optimizers import save_optimizer_state
-
-    checkpoints = Path(output_dir) / "checkpoints"
-    final = checkpoints / f"{step:06d}"
-    with unpublished(final) as temporary:
-        _write_pretrained(temporary / PRETRAINED_MODEL, policy, meta)
-        state = temporary / TRAINING_STATE
-        state.mkdir()
-        save_optimizer_state(optimizer, state)
-        write_json(state / STEP_FILE, {"step": step, **resume_key})
-    for other in checkpoints.iterdir():
-        if not other.is_symlink() and other.name != final.name:
-            shutil.rmtree(other, ignore_errors=True)
-    return checkpoints / _LAST / PRETRAINED_MODEL
+    if "cameras_sha256" not in fingerprint:
+        return None
+    rendered = provenance.get("rendered", {}).get("cameras", {})  # `record` has the default light alone
+    return dict(rendered.get("look", {}))
 
 
 def last_checkpoint(output_dir: Path) -> Path | None:
@@ -212,14 +197,6 @@ def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) ->
             )
 
 
-def load_optimizer(checkpoint: Path, optimizer: torch.optim.Optimizer) -> None:
-    """Put the optimiser in the checkpoint's state."""
-    from lerobot.optim.optimizers import load_optimizer_state
-
-    with readable_state(checkpoint):
-        load_optimizer_state(optimizer, checkpoint / TRAINING_STATE)
-
-
 @contextmanager
 def readable_state(checkpoint: Path) -> Iterator[None]:
     """Turn what LeRobot, torch and safetensors raise for files that are not whole into `ManipError`."""
@@ -232,16 +209,6 @@ def readable_state(checkpoint: Path) -> Iterator[None]:
         raise ManipError(
             f"{checkpoint} cannot be resumed ({type(error).__name__}: {line}); start again with --overwrite=true"
         ) from error
-
-
-def _write_pretrained(folder: Path, policy: PreTrainedPolicy, meta: CheckpointMeta) -> None:
-    from lerobot.policies.factory import make_pre_post_processors
-
-    folder.mkdir(parents=True)
-    policy.save_pretrained(folder)
-    for processor in make_pre_post_processors(policy.config):
-        processor.save_pretrained(folder)
-    write_json(folder / META_FILE, asdict(meta))
 
 
 @contextmanager

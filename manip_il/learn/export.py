@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.augment import to_float
+from manip_il.learn.batches import to_float
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
@@ -129,7 +129,10 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
 
 
 def export_torchscript(path: Path, policy_sha256: str) -> Exported:
-    """Return the same as TorchScript: a module whose one argument is a dict of observations."""
+    """Return the policy in a `pretrained_model` folder as TorchScript, a module of one dict of observations.
+
+    Raises what `export_onnx` raises.
+    """
     policy, function, metadata = _load(path, policy_sha256)
     content = io.BytesIO()
     with warnings.catch_warnings():
@@ -153,14 +156,13 @@ def _without_source_paths(archive: bytes) -> bytes:
     return content.getvalue()
 
 
-def describe(policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str) -> dict[str, Any]:
-    """Return a file's metadata: what policy it is, for what, and its inputs and outputs.
-
-    What is not known is left out.
-    """
+def file_metadata(
+    policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str
+) -> dict[str, Any]:
+    """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
     meta, n = policy.meta, policy.interface.action
     outputs = [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))]
-    told: dict[str, Any] = {
+    entries: dict[str, Any] = {
         "robot": meta.robot if meta else None,
         "task": meta.task if meta else None,
         "control_rate_hz": meta.fps if meta else None,
@@ -171,7 +173,7 @@ def describe(policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[
         "policy_loss": config.get("loss"),
         "policy_sha256": sha256,
     }
-    return {key: value for key, value in told.items() if value is not None}
+    return {key: value for key, value in entries.items() if value is not None}
 
 
 def _input(policy: LearnedPolicy, key: str, meta: CheckpointMeta | None) -> dict[str, Any]:
@@ -189,18 +191,18 @@ def _input(policy: LearnedPolicy, key: str, meta: CheckpointMeta | None) -> dict
 def _numbers(key: str, size: int, names: Sequence[str] | None, units: Sequence[str | None] | None) -> dict[str, Any]:
     if names and len(names) != size:
         raise MismatchError(f"numbers in {key}", META_FILE, len(names), CONFIG, size)
-    told = {"name": key, "dtype": "float32", "shape": ["batch", size]}
-    told |= {"names": list(names)} if names else {}
-    return told | ({"units": list(units)} if units else {})
+    entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
+    entry |= {"names": list(names)} if names else {}
+    return entry | ({"units": list(units)} if units else {})
 
 
 def _joint_units(n: int) -> list[str]:
-    """Of joint state and action: the arm's joints, then the gripper's opening."""
+    """Units of joint state and action: the arm's joints, then the gripper's opening."""
     return ["rad"] * (n - 1) + ["m"]
 
 
 def _unit(name: str) -> str | None:
-    """Of a number of the environment state, by its name; None where that does not say."""
+    """Unit of a number of the environment state, by its name; None where that does not say."""
     return "1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2])
 
 
@@ -211,7 +213,7 @@ def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction
         raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
     policy = LearnedPolicy.load(path)
     function = PolicyFunction(policy)
-    return policy, function, describe(policy, config, function.inputs, policy_sha256)
+    return policy, function, file_metadata(policy, config, function.inputs, policy_sha256)
 
 
 def _observations(policy: LearnedPolicy, function: PolicyFunction, rows: int) -> Arrays:

@@ -1,36 +1,50 @@
-"""How a policy is to be fitted, as a user says it: the mlp by its own loop, every other one by LeRobot's means."""
+"""The options of a fit by LeRobot's names, and the names of policies and of their options.
+
+Names are read from the text of LeRobot's and our configuration files, so that a mistyped one is answered at once:
+importing the configurations themselves takes seconds.
+"""
 
 from __future__ import annotations
 
+import ast
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from manip_il.checks import read_json
-from manip_il.errors import UsageError
-from manip_il.learn.policy_names import check_names
-
-if TYPE_CHECKING:  # torch and LeRobot take seconds to import
-    from manip_il.learn.policy_config import PolicyFitConfig
-    from manip_il.learn.train import TrainConfig
+from manip_il.errors import UnknownName, UsageError
 
 MLP = "mlp"  # the one policy with a loop of its own
 MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
 STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
+# Where a policy's configuration is kept with what was meant for one machine or one command.
+NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
 _AT_LEAST_1 = ("steps", "batch_size", "threads", "log_freq", "save_freq")
 _AT_LEAST_0 = ("num_workers", "image_cache_gb")
+_REGISTERED = re.compile(r"""@PreTrainedConfig\.register_subclass\(\s*["'](\w+)["']""")
+_BASE = "PreTrainedConfig"
+_FEW = 12  # names that one line of an error may list
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Options by LeRobot's names; None is the default of the policy's kind.
+    """Options of a fit; None is the default of the policy's kind.
 
-    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). optimizer, scheduler:
-    in place of the policy's own. trust: whether models that the policy or its checkpoint names may be loaded.
+    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). observation: `state`,
+    `images` or `both`, what the policy sees. lr: peak learning rate. optimizer, scheduler: in place of the policy's
+    own. eval_split: share of the episodes held out. image_augment: random crops and colour jitter. image_cache_gb: how
+    large the cache of decoded pictures may grow; a dataset that does not fit goes through LeRobot's loader with
+    num_workers processes. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times
+    slower where none is. save_freq, log_freq: in steps. trust: whether models that the policy or its checkpoint names
+    may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder whose weights to start from.
 
-    Raises `UsageError` for a number out of range, `UnknownName` for a policy or an option of it that is not there.
+    Raises `UsageError` for a number out of range or an option that is not for the mlp, `UnknownName` for a policy or an
+    option of it that is not there.
     """
 
     policy: Mapping[str, Any] = field(default_factory=dict[str, Any])
@@ -50,6 +64,8 @@ class FitConfig:
     tensorboard: bool = False
     wandb: Mapping[str, Any] = field(default_factory=dict[str, Any])
     trust: bool = False
+    seed: int = 0
+    init_from: Path | None = None
 
     def __post_init__(self) -> None:
         for name, least in (*((name, 1) for name in _AT_LEAST_1), *((name, 0) for name in _AT_LEAST_0)):
@@ -60,11 +76,18 @@ class FitConfig:
             raise UsageError(f"dataset.eval_split is {self.eval_split}; expected at least 0 and less than 1")
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
-        check_names(self.policy, MLP)
-        if self.is_mlp and self.observation not in (None, "state"):
+        check_names(self.policy)
+        if self.is_mlp:
+            self._check_mlp()
+
+    def _check_mlp(self) -> None:
+        if self.observation not in (None, "state"):
             raise UsageError(
                 f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
             )
+        for name in ("optimizer", "scheduler"):
+            if getattr(self, name):
+                raise UsageError(f"--{name} is not for --policy.type=mlp, which has its own loop and schedule")
 
     @property
     def is_mlp(self) -> bool:
@@ -72,8 +95,8 @@ class FitConfig:
         return "path" not in self.policy and self.policy.get("type", MLP) == MLP
 
     @property
-    def sees(self) -> bool:
-        """Whether the policy looks at pictures; `ManipError` where that is for the checkpoint in `path` to say."""
+    def takes_images(self) -> bool:
+        """Whether pictures are among the policy's inputs. Raises `ManipError` for a `path` without a policy."""
         if self.is_mlp or self.observation is not None:
             return not self.is_mlp and self.observation != "state"
         path = self.policy.get("path")
@@ -83,76 +106,101 @@ class FitConfig:
     @property
     def total_steps(self) -> int:
         """Gradient steps."""
-        return self.steps if self.steps is not None else MLP_STEPS if self.is_mlp else STEPS
+        return self.steps or (MLP_STEPS if self.is_mlp else STEPS)
+
+    @property
+    def samples_per_step(self) -> int:
+        """Samples in the batch of a step."""
+        return self.batch_size or (MLP_BATCH_SIZE if self.is_mlp else BATCH_SIZE)
+
+    @property
+    def steps_per_checkpoint(self) -> int:
+        """Steps from one checkpoint to the next."""
+        return self.save_freq or (MLP_SAVE_FREQ if self.is_mlp else SAVE_FREQ)
+
+    @property
+    def peak_lr(self) -> float | None:
+        """Peak learning rate; None for that of the optimiser's preset."""
+        return MLP_LR if self.lr is None and self.is_mlp else self.lr
 
     @property
     def plan_length(self) -> int:
         """Actions that the policy plans at once: 1 for one that maps a state to an action."""
-        indices = None if self.is_mlp else self.other(0).policy.action_delta_indices
+        indices = self._lerobot_option("action_delta_indices")
         return len(indices) if indices else 1
 
     @property
     def dropped_frames(self) -> int:
         """Frames at an episode's end that the policy does not learn from."""
-        return 0 if self.is_mlp else getattr(self.other(0).policy, "drop_n_last_frames", 0)
+        return self._lerobot_option("drop_n_last_frames") or 0
 
-    def mlp(self, seed: int, init_from: Path | None = None) -> TrainConfig:
-        """For `manip_il.learn.train.fit`. Raises `UsageError` for what the mlp does not know."""
-        for name in ("optimizer", "scheduler"):
-            if getattr(self, name):
-                raise UsageError(f"--{name} is not for --policy.type=mlp, which has its own loop and schedule")
-        from lerobot.configs.default import WandBConfig
+    def _lerobot_option(self, name: str) -> Any:
+        """An attribute of the policy's configuration, which imports LeRobot; None for the mlp."""
+        if self.is_mlp:
+            return None
+        from manip_il.learn.lerobot_config import policy_config
 
-        from manip_il.learn.choices import plain, policy_config
-        from manip_il.learn.mlp.configuration_mlp import MLPConfig
-        from manip_il.learn.train import TrainConfig
+        return getattr(policy_config(self.policy, trust=self.trust), name, None)
 
-        policy = policy_config(self.policy, MLP)
-        assert isinstance(policy, MLPConfig)
-        return TrainConfig(
-            steps=self.total_steps,
-            batch_size=MLP_BATCH_SIZE if self.batch_size is None else self.batch_size,
-            lr=MLP_LR if self.lr is None else self.lr,
-            val_fraction=self.eval_split,
-            seed=seed,
-            threads=self.threads,
-            save_freq=MLP_SAVE_FREQ if self.save_freq is None else self.save_freq,
-            log_freq=self.log_freq,
-            init_from=init_from,
-            tensorboard=self.tensorboard,
-            wandb=plain(WandBConfig, self.wandb, "wandb"),
-            policy=policy,
-        )
 
-    def other(self, seed: int, init_from: Path | None = None) -> PolicyFitConfig:
-        """For `manip_il.learn.fit_policy`. init_from: weights to start from. Raises what `policy_config` raises."""
-        from lerobot.configs.default import WandBConfig
-        from lerobot.optim import LRSchedulerConfig, OptimizerConfig
+@cache
+def policy_files() -> Mapping[str, Path]:
+    """Return `--policy.type` -> file of its configuration, for every policy of LeRobot's and of this project."""
+    found = (Path(root) / "policies" for root in _lerobot_folders())
+    files = [file for root in (*found, Path(__file__).parent) for file in root.glob("*/configuration_*.py")]
+    return {kind: file for file in sorted(files) for kind in _REGISTERED.findall(file.read_text(encoding="utf-8"))}
 
-        from manip_il.learn.augment import Augment
-        from manip_il.learn.choices import choice, plain, policy_config
-        from manip_il.learn.policy_config import PolicyFitConfig
 
-        policy = policy_config(self.policy, trust=self.trust)
-        if init_from is not None:
-            policy.pretrained_path = init_from
-        return PolicyFitConfig(
-            policy=policy,
-            steps=self.total_steps,
-            batch_size=BATCH_SIZE if self.batch_size is None else self.batch_size,
-            seed=seed,
-            observation=self.observation or ("images" if policy.type == "cnn" else "state"),
-            eval_split=self.eval_split,
-            lr=self.lr,
-            optimizer=choice(OptimizerConfig, self.optimizer, "optimizer") if self.optimizer else None,
-            scheduler=choice(LRSchedulerConfig, self.scheduler, "scheduler") if self.scheduler else None,
-            augment=Augment() if self.image_augment else None,
-            image_cache_gb=self.image_cache_gb,
-            num_workers=self.num_workers,
-            threads=self.threads,
-            log_freq=self.log_freq,
-            save_freq=SAVE_FREQ if self.save_freq is None else self.save_freq,
-            tensorboard=self.tensorboard,
-            wandb=plain(WandBConfig, self.wandb, "wandb"),
-            trust=self.trust,
-        )
+def policy_options(kind: str) -> tuple[str, ...]:
+    """Return the names of a policy type's options, sorted; none where its configuration is of another form."""
+    own, classes = (_classes(policy_files()[one]) for one in ("mlp", kind))
+    name = next((name for name, one in classes.items() if kind in _registered(one)), "")
+    classes = own | classes  # the cnn's options are the mlp's, and some
+    names: set[str] = set()
+    while name != _BASE:
+        if name not in classes:
+            return ()
+        names |= set(_fields(classes[name]))
+        bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name)]
+        name = bases[0] if len(bases) == 1 else ""
+    base = next((_classes(Path(root) / "configs" / "policies.py") for root in _lerobot_folders()), {}).get(_BASE)
+    return () if base is None else tuple(sorted({*names, *_fields(base)} - {*NOT_OURS}))
+
+
+def check_names(settings: Mapping[str, Any]) -> None:
+    """Raise `UnknownName` for a type or an option of `--policy.*` that is not there; a `path` is not read."""
+    if "path" in settings:
+        return
+    kind = settings.get("type", MLP)
+    if not isinstance(kind, str) or kind not in policy_files():
+        raise UnknownName("policy", str(kind), policy_files())
+    known = policy_options(kind)
+    for name in settings:
+        if known and name not in (*known, "type"):
+            hint = f"manip-il train --policy.type={kind} --help lists all" if len(known) > _FEW else ""
+            raise UnknownName(f"option of --policy.type={kind}:", name, known, hint)
+
+
+def _lerobot_folders() -> list[str]:
+    """Folders of LeRobot's package, found without importing it."""
+    spec = find_spec("lerobot")
+    return list(spec.submodule_search_locations or []) if spec is not None else []
+
+
+@cache
+def _classes(file: Path) -> dict[str, ast.ClassDef]:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+def _registered(node: ast.ClassDef) -> list[str]:
+    return [name for one in node.decorator_list for name in _REGISTERED.findall(f"@{ast.unparse(one)}")]
+
+
+def _fields(node: ast.ClassDef) -> Iterator[str]:
+    """Annotated names in a dataclass's body that are options."""
+    for line in node.body:
+        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+            text = ast.unparse(line)
+            if "ClassVar[" not in text and "init=False" not in text:
+                yield line.target.id

@@ -11,6 +11,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,115 +19,104 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
-from lerobot.common.train_utils import load_training_state
+from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
+from lerobot.configs import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
 from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
+from manip_il.learn.batches import order_of, pictures_to_float, prefetched
 from manip_il.learn.card import write_card
 from manip_il.learn.checkpoint import (
+    META_FILE,
     PRETRAINED_MODEL,
+    STEP_FILE,
+    TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
     last_checkpoint,
     read_step,
     readable_state,
+    unpublished,
+    write_json,
 )
-from manip_il.learn.lerobot_checkpoint import Progress, save_lerobot_checkpoint
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import LeRobotFit, set_features
+from manip_il.learn.lerobot_policy import build_policy, build_processors
+from manip_il.learn.limits import threads
 from manip_il.learn.metrics import Writer, metric_writers
-from manip_il.learn.order import batches_of, order_of
-from manip_il.learn.policy_config import PolicyFitConfig
-from manip_il.learn.prefetch import prefetched
-from manip_il.learn.setup import Samples, build_policy, build_processors, load_samples, set_features
-from manip_il.learn.sources import Batch, pictures_to_float
-from manip_il.learn.threads import threads
+from manip_il.learn.samples import Batch, load_samples
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
 
 
-def fit_policy(
-    root: Path | Sequence[Path],
-    config: PolicyFitConfig,
-    output_dir: Path,
-    *,
-    meta: CheckpointMeta,
-    on_step: Callable[[dict[str, Any]], None] | None = None,
-    on_frames: Callable[[int], None] | None = None,
-    resume: bool = False,
-    weights: F64 | None = None,
-) -> Path:
-    """Clone the labels of the dataset in `root`, or of several; return `output_dir/checkpoints/last/pretrained_model`.
-
-    meta: what the policy is trained for. weights: how often each frame is drawn, relative to the others, (N,); by
-    default each once an epoch. on_step: called after every step, with the metrics where there are some,
-    else with {}; an exception from it ends the fit, `KeyboardInterrupt` after a checkpoint. on_frames: sees how many
-    frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
-    resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
-
-    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is
-    resumed on other data or options, `NotFiniteError` for data or a loss that is not finite, and what the policy
-    refuses as `ManipError`.
-    """
-    with threads(config.threads):
-        trainer = PolicyTrainer(root, config, output_dir, meta, resume=resume, on_frames=on_frames, weights=weights)
-        return trainer.fit(on_step)
-
-
 class PolicyTrainer:
-    """Policy, processors, optimiser and data of one run; `run()` yields once a step."""
+    """Policy, processors, optimiser and data of one run that clones the labels of the dataset in `root`, or of several.
+
+    spec, fingerprint, look: see `CheckpointMeta.of`. weights: how often each frame is drawn, relative to the others,
+    (N,); by default each once an epoch. on_frames: sees how many frames more have been decoded into the cache. On one
+    CPU the same data, config and threads give the same bits, resumed or not. Started by `accelerate launch` or
+    `torchrun`, every process takes `batch_size` samples a step.
+
+    Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
+    on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
+    """
 
     def __init__(
         self,
         root: Path | Sequence[Path],
-        config: PolicyFitConfig,
+        config: FitConfig,
         output_dir: Path,
-        meta: CheckpointMeta,
         *,
+        spec: RobotTaskSpec,
+        fingerprint: Mapping[str, Any] | None = None,
+        look: Mapping[str, Any] | None = None,
         resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
         weights: F64 | None = None,
     ):
-        self.config, self.output_dir, self.meta = config, output_dir, meta
-        self.accelerator = _accelerator(config)
+        self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config)
+        options, observation = self.lerobot.resume_options(), self.lerobot.observation
+        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look)
+        self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir)
         if checkpoint is not None and not resume:
             raise FolderExistsError(output_dir)
         roots = [root] if isinstance(root, Path) else list(root)
         self.dataset = read_metadata(*roots)
-        set_features(config.policy, self.dataset, config.observation)
-        self.options = config.what_changes_the_weights()
+        set_features(self.lerobot.policy, self.dataset, observation)
+        self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
-            self.samples: Samples = load_samples(roots, config, self.dataset, on_frames)
+            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
         self.digest = _digest(self.samples.digest, weights)
         if checkpoint is not None:
             check_same_run(checkpoint, self.digest, self.options)
-        self.pipeline = config.lerobot(self.dataset.repo_id, str(roots[-1]), output_dir)
+        self.pipeline = self.lerobot.pipeline(self.dataset.repo_id, str(roots[-1]), output_dir)
+        self.steps, self.batch_size = config.total_steps, config.samples_per_step
         self.step = 0
-        self._build(checkpoint)
+        with threads(config.threads):
+            self._build(checkpoint)
         world = self.accelerator.num_processes
         drawn = weights[self.samples.train] if weights is not None else None
-        self._order = order_of(len(self.samples.train), drawn, config.batch_size * world, config.seed)
+        self._order = order_of(len(self.samples.train), drawn, self.batch_size * world, config.seed)
 
     def _build(self, checkpoint: Path | None) -> None:
-        config = self.config
-        set_seed(config.seed)
-        if checkpoint is not None:
-            config.policy.pretrained_path = checkpoint / PRETRAINED_MODEL
-        policy = build_policy(config.policy, self.dataset)
+        config = self.lerobot.policy
+        set_seed(self.config.seed)
         before = checkpoint / PRETRAINED_MODEL if checkpoint is not None else None
-        self.preprocessor, self.postprocessor = build_processors(
-            config.policy, self.dataset, before, trust=config.trust
-        )
-        optimizer = config.resolved_optimizer().build(policy.get_optim_params())
+        if before is not None:
+            config.pretrained_path = before
+        policy = build_policy(config, self.dataset)
+        self.preprocessor, self.postprocessor = build_processors(config, self.dataset, before, trust=self.config.trust)
+        optimizer = self.lerobot.optimizer().build(policy.get_optim_params())
         if not isinstance(optimizer, torch.optim.Optimizer):
-            raise UsageError(
-                f"--policy.type={config.policy.type} needs several optimisers; train it with lerobot-train"
-            )
-        schedule = config.resolved_scheduler()
-        scheduler = schedule.build(optimizer, config.steps) if schedule is not None else None
+            raise UsageError(f"--policy.type={config.type} needs several optimisers; train it with lerobot-train")
+        schedule = self.lerobot.scheduler()
+        scheduler = schedule.build(optimizer, self.steps) if schedule is not None else None
         if checkpoint is not None:
             read_step(checkpoint)
             with readable_state(checkpoint):
@@ -134,19 +124,22 @@ class PolicyTrainer:
         self.policy, self.optimizer, self.scheduler = self.accelerator.prepare(policy, optimizer, scheduler)
 
     def fit(self, on_step: Callable[[dict[str, Any]], None] | None = None) -> Path:
-        """Take the steps that are left, with metrics and checkpoints; see `fit_policy`."""
-        config = self.config
-        with self._open_metrics() as writers:
+        """Take the steps that are left, with metrics and checkpoints; return the last one's `pretrained_model`.
+
+        on_step: called after every step, with the metrics where there are some, else with {}; an exception from it ends
+        the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
+        """
+        with threads(self.config.threads), self._open_metrics() as writers:
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
-                saved = self.step % config.save_freq == 0 or self.step == config.steps
+                saved = self.step % self.config.steps_per_checkpoint == 0 or self.step == self.steps
                 if saved:
                     self.save(record)
                 try:
                     if on_step is not None:
                         on_step(record)
-                except KeyboardInterrupt:  # asked for between two steps: nothing is lost
+                except KeyboardInterrupt:  # by the user, between two steps: nothing is lost
                     if not saved:
                         self.save(record)
                     raise
@@ -155,17 +148,17 @@ class PolicyTrainer:
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
-        config, log = self.config, _Log(self.config.batch_size * self.accelerator.num_processes)
+        log = _Log(self.batch_size * self.accelerator.num_processes)
         batches = self.samples.source.batches(self._rows_of(step) for step in itertools.count(self.step))
         self.policy.train()
-        with prefetched(itertools.islice(batches, config.steps - self.step)) as ready:
-            while self.step < config.steps:
+        with prefetched(itertools.islice(batches, self.steps - self.step)) as ready:
+            while self.step < self.steps:
                 started = time.perf_counter()
                 batch = next(ready)
                 waited = time.perf_counter() - started
                 log.add(self._update(batch), waited)
                 self.step += 1
-                if self.step % config.log_freq and self.step != config.steps:
+                if self.step % self.config.log_freq and self.step != self.steps:
                     yield {}
                     continue
                 yield {"step": self.step, **log.take(), "lr": self._lr()} | self.validate()
@@ -180,7 +173,8 @@ class PolicyTrainer:
         total = 0.0
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
             torch.manual_seed(self.config.seed)  # a policy that draws (diffusion) draws the same every time
-            pieces = batches_of(held_out, self.config.batch_size)
+            size = self.batch_size
+            pieces = [held_out[start : start + size] for start in range(0, len(held_out), size)]
             for rows, batch in zip(pieces, self.samples.source.batches(pieces), strict=True):
                 loss, _ = policy.forward(self.preprocessor(pictures_to_float(batch, self.samples.cameras)))
                 total += loss.item() * len(rows)
@@ -190,15 +184,18 @@ class PolicyTrainer:
     def save(self, record: Mapping[str, Any]) -> None:
         """Write a checkpoint of this step and make it the last one. record: metrics for the model card."""
         if self.accelerator.is_main_process:
-            progress = Progress(self.step, self.config.steps, self.digest, self.options)
-            parts = (self.accelerator.unwrap_model(self.policy), self.preprocessor, self.postprocessor)
-            state = (self.optimizer, self.scheduler)
-            with save_lerobot_checkpoint(self.output_dir, progress, parts, state, self.pipeline, self.meta) as folder:
-                write_card(folder, self.pipeline, self.meta, self.dataset, record)
+            policy = self.accelerator.unwrap_model(self.policy)
+            own = {"data": self.digest, "options": self.options, "batch_size": self.batch_size}
+            with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
+                state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
+                save_checkpoint(new, self.step, self.pipeline, policy, *state, *processors)
+                write_json(new / PRETRAINED_MODEL / META_FILE, asdict(self.meta))
+                write_json(new / TRAINING_STATE / STEP_FILE, read_step(new) | own)
+                write_card(new / PRETRAINED_MODEL, self.pipeline, self.meta, self.dataset, record)
         self.accelerator.wait_for_everyone()
 
     def _open_metrics(self) -> contextlib.AbstractContextManager[list[Writer]]:
-        """Where metrics go, in the main process."""
+        """Open what metrics are written to, in the main process alone."""
         if not self.accelerator.is_main_process:
             return contextlib.nullcontext([])
         return metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
@@ -223,21 +220,22 @@ class PolicyTrainer:
         return numbers | {"loss": value, "grad_norm": math.nan if norm is None else float(norm)}
 
     def _augmented(self, batch: Batch) -> Batch:
-        """Pictures on the device, shifted and recoloured by draws that depend on seed, step and process alone."""
+        """Put pictures on the device, shifted and recoloured by draws that depend on seed, step and process alone."""
         cameras = self.samples.cameras
         if not cameras:
             return batch
         device = self.accelerator.device
         batch = batch | {key: batch[key].to(device, non_blocking=True) for key in cameras}
-        if self.config.augment is None or batch[cameras[0]].dtype != torch.uint8:
+        augment = self.lerobot.augment
+        if augment is None or batch[cameras[0]].dtype != torch.uint8:
             return pictures_to_float(batch, cameras)
         key = [self.config.seed, self.step, self.accelerator.process_index]
         generator = torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
-        return batch | {camera: self.config.augment(batch[camera], generator) for camera in cameras}
+        return batch | {camera: augment(batch[camera], generator) for camera in cameras}
 
     def _rows_of(self, step: int) -> I64:
         """The samples of this process at a step."""
-        size, place = self.config.batch_size, self.accelerator.process_index
+        size, place = self.batch_size, self.accelerator.process_index
         rows = self._order.batch(step).numpy()[place * size : (place + 1) * size]
         return self.samples.train[rows]
 
@@ -245,7 +243,7 @@ class PolicyTrainer:
         return float(self.optimizer.param_groups[0]["lr"])
 
     def _clip(self) -> float:
-        norm = self.config.resolved_optimizer().grad_clip_norm
+        norm = self.lerobot.optimizer().grad_clip_norm
         return norm if norm > 0 else math.inf
 
 
@@ -282,14 +280,14 @@ class _Log:
         return means | rates
 
 
-def _accelerator(config: PolicyFitConfig) -> Accelerator:
+def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     """As lerobot-train makes it: half precision by the policy's `dtype`, else by its `use_amp`."""
-    precision = _HALF_PRECISION.get(getattr(config.policy, "dtype", None) or "", "no")
-    if not hasattr(config.policy, "dtype") and config.policy.use_amp:
-        precision = "bf16" if config.policy.device == "cpu" else "fp16"
+    precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
+    if not hasattr(policy, "dtype") and policy.use_amp:
+        precision = "bf16" if policy.device == "cpu" else "fp16"
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
-        cpu=config.policy.device == "cpu",
+        cpu=policy.device == "cpu",
         kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
     )

@@ -1,8 +1,8 @@
-"""Any LeRobot policy, for many episodes at once.
+"""LeRobot's policies: made for a fit, and loaded to act in many episodes at once.
 
-LeRobot's policies keep what they remember (queues of actions, past observations, ensembles) as plain attributes, one
-for all rows of a batch. Here every episode has a copy of its own that shares the weights, and is asked alone: it plans
-at its own clock, and its actions are the same bits whatever runs beside it.
+They keep what they remember (queues of actions, past observations, ensembles) as plain attributes, one for all rows of
+a batch. Here every episode has a copy of its own that shares the weights and acts alone: it plans at its own clock, and
+its actions are the same bits whatever runs beside it.
 """
 
 from __future__ import annotations
@@ -15,22 +15,35 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
 
 import draccus
 import numpy as np
 import torch
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_policy, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
+from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError, UnknownName
-from manip_il.learn.choices import policy_class, policy_types
+from manip_il.learn.checkpoint import readable_state
+from manip_il.learn.lerobot_config import policy_class, policy_types
 from manip_il.learn.limits import Budget, check_numbers
-from manip_il.learn.pretrained import CONFIG, PROCESSORS, WEIGHTS, check_processors, processor_steps
-from manip_il.learn.trust import PLAIN, require_trust
+from manip_il.learn.pretrained import (
+    CONFIG,
+    PLAIN,
+    PROCESSORS,
+    WEIGHTS,
+    check_processors,
+    processor_steps,
+    read_config,
+    require_trust,
+)
 
 Batch = dict[str, Any]
 _DEVICE_STEP = "device_processor"
 _LONGEST = 300  # characters of another program's message
+_SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
 
 
 @dataclass(slots=True)
@@ -40,9 +53,9 @@ class _Memory:
 
 
 class EpisodePolicy:
-    """A LeRobot policy with its processors; remembers each episode apart.
+    """A LeRobot policy with its processors and one memory an episode.
 
-    task: what a policy that reads language is told to do.
+    module: the policy without a memory of any episode. task: instruction for one that reads language.
     """
 
     def __init__(
@@ -53,15 +66,10 @@ class EpisodePolicy:
         task: str = "",
     ):
         policy.reset()
-        self._fresh, self._before, self._after, self._task = policy, before, after, task
+        self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
         self._memories: dict[int, _Memory] = {}
-
-    @property
-    def module(self) -> PreTrainedPolicy:
-        """LeRobot's policy, which has seen no episode."""
-        return self._fresh
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
@@ -76,13 +84,13 @@ class EpisodePolicy:
         return torch.cat([action.to("cpu", torch.float32) for action in actions])
 
     def forget(self, episodes: Iterable[int]) -> None:
-        """Drop what is remembered of these."""
+        """Drop the memory of these episodes."""
         for episode in episodes:
             self._memories.pop(episode, None)
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
         if episode not in self._memories:
-            self._memories[episode] = _Memory(copy.deepcopy(self._fresh, dict(self._shared)))
+            self._memories[episode] = _Memory(copy.deepcopy(self.module, dict(self._shared)))
         memory = self._memories[episode]
         with _drawing(episode, memory.step, self._device):
             seen = self._before({**row, "task": [self._task]})
@@ -93,7 +101,7 @@ class EpisodePolicy:
 
     def _precision(self) -> contextlib.AbstractContextManager[Any]:
         """Mixed, where the policy was trained so, as lerobot-eval has it."""
-        return torch.autocast(self._device.type) if self._fresh.config.use_amp else contextlib.nullcontext()
+        return torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
@@ -140,7 +148,7 @@ def _load(path: Path, settings: Mapping[str, Any], device: str) -> tuple[PreTrai
 
 
 def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
-    """What copies have in common, as `deepcopy` wants it: weights, buffers, torch's own layers, the configuration."""
+    """The parts that copies share, as a memo of `deepcopy`: weights, buffers, torch's own layers, the configuration."""
     shared: dict[int, Any] = {id(policy.config): policy.config}
     for tensor in itertools.chain(policy.parameters(), policy.buffers()):
         shared[id(tensor)] = tensor
@@ -167,3 +175,73 @@ def _drawing(episode: int, step: int, device: torch.device) -> Iterator[None]:
 def _line(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
+
+def build_policy(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
+    """Return LeRobot's policy, its weights new or from `config.pretrained_path`.
+
+    Raises `ManipError` for a checkpoint that cannot be loaded, and with the two ways out where a backbone's weights
+    would have to be downloaded and cannot be.
+    """
+    weights = getattr(config, "pretrained_backbone_weights", None)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints, and standard output belongs to the caller
+            policy = make_policy(config, ds_meta=meta) if config.pretrained_path is None else _loaded(config, meta)
+    except (URLError, OSError) as error:
+        if not weights or isinstance(error, FileNotFoundError):
+            raise
+        raise ManipError(
+            f"cannot download {weights} ({error}): train from scratch with --policy.pretrained_backbone_weights=null, "
+            f"or put the file that torchvision names into {torch.hub.get_dir()}/checkpoints"
+        ) from error
+    except ImportError as error:
+        raise ManipError(f"--policy.type={config.type} needs more packages: {error}") from error
+    if weights:  # a checkpoint has its own: it shall load where there is no network
+        config.pretrained_backbone_weights = None  # pyright: ignore[reportAttributeAccessIssue]
+    config.pretrained_path = None
+    return policy
+
+
+def _loaded(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
+    """The policy with the weights in `config.pretrained_path`."""
+    path = Path(str(config.pretrained_path))
+    try:
+        with Budget(path / WEIGHTS) if config.type in PLAIN else contextlib.nullcontext():
+            return make_policy(config, ds_meta=meta)
+    except ImportError:
+        raise
+    except Exception as error:  # weights from anywhere, read by the code of any policy: errors of every kind
+        raise ManipError(f"{path} does not fit this policy: {type(error).__name__}: {_line(error)}") from error
+
+
+def build_processors(
+    config: PreTrainedConfig, meta: Any, checkpoint: Path | None, *, trust: bool = False
+) -> tuple[Any, Any]:
+    """Return LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
+
+    Raises what `require_trust` raises for the checkpoint's, and `ManipError` where they cannot be read.
+    """
+    if checkpoint is None:
+        return make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+    check_processors(checkpoint)
+    require_trust(read_config(checkpoint), str(checkpoint), trust, checkpoint)
+    device = {"device_processor": {"device": config.device}}
+    with readable_state(checkpoint):
+        return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
+
+
+def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return a dataset's statistics with a least deviation and range for vectors.
+
+    Without it, a joint that hardly moved in the data would be many deviations off wherever it does move.
+    """
+    usable: dict[str, dict[str, Any]] = {}
+    for key, values in stats.items():
+        usable[key] = own = {name: np.array(value) for name, value in values.items()}
+        if key.startswith(IMAGES) or "std" not in own:
+            continue
+        own["std"] = np.maximum(own["std"], _SMALLEST["std"])
+        for low, high in (("min", "max"), ("q01", "q99"), ("q10", "q90")):
+            if low in own and high in own:
+                own[high] = np.maximum(own[high], own[low] + _SMALLEST["range"])
+    return usable

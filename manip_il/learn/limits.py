@@ -1,16 +1,18 @@
-"""How large a network may become that a checkpoint asks for: no larger than the weights that lie beside it.
+"""Limits of what torch takes: memory for the network that a checkpoint asks for, and threads.
 
-A few bytes of `config.json` can ask for a thousand million layers. Numbers are checked before LeRobot sees them, and
-what is made of them is counted while it is made.
+A few bytes of `config.json` can ask for a thousand million layers. Its numbers are checked before LeRobot sees them,
+and the tensors made of them are counted while they are made: no more than belong to the weights beside it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, override
 
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -36,12 +38,12 @@ _A_TENSOR = 1_000  # what a tensor counts for beside its numbers: layers of noth
 _BESIDE = 2**26  # numbers that are not saved with the weights: tables of positions, masks
 
 
-def check_numbers(settings: Mapping[str, Any], where: str) -> None:
+def check_numbers(settings: Mapping[str, Any], source: str) -> None:
     """Raise `ManipError` for a whole number among a policy's options that no policy has."""
     for name, value in settings.items():
         if name not in _ELSEWHERE:
             training = name.startswith(_OF_TRAINING)
-            _check(f"{where}: {name}", value, _MOST_OF_TRAINING if training else _LARGEST.get(name, LARGEST))
+            _check(f"{source}: {name}", value, _MOST_OF_TRAINING if training else _LARGEST.get(name, LARGEST))
 
 
 def _check(what: str, value: Any, most: int) -> None:
@@ -56,7 +58,7 @@ def _check(what: str, value: Any, most: int) -> None:
 
 
 class Budget(TorchDispatchMode):
-    """While active, no more tensors may be made than twice those saved in a file of weights, and some beside.
+    """A limit while it is active: no more tensors than twice those saved in a file of weights, and some beside.
 
     Raises `ManipError` before the memory is taken.
     """
@@ -81,9 +83,25 @@ def _is_size(values: Any) -> bool:
 
 
 def _stored(weights: Path) -> int:
-    """What the tensors in a file of weights count for."""
+    """Numbers in a file of weights, with `_A_TENSOR` more for each of its tensors."""
     try:
         with safe_open(weights, framework="pt") as file:
             return sum(_A_TENSOR + math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise ManipError(f"{weights.name} cannot be read: {error}") from error
+
+
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Let torch use `count` threads inside.
+
+    Its threads wait by spinning: two on one free core are tens of times slower than one.
+    """
+    before = torch.get_num_threads()
+    if before != count:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        if before != count:
+            torch.set_num_threads(before)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import override
 
 import numpy as np
@@ -34,12 +33,10 @@ _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Head(ABC):
-    """A family of action distributions."""
+    """A family of action distributions. n: numbers in an action. size: parameters a row."""
 
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """Parameters a row."""
+    n: int
+    size: int
 
     @abstractmethod
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -55,7 +52,7 @@ class Distribution(Head):
 
     @abstractmethod
     def draw(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """What one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
+        """Draw what one sample is made from, (m,): uniform numbers in [0, 1) and standard normal ones."""
 
     @abstractmethod
     def sample(self, params: Tensor, draws: Tensor) -> Tensor:
@@ -66,16 +63,11 @@ class Distribution(Head):
         return -self.nll(params, target)
 
 
-@dataclass(frozen=True)
 class MSEHead(Head):
     """Mean squared error: a Gaussian with unit variance, up to constants. Acts with its mean."""
 
-    n: int
-
-    @property
-    @override
-    def size(self) -> int:
-        return self.n
+    def __init__(self, n: int) -> None:
+        self.n = self.size = n
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -86,7 +78,6 @@ class MSEHead(Head):
         return params
 
 
-@dataclass(frozen=True)
 class L1Head(MSEHead):
     """Mean absolute error: a Laplace distribution with unit scale, up to constants. Acts with its median."""
 
@@ -106,13 +97,8 @@ class GaussianHead(Distribution, nn.Module):
 
     def __init__(self, n: int) -> None:
         super().__init__()
-        self.n = n
+        self.n = self.size = n
         self.raw_log_std = nn.Parameter(torch.zeros(n))
-
-    @property
-    @override
-    def size(self) -> int:
-        return self.n
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -131,7 +117,6 @@ class GaussianHead(Distribution, nn.Module):
         return params + floored_log_std(self.raw_log_std).exp() * draws.to(params.dtype)
 
 
-@dataclass(frozen=True)
 class MixtureHead(Distribution):
     """Mixture of `components` diagonal Gaussians (Bishop, Mixture density networks, 1994).
 
@@ -139,13 +124,8 @@ class MixtureHead(Distribution):
     round an obstacle, where no demonstration goes.
     """
 
-    n: int
-    components: int
-
-    @property
-    @override
-    def size(self) -> int:
-        return self.components * (1 + 2 * self.n)
+    def __init__(self, n: int, components: int) -> None:
+        self.n, self.components, self.size = n, components, components * (1 + 2 * n)
 
     def split(self, params: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log-weights (B, K), means (B, K, n), log-deviations (B, K, n)."""
@@ -180,7 +160,6 @@ class MixtureHead(Distribution):
         return values.gather(-2, component.unsqueeze(-1).expand(*values.shape[:-2], 1, self.n)).squeeze(-2)
 
 
-@dataclass(frozen=True)
 class CategoricalHead(Distribution):
     """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
 
@@ -191,13 +170,8 @@ class CategoricalHead(Distribution):
     expectation over all bins. A sample is a bin's centre.
     """
 
-    n: int
-    bins: int
-
-    @property
-    @override
-    def size(self) -> int:
-        return self.n * self.bins
+    def __init__(self, n: int, bins: int) -> None:
+        self.n, self.bins, self.size = n, bins, n * bins
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
@@ -250,7 +224,7 @@ def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
 
 
 def floored_log_std(raw: Tensor) -> Tensor:
-    """Return log-deviation that goes smoothly to `MIN_LOG_STD` from above."""
+    """Return log-deviations of the shape of `raw`, (B, n), that go smoothly to `MIN_LOG_STD` from above."""
     return MIN_LOG_STD + softplus(raw - MIN_LOG_STD)
 
 

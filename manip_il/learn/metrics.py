@@ -1,4 +1,4 @@
-"""Where a fit's metrics go: always a file of JSON lines; TensorBoard and Weights & Biases on request."""
+"""Metrics of a fit: always a file of JSON lines; TensorBoard and Weights & Biases on request."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Writer = Callable[[Record], None]
 
 @contextmanager
 def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPipelineConfig) -> Iterator[list[Writer]]:
-    """What a fit calls with each record: the file of lines, and what else the user asked for.
+    """Give the functions to call with each record: of the file of lines, and of what else the user asked for.
 
     step: the fit goes on from there. curves: for TensorBoard. pipeline: with the options for Weights & Biases. Raises
     `UsageError` where one of them is not installed.
@@ -44,10 +44,7 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 
 @contextmanager
 def json_lines(path: Path, step: int) -> Iterator[Writer]:
-    """A function that adds a line, null where a number is not finite.
-
-    Lines after `step`, of a run that was killed, go first.
-    """
+    """Give a function that adds a line, null where a number is not finite; lines after `step` are dropped first."""
     kept = []
     if path.is_file() and step > 0:
         for line in path.read_text(errors="replace").splitlines():
@@ -65,7 +62,7 @@ def json_lines(path: Path, step: int) -> Iterator[Writer]:
 
 @contextmanager
 def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
-    """A function that adds a point to every curve. Raises `UsageError` where TensorBoard is not installed."""
+    """Give a function that adds a point to every curve. Raises `UsageError` where TensorBoard is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -83,7 +80,7 @@ def tensorboard(folder: Path, step: int) -> Iterator[Writer]:
 
 @contextmanager
 def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
-    """A function that adds a point, through LeRobot's own logger. Raises `UsageError` where wandb is not installed."""
+    """Give a function that adds a point by LeRobot's own logger. Raises `UsageError` where wandb is not installed."""
     try:
         importlib.import_module("wandb")  # LeRobot's logger imports it, and says less
         from lerobot.common.wandb_utils import WandBLogger

@@ -1,21 +1,26 @@
-"""The `mlp` policy's network, in torch alone.
+"""The `mlp` policy's network with the units of its data, in torch alone.
 
-Apart from LeRobot's interface to it (`manip_il.learn.mlp`), so that a worker that only acts need
-not spend seconds on importing LeRobot.
+Apart from LeRobot's interface to it (`manip_il.learn.mlp`), so that a worker that only acts need not spend seconds on
+importing LeRobot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.learn.columns import ARM, GRIPPER
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES, Distribution, make_head
-from manip_il.learn.normalise import Statistics, identity_statistics, scale_targets
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
 # multiplies this many, filled up with zeros.
@@ -24,11 +29,15 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "s
 ACTIVATIONS = tuple(_ACTIVATIONS)
 BOUNDS = {"width": (1, 16_384), "depth": (1, 100), "components": (1, 1_000), "bins": (2, 10_000)}
 LARGEST_CLAMP = 1e6  # [standard deviations]
+# [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
+# deviation would blow up: it is multiplied by zero instead, so the network never sees it.
+CONSTANT_INPUT = 1e-4
+CONSTANT_TARGET = 1e-6
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What a network is built from; the names are those of `MLPConfig`, which says what they mean.
+    """Sizes and kinds that a network is built from; the names are those of `MLPConfig`, which says what they mean.
 
     Raises `ManipError` for a value out of bounds or of another type, `UnknownName` for a loss or activation.
     """
@@ -52,6 +61,46 @@ class Shape:
             raise ManipError(f"clamp is {self.clamp}; expected more than 0")
 
 
+@dataclass(frozen=True)
+class Statistics:
+    """Float32 vectors over inputs (d,) and targets (n,), in raw units ([rad], [m]).
+
+    x = (input - input_mean) * input_scale; target = target_mean + target_scale * y, clamped to
+    [target_low, target_high], the range of the data.
+    """
+
+    input_mean: Tensor
+    input_scale: Tensor
+    target_mean: Tensor
+    target_scale: Tensor
+    target_low: Tensor
+    target_high: Tensor
+
+    @classmethod
+    def identity(cls, inputs: int, targets: int) -> Statistics:
+        """Return statistics that change nothing, of d inputs and n targets."""
+        everything, zeros, ones = torch.full((targets,), torch.inf), torch.zeros, torch.ones
+        return cls(zeros(inputs), ones(inputs), zeros(targets), ones(targets), -everything, everything)
+
+
+def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str) -> Statistics:
+    """Return statistics of inputs (N, d) and targets (N, n).
+
+    Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
+    their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
+    """
+    low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
+    if loss == "categorical":
+        target_mean, target_scale = (low + high) / 2, (high - low) / 2
+    else:
+        target_mean, target_scale = targets.mean(0, dtype=np.float64), targets.std(0, dtype=np.float64)
+    target_scale = np.where(target_scale < CONSTANT_TARGET, 0.0, target_scale)
+    deviation = inputs.std(0, dtype=np.float64)
+    input_scale = np.where(deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT))
+    values = (inputs.mean(0, dtype=np.float64), input_scale, target_mean, target_scale, low, high)
+    return Statistics(*(torch.from_numpy(value.astype(np.float32)) for value in values))
+
+
 class MLPNetwork(nn.Module):
     """Perceptron, head and units. Inputs (B, n + k) are raw, the first n the measured joints.
 
@@ -71,12 +120,12 @@ class MLPNetwork(nn.Module):
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins)
         self.layers = _perceptron(inputs, self.head.size, shape)
-        for name, tensor in identity_statistics(inputs, n).items():
+        for name, tensor in vars(Statistics.identity(inputs, n)).items():
             self.register_buffer(name, tensor)
 
     def set_statistics(self, statistics: Statistics) -> None:
         """Take the units of the data, saved with the weights. Inputs beyond those of `statistics` have none."""
-        for name, tensor in statistics.items():
+        for name, tensor in vars(statistics).items():
             getattr(self, name)[: len(tensor)].copy_(tensor)
 
     def encode(self, inputs: Tensor) -> Tensor:
@@ -84,12 +133,17 @@ class MLPNetwork(nn.Module):
         return ((inputs - self.input_mean) * self.input_scale).clamp(-self.clamp, self.clamp)
 
     def encode_targets(self, targets: Tensor) -> Tensor:
-        """Return the head's targets from raw relative ones, (B, n)."""
-        return scale_targets(targets, self.target_mean, self.target_scale)
+        """Return the head's targets from raw relative ones, (B, n); 0 where the scale is 0."""
+        inverse = torch.where(self.target_scale > 0, 1.0 / self.target_scale, torch.zeros_like(self.target_scale))
+        return (targets - self.target_mean) * inverse
 
     def row_losses(self, x: Tensor, y: Tensor) -> Tensor:
         """Return loss of each row, (B,), from encoded inputs and targets."""
         return self.head.nll(self.layers(x), y)
+
+    def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
+        """Return targets (B, n) of absolute actions (B, n): the arm's from the measured joints, the gripper's alone."""
+        return torch.cat([actions[:, ARM] - inputs[:, : self.n - 1], actions[:, GRIPPER:]], dim=1)
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
@@ -117,23 +171,23 @@ class MLPNetwork(nn.Module):
 
     @torch.no_grad()
     def log_prob(self, inputs: Tensor, actions: Tensor) -> Tensor:
-        """What the distribution says of absolute actions (B, n), in normalised units, (B,); bits as in `act`."""
+        """Return the log-density of absolute actions (B, n) in normalised units [nats], (B,); bits as in `act`."""
 
         def log_probs(inputs: Tensor, actions: Tensor) -> Tensor:
-            targets = torch.cat([actions[:, :-1] - inputs[:, : self.n - 1], actions[:, -1:]], dim=1)
-            return self.distribution().log_prob(self.layers(self.encode(inputs)), self.encode_targets(targets))
+            targets = self.encode_targets(self.relative(actions, inputs))
+            return self.distribution().log_prob(self.layers(self.encode(inputs)), targets)
 
         return _in_blocks(log_probs, inputs, actions)
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return the same as `act` of all rows in one product, whose last bits depend on their number."""
+        """Return absolute actions, (B, n), of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so neither shall the learner's, wherever it is.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
         return self._absolute(inputs, target)
 
     def _absolute(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        return torch.cat([inputs[:, : self.n - 1] + targets[:, :-1], targets[:, -1:]], dim=1)
+        return torch.cat([inputs[:, : self.n - 1] + targets[:, ARM], targets[:, GRIPPER:]], dim=1)
 
 
 def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
@@ -150,3 +204,38 @@ def _perceptron(inputs: int, outputs: int, shape: Shape) -> nn.Sequential:
     for i in range(shape.depth):
         layers += [nn.Linear(inputs if i == 0 else shape.width, shape.width), _ACTIVATIONS[shape.activation]()]
     return nn.Sequential(*layers, nn.Linear(shape.width, outputs))
+
+
+@torch.no_grad()
+def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
+    """Copy the weights from `pretrained_model`; `network` then acts as that one did, within rounding.
+
+    The input statistics stay those of the new data: the first layer takes up the difference. (An
+    input normaliser frozen at the first round of DAgger puts later rounds' states out of scale.)
+    The range of the targets is that of the new data too; their mean and scale are taken over, being
+    only the unit of the outputs. Raises `MismatchError` for other shapes, `ManipError` for a file that cannot be read.
+    """
+    path = Path(pretrained_model) / "model.safetensors"
+    try:
+        saved = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise ManipError(f"cannot read {path} to start from its weights: {' '.join(str(error).split())}") from error
+    saved = {name.removeprefix("model."): tensor for name, tensor in saved.items()}
+    mean, scale = network.input_mean.clone(), network.input_scale.clone()
+    low, high = network.target_low.clone(), network.target_high.clone()
+    for name, ours in network.state_dict().items():
+        theirs = saved[name].shape if name in saved else None
+        if theirs != ours.shape:
+            raise MismatchError(f"{name}'s shape", str(pretrained_model), theirs, "the new network", tuple(ours.shape))
+    network.load_state_dict(saved)
+    # x_old = (u - mean_old) scale_old and x = (u - mean) scale, so x_old = x scale_old / scale + offset
+    first = network.layers[0]
+    assert isinstance(first, torch.nn.Linear)
+    offset = (mean - network.input_mean) * network.input_scale
+    ratio = torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale))
+    first.bias.add_(first.weight @ offset)
+    first.weight.mul_(ratio)
+    network.input_mean.copy_(mean)
+    network.input_scale.copy_(scale)
+    network.target_low.copy_(low)
+    network.target_high.copy_(high)

@@ -16,12 +16,10 @@ from safetensors.torch import load_file
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, read_meta
-from manip_il.learn.limits import Budget
+from manip_il.learn.limits import Budget, threads
 from manip_il.learn.losses import DISTRIBUTIONS
 from manip_il.learn.network import MLPNetwork, Shape
-from manip_il.learn.observation import observation_of
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
-from manip_il.learn.threads import threads
 from manip_il.policy import F32, F64, Images
 
 Batch = dict[str, torch.Tensor]
@@ -32,8 +30,8 @@ NO_LIKELIHOOD = (
 )
 
 
-class Chooser(Protocol):
-    """What turns a batch into actions, and remembers what must be remembered."""
+class BatchPolicy(Protocol):
+    """A policy that turns a batch into actions and keeps a memory of each episode where it needs one."""
 
     @property
     def module(self) -> torch.nn.Module:
@@ -45,7 +43,7 @@ class Chooser(Protocol):
         ...
 
     def forget(self, episodes: Iterable[int]) -> None:
-        """Drop what is remembered of these episodes."""
+        """Drop the memory of these episodes."""
         ...
 
 
@@ -55,16 +53,16 @@ class LearnedPolicy:
     meta: what the policy was trained for, None for a checkpoint of lerobot-train. interface: what it sees and gives.
     """
 
-    def __init__(self, chooser: Chooser, interface: Interface, meta: CheckpointMeta | None = None):
+    def __init__(self, policy: BatchPolicy, interface: Interface, meta: CheckpointMeta | None = None):
         self.interface, self.meta = interface, meta
-        self._chooser = chooser
+        self._policy = policy
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu", task: str = "", *, trust: bool = False) -> LearnedPolicy:
-        """Any LeRobot `pretrained_model` folder. Reads JSON and safetensors alone, unless `trust`.
+        """Load any LeRobot `pretrained_model` folder, from JSON and safetensors alone unless `trust`.
 
-        The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task: what
-        a policy that reads language is told to do. trust: load models and code that the checkpoint names, too. Raises
+        The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task:
+        instruction for a policy that reads language. trust: load models and code that the checkpoint names, too. Raises
         `ManipError` for a folder that is not whole, that holds a pickle, whose files do not match, or that
         names code to import or, without `trust`, models to load; `UnknownName` for a type of policy that is not known.
         """
@@ -80,24 +78,14 @@ class LearnedPolicy:
         return cls(load_policy(path, config, device, task, trust), interface, meta)
 
     @property
-    def widths(self) -> dict[str, int]:
-        """Numbers in each observation that it looks at."""
-        return self.interface.numbers
-
-    @property
     def cameras(self) -> tuple[str, ...]:
-        """Whose pictures it looks at."""
+        """Cameras among its inputs."""
         return tuple(self.interface.pictures)
 
     @property
     def module(self) -> torch.nn.Module:
         """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
-        return self._chooser.module
-
-    @property
-    def observation(self) -> str:
-        """What it sees: `state`, `images` or `both`."""
-        return observation_of(self.interface.columns)
+        return self._policy.module
 
     @torch.inference_mode()
     def act(
@@ -118,7 +106,7 @@ class LearnedPolicy:
         if not rows:
             return np.empty((0, self.interface.action))
         with threads(1):
-            actions = self._chooser.select(batch, episodes).cpu().numpy().astype(np.float64)
+            actions = self._policy.select(batch, episodes).cpu().numpy().astype(np.float64)
         if actions.shape != (rows, self.interface.action):
             expected = (rows, self.interface.action)
             raise MismatchError("shape of the actions", CONFIG, expected, "the policy", actions.shape)
@@ -127,7 +115,7 @@ class LearnedPolicy:
 
     def reset(self, episodes: Iterable[int]) -> None:
         """Forget the past of episodes that begin."""
-        self._chooser.forget(episodes)
+        self._policy.forget(episodes)
 
     @torch.inference_mode()
     def sample(self, states: F32, environment_states: F32, images: Images, rngs: Sequence[np.random.Generator]) -> F64:
@@ -160,18 +148,18 @@ class LearnedPolicy:
 
     def require_likelihood(self) -> None:
         """Raise `UsageError` unless the policy tells how likely it finds an action, state by state."""
-        if not isinstance(self._chooser, _Perceptron) or self._chooser.loss not in LIKELIHOODS:
+        if not isinstance(self._policy, _Perceptron) or self._policy.module.loss not in LIKELIHOODS:
             raise UsageError(NO_LIKELIHOOD)
 
     def _with_spread(self) -> _Perceptron:
         """The mlp; `UsageError` for any other policy, and for an mlp whose loss learns no spread."""
-        if not isinstance(self._chooser, _Perceptron):
-            expected = f"expected an mlp with loss {', '.join(DISTRIBUTIONS)}"
+        if not isinstance(self._policy, _Perceptron):
             raise UsageError(
-                f"a policy of type {self.interface.type!r} has no distribution of actions here; {expected}"
+                f"a policy of type {self.interface.type!r} has no distribution of actions here; expected an mlp with "
+                f"loss {', '.join(DISTRIBUTIONS)}"
             )
-        self._chooser.module.distribution()
-        return self._chooser
+        self._policy.module.distribution()
+        return self._policy
 
     def _numbers(self, states: F32, environment_states: F32) -> Batch:
         batch = {}
@@ -187,78 +175,65 @@ class LearnedPolicy:
         return batch
 
     def _pictures(self, rows: int, images: Images) -> Batch:
-        """As LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
+        """Pictures as LeRobot's evaluation feeds them: float32 (B, 3, H, W), from 0 to 1."""
         if missing := set(self.cameras) - set(images):
-            raise MismatchError(
-                f"cameras ({', '.join(sorted(missing))})",
-                "the policy",
-                sorted(self.cameras),
-                "the caller",
-                sorted(images),
-            )
+            what = f"cameras ({', '.join(sorted(missing))})"
+            raise MismatchError(what, "the policy", sorted(self.cameras), "the caller", sorted(images))
         batch = {}
         for camera, size in self.interface.pictures.items():
             expected = (rows, *size, 3)
-            if images[camera].shape != expected:
-                raise MismatchError(
-                    f"shape of the pictures of {camera}", "the policy", expected, "the caller", images[camera].shape
-                )
+            if (given := images[camera].shape) != expected:
+                raise MismatchError(f"shape of the pictures of {camera}", "the policy", expected, "the caller", given)
             picture = torch.from_numpy(np.ascontiguousarray(images[camera])).permute(0, 3, 1, 2)
             batch[IMAGES + camera] = picture.contiguous().to(torch.float32) / 255
         return batch
 
 
 class _Perceptron:
-    """The mlp: no memory, and one call for all rows, which do not feel each other."""
+    """The mlp: no memory, and one call for all rows, whose actions do not depend on each other."""
 
     def __init__(self, path: Path, config: dict[str, Any], interface: Interface, device: str):
         self._device = device
         self._keys = [key for key in (STATE, ENVIRONMENT_STATE) if key in interface.numbers]
         shape = _shape(config, path / CONFIG)
-        self.loss = shape.loss
         try:
             with Budget(path / WEIGHTS):
-                self._network = MLPNetwork(sum(interface.numbers[key] for key in self._keys), interface.action, shape)
+                self.module = MLPNetwork(sum(interface.numbers[key] for key in self._keys), interface.action, shape)
                 weights = load_file(path / WEIGHTS)
-            self._network.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
+            self.module.load_state_dict({name.removeprefix("model."): tensor for name, tensor in weights.items()})
         except (RuntimeError, SafetensorError) as error:
             line = " ".join(str(error).split())
             raise ManipError(f"{path}: weights and {CONFIG} do not match: {line}") from error
         except ManipError as error:
             raise ManipError(f"{path}: {error}") from error
-        self._network.to(device).eval()
-
-    @property
-    def module(self) -> MLPNetwork:
-        """The network."""
-        return self._network
+        self.module.to(device).eval()
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row (B, n).
 
         The mlp's processors are the identity (see MLPConfig), so there is nothing else to do.
         """
-        return self._network.act(self._inputs(batch))
+        return self.module.act(self._inputs(batch))
 
     def sample(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
         """Return absolute actions (B, n), each row's from its own generator."""
-        head = self._network.distribution()
+        head = self.module.distribution()
         draws = torch.from_numpy(np.stack([head.draw(rng) for rng in rngs]))
-        return self._network.sample(self._inputs(batch), draws.to(self._device)).cpu()
+        return self.module.sample(self._inputs(batch), draws.to(self._device)).cpu()
 
     def log_prob(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
-        """Of absolute actions (B, n), (B,)."""
-        return self._network.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
+        """Return the log-density of absolute actions (B, n) [nats], (B,)."""
+        return self.module.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
 
     def forget(self, episodes: Iterable[int]) -> None:
-        """Do nothing: there is nothing to forget."""
+        """Forget nothing: the mlp has no memory."""
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
 
 
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:
-    """What an mlp's `config.json` asks for."""
+    """The network's shape in an mlp's `config.json`."""
     for field in fields(Shape):
         if field.name not in config:
             raise ManipError(f"{path} has no {field.name}; it is not an mlp's")

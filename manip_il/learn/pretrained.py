@@ -1,10 +1,15 @@
-"""What a `pretrained_model` folder says of itself, read before anything in it is loaded."""
+"""A `pretrained_model` folder's own files, checked before anything in it is loaded: a checkpoint is data from anywhere.
+
+LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
+`trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
+and weights alone are listed in `PLAIN`, with the steps of their processors; all others need `--trust=true`.
+"""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,16 +19,43 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE, Robot
 from manip_il.errors import ManipError, MismatchError
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
+OBSERVATIONS = ("state", "images", "both")  # besides the joints: the true poses, pictures, or both
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 _LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _MOST_FEATURES, _MOST_STEPS, _LONGEST_SIDE = 100, 100, 100_000
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
+_NORMALISER = frozenset({"eps", "features", "norm_map", "normalize_observation_keys"})
+_STEPS: dict[str, frozenset[str]] = {  # LeRobot's default processors: step -> the options that it may have
+    "rename_observations_processor": frozenset({"rename_map"}),
+    "to_batch_processor": frozenset(),
+    "device_processor": frozenset({"device", "float_dtype"}),
+    "normalizer_processor": _NORMALISER,
+    "unnormalizer_processor": _NORMALISER,
+}
+PLAIN: dict[str, dict[str, frozenset[str]]] = {  # policies that load nothing by name -> their processors' steps
+    name: _STEPS for name in ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")
+}
+_NAMES: dict[str, tuple[str, ...]] = {  # other policies of LeRobot 0.6.1 -> the options that name what they load
+    "eo1": ("vlm_base",),
+    "evo1": ("vlm_model_name",),
+    "fastwam": ("model_id", "base_model_id", "text_encoder_model_id", "tokenizer_model_id"),
+    "gaussian_actor": ("vision_encoder_name",),  # plain without one
+    "groot": ("base_model_path", "tokenizer_assets_repo"),
+    "lingbot_va": ("wan_pretrained_path",),
+    "molmoact2": ("checkpoint_path", "discrete_action_tokenizer"),
+    "multi_task_dit": ("vision_encoder_name", "text_encoder_name"),
+    "pi0_fast": ("text_tokenizer_name", "action_tokenizer_name"),
+    "smolvla": ("vlm_model_name",),
+    "vla_jepa": ("qwen_model_name", "jepa_encoder_name"),
+    "wall_x": ("pretrained_name_or_path", "action_tokenizer_path"),
+    "xvla": ("tokenizer_name",),
+}
 
 
 @dataclass(frozen=True)
 class Interface:
-    """What a policy sees and gives.
+    """Inputs and outputs of a policy.
 
     type: LeRobot's name for the policy. numbers: column -> how many; pictures: camera -> (height, width) [pixels];
     action: how many numbers.
@@ -35,13 +67,26 @@ class Interface:
     action: int
 
     @property
+    def observation(self) -> str:
+        """One of `OBSERVATIONS`."""
+        return observation_of(self.columns)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """All inputs by LeRobot's names."""
         return (*self.numbers, *(IMAGES + camera for camera in self.pictures))
 
 
+def observation_of(input_features: Iterable[str]) -> str:
+    """Return which of `OBSERVATIONS` a policy takes, from the names of its inputs."""
+    keys = set(input_features)
+    if not any(key.startswith(IMAGES) for key in keys):
+        return "state"
+    return "both" if ENVIRONMENT_STATE in keys else "images"
+
+
 def read_config(path: Path) -> dict[str, Any]:
-    """`config.json` of a folder that is whole and holds no pickle; else `ManipError`."""
+    """Return the `config.json` of a folder that is whole and holds no pickle; else raise `ManipError`."""
     if not (path / CONFIG).is_file():
         raise ManipError(f"no {CONFIG} in {path}; expected LeRobot's pretrained_model folder")
     for file in sorted(path.rglob("*")):
@@ -67,12 +112,12 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def read_interface(path: Path) -> Interface:
-    """What the policy in a folder sees and gives. Raises what `read_config` raises."""
+    """Return inputs and outputs of the policy in a folder. Raises what `read_config` raises."""
     return interface_of(read_config(path), path)
 
 
 def interface_of(config: dict[str, Any], path: Path) -> Interface:
-    """Return the same from `config.json`; path: for the message."""
+    """Return inputs and outputs from a `config.json`; path: for the message."""
     try:
         inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
         if ACTION not in outputs:
@@ -155,3 +200,48 @@ def _step(path: Path, step: dict[str, Any]) -> dict[str, Any]:
         if not (path.parent / known["state_file"]).is_file():
             raise ManipError(f"no {known['state_file']} beside it")
     return known
+
+
+def require_trust(settings: Mapping[str, Any], source: str, trust: bool, folder: Path | None = None) -> None:
+    """Raise `ManipError` unless a policy loads nothing by name, or `trust` is given; says what would be loaded.
+
+    settings: its options with `type`, as `config.json` has them. source: of them, for the message. folder: a
+    checkpoint, whose processors are looked at as well; of these, steps by import path are refused in any case.
+    """
+    kind = settings["type"]
+    wanted = _models(kind, settings)
+    for name in PROCESSORS if folder is not None else ():
+        assert folder is not None
+        wanted += _steps(name, processor_steps(folder / name), PLAIN.get(kind, _STEPS))
+    if wanted and not trust:
+        raise ManipError(
+            f"{source} is a policy of type {kind!r} that would load {'; '.join(wanted)}: this fetches files and may "
+            "run code that comes with them; if you trust its source, add --trust=true"
+        )
+
+
+def _models(kind: str, settings: Mapping[str, Any]) -> list[str]:
+    """The models that a policy's options name."""
+    named = {option: settings[option] for option in _NAMES.get(kind, ()) if settings.get(option) is not None}
+    if named:
+        return [_list_options(f"models by name ({CONFIG})", named)]
+    return [] if kind in PLAIN else [f"models that LeRobot's {kind!r} names itself"]
+
+
+def _steps(file: str, steps: Sequence[Mapping[str, Any]], allowed: Mapping[str, frozenset[str]]) -> list[str]:
+    """The steps of a processor's file that are not allowed, or have options that are not."""
+    found: list[str] = []
+    for step in steps:
+        name, options = step["registry_name"], step["config"]
+        if name not in allowed:
+            found.append(_list_options(f"the step {checks.shorten(name)} of {file}", options))
+        elif extra := {key: options[key] for key in options if key not in allowed[name]}:
+            found.append(_list_options(f"the step {name!r} of {file} with options of its own", extra))
+    return found
+
+
+def _list_options(what: str, options: Mapping[str, Any]) -> str:
+    """`what` with the three options that say most, the names of models first."""
+    first = sorted(options.items(), key=lambda item: not isinstance(item[1], str))[:3]
+    text = ", ".join(f"{checks.shorten(key)[1:-1]}={checks.shorten(value)}" for key, value in first)
+    return f"{what}: {text}" if text else what

@@ -1,4 +1,4 @@
-"""Training in memory: the whole table is a tensor, a batch is one `index_select`.
+"""Training of the mlp in memory: the whole table is a tensor, a batch is one `index_select`.
 
 A loop of its own beside `fit_policy`'s: with LeRobot's processors, prefetching and accelerator around each step the mlp
 takes a quarter fewer samples a second (32,000 for 42,000 in batches of 512, one busy core), and initialisation, order
@@ -11,9 +11,10 @@ import copy
 import hashlib
 import json
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,102 +22,44 @@ import draccus
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.configs.default import DatasetConfig, WandBConfig
-from lerobot.configs.train import TrainPipelineConfig
-from lerobot.optim import AdamWConfig
+from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
+from lerobot.policies.factory import make_pre_post_processors
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, NotFiniteError
+from manip_il.learn.batches import order_of
 from manip_il.learn.checkpoint import (
+    META_FILE,
     PRETRAINED_MODEL,
+    STEP_FILE,
+    TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
     last_checkpoint,
-    load_optimizer,
     read_step,
     readable_state,
-    save_checkpoint,
+    unpublished,
+    write_json,
 )
-from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
+from manip_il.learn.columns import ARM, GRIPPER, Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import LeRobotFit
+from manip_il.learn.limits import threads
 from manip_il.learn.metrics import metric_writers
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
-from manip_il.learn.normalise import fit_statistics
-from manip_il.learn.order import order_of
-from manip_il.learn.threads import threads
-from manip_il.learn.warm_start import warm_start
+from manip_il.learn.network import fit_statistics, warm_start
 
+WARMUP_STEPS, WEIGHT_DECAY, GRAD_CLIP_NORM = 100, 1e-4, 10.0
 # Do not change the weights that come out at the end (threads: only in the last bits).
 _FREE_ON_RESUME = ("threads", "log_freq", "save_freq", "init_from")
-_TOLD_ELSEWHERE = ("tensorboard", "wandb")  # options of nobody but this run's user
-
-
-@dataclass
-class TrainConfig:
-    """How to fit. `lr` is the peak: linear warm-up over `warmup_steps`, then a cosine down to zero.
-
-    val_fraction: share of the episodes held out for the metrics, 0 for none. init_from: a
-    `pretrained_model` folder whose weights to start from. save_freq, log_freq: in steps. threads:
-    a second one is up to 1.8 times as fast where a core is free, and tens of times slower where
-    none is.
-    """
-
-    steps: int = 3_000
-    batch_size: int = 512
-    lr: float = 2e-3
-    warmup_steps: int = 100
-    weight_decay: float = 1e-4
-    grad_clip_norm: float = 10.0
-    val_fraction: float = 0.05
-    seed: int = 0
-    threads: int = 1
-    log_freq: int = 200
-    save_freq: int = 1_000
-    init_from: Path | None = None
-    tensorboard: bool = False
-    wandb: WandBConfig = field(default_factory=WandBConfig)
-    policy: MLPConfig = field(default_factory=MLPConfig)
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch_size", "threads", "log_freq", "save_freq"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")
-        if not 0.0 <= self.val_fraction < 1.0:
-            raise UsageError(f"val_fraction is {self.val_fraction}; expected 0 <= val_fraction < 1")
-        if not self.lr > 0.0:
-            raise UsageError(f"lr is {self.lr}; expected more than 0")
-
-    def lerobot(self, repo_id: str, output_dir: Path) -> TrainPipelineConfig:
-        """Return the same in LeRobot's words, for its logger."""
-        optimizer = AdamWConfig(lr=self.lr, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm)
-        return TrainPipelineConfig(
-            dataset=DatasetConfig(repo_id),
-            policy=self.policy,
-            output_dir=output_dir,
-            job_name="manip_il_mlp",
-            seed=self.seed,
-            batch_size=self.batch_size,
-            steps=self.steps,
-            env_eval_freq=0,
-            log_freq=self.log_freq,
-            save_freq=self.save_freq,
-            optimizer=optimizer,
-            wandb=self.wandb,
-        )
-
-    def lr_at(self, step: int) -> float:
-        """Return learning rate of the update with number `step`, from 0."""
-        warmup = min(self.warmup_steps, self.steps // 10)
-        if step < warmup:
-            return self.lr * (step + 1) / (warmup + 1)
-        return self.lr * 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, self.steps - warmup)))
 
 
 def fit(
     table: Table,
-    config: TrainConfig,
+    config: FitConfig,
     output_dir: Path,
     *,
     spec: RobotTaskSpec,
@@ -145,23 +88,24 @@ def fit(
     check_table(table, spec)
     rows = learning_rows(table)
     drawn = weights[valid_frames(table)] if weights is not None else None
-    options = {name: value for name, value in draccus.encode(config).items() if name not in _TOLD_ELSEWHERE}
+    lerobot = LeRobotFit(config)
+    options = _options(lerobot)
     meta = CheckpointMeta.of(spec, fingerprint, options)
     digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):
         if checkpoint is not None:
             check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
-        trainer = Trainer(rows, config, spec, checkpoint, drawn)
-        pipeline = config.lerobot(repo_id, output_dir)
+        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn)
+        pipeline = lerobot.pipeline(repo_id, None, output_dir)
         with metric_writers(output_dir, trainer.step, config.tensorboard, pipeline) as writers:
             for record in trainer.run():
                 for write in writers if record else []:
                     write(record)
                 if record and on_log is not None:
                     on_log(record)
-                if trainer.step % config.save_freq == 0 or trainer.step == config.steps:
-                    save_checkpoint(output_dir, trainer.step, trainer.policy, meta, trainer.optimizer, key)
+                if trainer.step % config.steps_per_checkpoint == 0 or trainer.step == config.total_steps:
+                    trainer.save(output_dir, meta, key)
     return output_dir / "checkpoints" / "last" / PRETRAINED_MODEL
 
 
@@ -171,32 +115,35 @@ class Trainer:
     def __init__(
         self,
         rows: Rows,
-        config: TrainConfig,
+        lerobot: LeRobotFit,
         spec: RobotTaskSpec,
         checkpoint: Path | None = None,
         weights: NDArray[np.float64] | None = None,
     ) -> None:
-        self.config = config
+        config = lerobot.config
+        self.steps, self.batch_size, self.log_freq = config.total_steps, config.samples_per_step, config.log_freq
+        self.peak_lr = lerobot.optimizer().lr
         self.step = 0
-        train, held_out = split_by_episode(rows.episodes, config.val_fraction, config.seed)
-        self.policy = _new_policy(config, spec)
-        self.policy.model.set_statistics(fit_statistics(rows.inputs[train], rows.targets[train], config.policy.loss))
+        train, held_out = split_by_episode(rows.episodes, config.eval_split, config.seed)
+        self.policy = _new_policy(lerobot, spec)
+        network = self.policy.model
+        network.set_statistics(fit_statistics(rows.inputs[train], rows.targets[train], network.loss))
         self.policy.to(self.policy.config.device)
         self.optimizer = torch.optim.AdamW(
-            self.policy.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
+            self.policy.parameters(), lr=self.peak_lr, weight_decay=WEIGHT_DECAY, fused=True
         )
         if checkpoint is not None:
             self._restore(checkpoint)
         elif config.init_from is not None:
-            warm_start(self.policy.model, config.init_from)
+            warm_start(network, config.init_from)
         self._encode(rows, train, held_out)
         drawn = weights[train] if weights is not None else None
-        self.order = order_of(len(train), drawn, config.batch_size, config.seed)
+        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
 
     def _restore(self, checkpoint: Path) -> None:
         with readable_state(checkpoint):
             self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
-        load_optimizer(checkpoint, self.optimizer)
+            load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
         self.step = read_step(checkpoint)["step"]
 
     def _encode(self, rows: Rows, train: NDArray[np.int64], held_out: NDArray[np.int64]) -> None:
@@ -212,20 +159,20 @@ class Trainer:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
         self.policy.train()
         since, started, total = self.step, time.perf_counter(), 0.0
-        while self.step < self.config.steps:
+        while self.step < self.steps:
             total += self._update()
             self.step += 1
-            if self.step % self.config.log_freq and self.step != self.config.steps:
+            if self.step % self.log_freq and self.step != self.steps:
                 yield {}
                 continue
             steps, seconds = self.step - since, time.perf_counter() - started
             record = {"step": self.step, "loss": total / steps, "lr": self.optimizer.param_groups[0]["lr"]}
-            record["samples_per_s"] = round(steps * self.config.batch_size / max(seconds, 1e-9))
+            record["samples_per_s"] = round(steps * self.batch_size / max(seconds, 1e-9))
             yield record | self.validate()
             since, started, total = self.step, time.perf_counter(), 0.0
 
     def batch(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Encoded inputs (B, n + k) and targets (B, n) of one step."""
+        """Return encoded inputs (B, n + k) and targets (B, n) of one step."""
         rows = self.data.index_select(0, self.order.batch(step).to(self.data.device))
         return rows[:, : self.width], rows[:, self.width :]
 
@@ -236,40 +183,88 @@ class Trainer:
         network = self.policy.model
         with torch.no_grad():
             loss = network.row_losses(self.held_out[:, : self.width], self.held_out[:, self.width :]).mean()
-            state = self.held_out_inputs[:, : network.n]
-            relative = network.act(self.held_out_inputs) - torch.nn.functional.pad(state[:, :-1], (0, 1))
+            relative = network.relative(network.act(self.held_out_inputs), self.held_out_inputs)
             error = (relative - self.held_out_targets).abs().mean(0)
         return {
             "val_loss": loss.item(),
-            "val_arm_error": error[:-1].mean().item(),
-            "val_gripper_error": error[-1].item(),
+            "val_arm_error": error[ARM].mean().item(),
+            "val_gripper_error": error[GRIPPER].item(),
         }
+
+    def save(self, output_dir: Path, meta: CheckpointMeta, resume_key: Mapping[str, Any]) -> None:
+        """Write a checkpoint of this step, make it the last one and remove those before.
+
+        resume_key: what a resumed run must share with this one (JSON values).
+        """
+        final = output_dir / "checkpoints" / f"{self.step:06d}"
+        with unpublished(final) as new:
+            folder, state = new / PRETRAINED_MODEL, new / TRAINING_STATE
+            folder.mkdir()
+            self.policy.save_pretrained(folder)
+            for processor in make_pre_post_processors(self.policy.config):
+                processor.save_pretrained(folder)
+            write_json(folder / META_FILE, asdict(meta))
+            state.mkdir()
+            save_optimizer_state(self.optimizer, state)
+            write_json(state / STEP_FILE, {"step": self.step, **resume_key})
+        for other in final.parent.iterdir():
+            if not other.is_symlink() and other.name != final.name:
+                shutil.rmtree(other, ignore_errors=True)
 
     def _update(self) -> float:
         x, y = self.batch(self.step)
         loss = self.policy.model.row_losses(x, y).mean()
         value = loss.item()
         if not math.isfinite(value):
-            raise NotFiniteError(f"the loss is {value} at step {self.step}; lower lr (now {self.config.lr})")
-        self.optimizer.param_groups[0]["lr"] = self.config.lr_at(self.step)
+            raise NotFiniteError(f"the loss is {value} at step {self.step}; lower lr (now {self.peak_lr})")
+        self.optimizer.param_groups[0]["lr"] = lr_at(self.step, self.steps, self.peak_lr)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.config.grad_clip_norm)
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), GRAD_CLIP_NORM)
         self.optimizer.step()
         return value
 
 
-def _new_policy(config: TrainConfig, spec: RobotTaskSpec) -> MLPPolicy:
+def lr_at(step: int, steps: int, peak: float) -> float:
+    """Return the learning rate of an update, from 0 to `steps` - 1: linear warm-up, then a cosine down to zero."""
+    warmup = min(WARMUP_STEPS, steps // 10)
+    if step < warmup:
+        return peak * (step + 1) / (warmup + 1)
+    return peak * 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+
+
+def _new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
     n, k = len(spec.joint_names), len(spec.environment_state_names)
-    policy_config = copy.deepcopy(config.policy)
+    policy_config = copy.deepcopy(lerobot.policy)
+    assert isinstance(policy_config, MLPConfig)
     policy_config.input_features = {STATE: PolicyFeature(type=FeatureType.STATE, shape=(n,))}
     if k:
         policy_config.input_features[ENVIRONMENT_STATE] = PolicyFeature(type=FeatureType.ENV, shape=(k,))
     policy_config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n,))}
     # torch initialises layers from its global generator: lend it one of our own.
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+        torch.manual_seed(lerobot.config.seed)
         return MLPPolicy(policy_config)
+
+
+def _options(lerobot: LeRobotFit) -> dict[str, Any]:
+    """The options that a checkpoint names, as JSON knows them."""
+    config = lerobot.config
+    return {
+        "steps": config.total_steps,
+        "batch_size": config.samples_per_step,
+        "lr": config.peak_lr,
+        "warmup_steps": WARMUP_STEPS,
+        "weight_decay": WEIGHT_DECAY,
+        "grad_clip_norm": GRAD_CLIP_NORM,
+        "val_fraction": config.eval_split,
+        "seed": config.seed,
+        "threads": config.threads,
+        "log_freq": config.log_freq,
+        "save_freq": config.steps_per_checkpoint,
+        "init_from": str(config.init_from) if config.init_from else None,
+        "policy": draccus.encode(lerobot.policy),
+    }
 
 
 def _digest(rows: Rows, weights: NDArray[np.float64] | None) -> str:

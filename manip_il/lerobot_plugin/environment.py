@@ -19,7 +19,7 @@ from manip_il.child_processes import bound_to_this_process
 from manip_il.data.lerobot_log import shorten_ffmpeg_warning
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName
-from manip_il.learn.observation import OBSERVATIONS
+from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.robots.robot import get_robot
 from manip_il.sim import env as sim
 from manip_il.sim.look import CameraConfig

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.algorithms.beta import BetaSchedule
-from manip_il.algorithms.config import RunConfig
 from manip_il.errors import UnknownName, UsageError
 
 
@@ -57,20 +56,3 @@ def test_a_parameter_out_of_range_is_refused(text: str):
 def test_a_schedule_without_a_number_is_refused_and_shown_how(text: str):
     with pytest.raises(UsageError, match=f"beta is '{text}'; expected {text.split(':')[0]}:NUMBER"):
         BetaSchedule.parse(text)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("demonstrations", 0),
-        ("rounds", -1),
-        ("rounds", 100),
-        ("episodes_per_round", 0),
-        ("validation_episodes", 0),
-        ("disturbed_share", 1.5),
-        ("method", "daggr"),
-    ],
-)
-def test_a_run_that_makes_no_sense_is_refused(name: str, value: object):
-    with pytest.raises(UsageError, match=f"{name} (is )?'?{value}"):
-        RunConfig(**{name: value})  # pyright: ignore[reportArgumentType]

@@ -5,12 +5,14 @@ from __future__ import annotations
 import pytest
 
 from manip_il.algorithms.beta import BetaSchedule
-from manip_il.algorithms.config import RunConfig, check_labels, check_sight
+from manip_il.algorithms.config import RunConfig, check_cameras, check_labels
+from manip_il.algorithms.table import check_method
 from manip_il.engine.query import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.look import CameraConfig
 
+CNN = FitConfig({"type": "cnn"})
 ACT = FitConfig({"type": "act", "chunk_size": 8, "n_action_steps": 4})
 DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
 
@@ -23,8 +25,10 @@ DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
         ({"ensemble": 3}, "no query uses it"),
         ({"label": "takeover", "beta": BetaSchedule("linear", 3)}, "learner rolls in alone"),
         ({"label": "takeover", "query_rule": QueryRule("every")}, "from the first step on"),
-        ({"method": "cloning", "label": "branch"}, "the expert drive throughout"),
-        ({"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
+        ({"rounds": -1}, "rounds is -1"),
+        ({"rounds": 100}, "rounds is 100; expected fewer than 100"),
+        ({"episodes_per_round": 0}, "episodes_per_round is 0"),
+        ({"disturbed_share": 1.5}, "disturbed_share is 1.5"),
         ({"refit_steps": 100}, "refit_steps is for refit=warm"),
         ({"branch_steps": 0}, "branch_steps is 0"),
     ],
@@ -53,23 +57,30 @@ def test_labels_that_the_policy_cannot_use_are_refused(options, says: str):
 
 
 @pytest.mark.parametrize(
-    ("fit", "cameras", "method", "says"),
+    ("options", "says"),
     [
-        (FitConfig({"type": "cnn"}), (), "dagger", "give --cameras=front,wrist"),
-        (FitConfig(), ("front",), "dagger", "the policy takes none"),
-        (ACT, ("front",), "dagger", "the policy takes none"),
-        (FitConfig({"type": "cnn"}), ("front",), "dart", "not for a policy on images"),
+        ({"method": "daggr"}, "unknown method 'daggr' .did you mean 'dagger'"),
+        ({"method": "cloning", "label": "branch"}, "the expert drive throughout"),
+        ({"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
+        ({"method": "dart", "fit": CNN, "cameras": CameraConfig(("front",))}, "not for a policy on images"),
     ],
 )
-def test_what_is_pictured_is_what_is_looked_at(fit, cameras, method, says: str):
-    config = RunConfig(fit=fit, method=method, cameras=CameraConfig(cameras) if cameras else None)
+def test_options_that_are_not_for_the_method_are_refused(options, says: str):
     with pytest.raises(UsageError, match=says):
-        check_sight(config)
+        check_method(RunConfig(**options))
 
 
-def test_an_mlp_that_is_to_see_is_refused_where_it_is_configured():
-    with pytest.raises(UsageError, match="mlp does not take images"):
-        FitConfig(observation="images")
+@pytest.mark.parametrize(
+    ("fit", "cameras", "says"),
+    [
+        (CNN, (), "give --cameras=front,wrist"),
+        (FitConfig(), ("front",), "the policy takes none"),
+        (ACT, ("front",), "the policy takes none"),
+    ],
+)
+def test_pictures_are_rendered_exactly_where_the_policy_takes_them(fit, cameras, says: str):
+    with pytest.raises(UsageError, match=says):
+        check_cameras(RunConfig(fit=fit, cameras=CameraConfig(cameras) if cameras else None))
 
 
 def test_a_branch_is_as_long_as_the_policy_needs_for_a_whole_plan():

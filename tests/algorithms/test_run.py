@@ -26,6 +26,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import CameraConfig
 
+from ..learn.tiny_policies import ACT
 from .trees import files, is_data
 
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
@@ -106,18 +107,6 @@ def test_of_equally_good_rounds_the_later_is_best(run):
 
     assert best_round([result(0, True, False), result(1, True, True), result(2, False, True)]).round == 1
     assert best_round([result(0, True, False), result(1, False, True), result(2, False, False)]).round == 1
-
-
-def test_aggregating_is_putting_one_round_behind_the_other(run):
-    folder, _, _ = run
-    parts = [read_table(round_folder(folder, i) / "dataset", LEARNING_COLUMNS) for i in range(2)]
-    table = read_tables(datasets(folder, 1), LEARNING_COLUMNS)
-    for key in ("observation.state", "observation.environment_state", "action", "label_valid"):
-        np.testing.assert_array_equal(table[key], np.concatenate([part[key] for part in parts]))
-    lengths = [count for part in parts for count in np.bincount(part["episode_index"])]
-    np.testing.assert_array_equal(table["episode_index"], np.repeat(np.arange(6), lengths))
-    for key, column in read_tables(datasets(folder, 0), LEARNING_COLUMNS).items():
-        np.testing.assert_array_equal(column, parts[0][key])
 
 
 def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
@@ -231,19 +220,6 @@ def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
     weights = "checkpoints/000020/pretrained_model/model.safetensors"
     assert (first / weights).read_bytes() != (second / weights).read_bytes()
     assert results[1].labels > results[0].labels
-
-
-ACT = {
-    "type": "act",
-    "device": "cpu",
-    "chunk_size": 4,
-    "n_action_steps": 2,
-    "dim_model": 16,
-    "n_heads": 2,
-    "dim_feedforward": 16,
-    "n_encoder_layers": 1,
-    "n_vae_encoder_layers": 1,
-}
 
 
 @pytest.mark.parametrize(("label", "length"), [("per_state", None), ("takeover", None), ("branch", 4)])

@@ -15,6 +15,7 @@ from manip_il.cli.study_file import read_plan
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, UsageError
+from manip_il.learn.lerobot_config import LeRobotFit
 
 from .made_runs import ENV, make_eval, make_policy, make_run
 
@@ -70,7 +71,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, tmp
     refused(["dagger", f"--policy.path={named}", out], capsys)
     refused(["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out], capsys)
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
-        parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._config()  # pyright: ignore[reportAttributeAccessIssue]
+        LeRobotFit(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
 
 
@@ -128,8 +129,8 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
     run = make_run(tmp_path / "run", make_policy(tmp_path / "p"))
     monkeypatch.chdir(tmp_path)
     options = parse(load(command), [*REQUIRED.get(command, []), "--policy.path=run"])
-    config = options.config().fit.other(0) if command == "dagger" else options._config()  # pyright: ignore[reportAttributeAccessIssue]
-    assert Path(config.policy.pretrained_path).resolve() == find_policy(run).resolve()
+    fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
+    assert Path(LeRobotFit(fit).policy.pretrained_path).resolve() == find_policy(run).resolve()
 
 
 @pytest.mark.parametrize("value", ["missing", "null", "5"])

@@ -88,7 +88,7 @@ def _is_open(name: str) -> bool:
 
 @cache
 def _policies_options() -> set[str]:
-    from manip_il.learn.choices import policy_class, policy_types
+    from manip_il.learn.lerobot_config import policy_class, policy_types
 
     return {field.name for kind in policy_types() for field in dataclasses.fields(policy_class(kind))} | {
         "type", "path", "discover_packages_path",

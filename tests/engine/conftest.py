@@ -17,12 +17,12 @@ sys.path.insert(0, str(Path(__file__).parent))  # where workers find `kept`
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory) -> Path:
     """A policy for the default environment, hardly trained."""
-    from manip_il.learn.mlp import MLPConfig
-    from manip_il.learn.train import TrainConfig, fit
+    from manip_il.learn.fit_config import FitConfig
+    from manip_il.learn.train import fit
 
     job = RolloutJob(EnvConfig(), "expert", hold=3)
     episodes = list(run_job(job, stream_seeds("demonstrations", 4)))
     table = {key: np.concatenate([episode.columns[key] for episode in episodes]) for key in episodes[0].columns}
     table["episode_index"] = np.repeat(np.arange(4), [len(episode) for episode in episodes])
-    config = TrainConfig(steps=20, batch_size=32, policy=MLPConfig(width=32))
+    config = FitConfig({"width": 32}, steps=20, batch_size=32)
     return fit(table, config, tmp_path_factory.mktemp("policy"), spec=env_spec(EnvConfig()))

@@ -216,14 +216,14 @@ MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: measured 4.5 
 @pytest.fixture(scope="module", params=["panda", "fetch"])
 def certified(request, tmp_path_factory) -> Certificate:
     """Beside perturbed states, those that a poor clone of the expert visits."""
-    from manip_il.learn.mlp import MLPConfig
-    from manip_il.learn.train import TrainConfig, fit
+    from manip_il.learn.fit_config import FitConfig
+    from manip_il.learn.train import fit
 
     env = EnvConfig(request.param)
     episodes = list(run_job(RolloutJob(env, "expert", hold=3), stream_seeds("demonstrations", 10)))
     table = {key: np.concatenate([episode.columns[key] for episode in episodes]) for key in episodes[0].columns}
     table["episode_index"] = np.repeat(np.arange(len(episodes)), [len(episode) for episode in episodes])
-    config = TrainConfig(steps=300, batch_size=32, policy=MLPConfig(width=64))
+    config = FitConfig({"width": 64}, steps=300, batch_size=32)
     folder = fit(table, config, tmp_path_factory.mktemp("clone"), spec=env_spec(env))
     return certify(Engine(), env, CASES, policy=folder)
 

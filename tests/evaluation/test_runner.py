@@ -37,13 +37,13 @@ def act(tmp_path_factory):
 @pytest.fixture(scope="module")
 def mlp(tmp_path_factory):
     """A policy of one call for all episodes, fitted a little so that its actions differ from state to state."""
-    from manip_il.learn.mlp import MLPConfig
-    from manip_il.learn.train import TrainConfig, fit
+    from manip_il.learn.fit_config import FitConfig
+    from manip_il.learn.train import fit
 
     episodes = list(run_job(RolloutJob(EnvConfig("fetch"), "expert", hold=3), stream_seeds("demonstrations", 3)))
     table = {key: np.concatenate([episode.columns[key] for episode in episodes]) for key in episodes[0].columns}
     table["episode_index"] = np.repeat(np.arange(3), [len(episode) for episode in episodes])
-    config = TrainConfig(steps=60, batch_size=64, policy=MLPConfig(width=64))
+    config = FitConfig({"width": 64}, steps=60, batch_size=64)
     return fit(table, config, tmp_path_factory.mktemp("policy"), spec=env_spec(EnvConfig("fetch")))
 
 

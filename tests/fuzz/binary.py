@@ -6,6 +6,7 @@ import io
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -51,12 +52,8 @@ def _splice(rng: Random, data: bytes) -> bytes:
 def _length(rng: Random, data: bytes) -> bytes:
     size = rng.choice((1, 2, 4, 8))
     value = rng.choice(_LENGTHS) % 2 ** (8 * size)
-    places = (
-        rng.randrange(len(data) + 1),
-        rng.randrange(min(len(data), 64) + 1),
-        max(len(data) - rng.randrange(64), 0),
-    )
-    place = rng.choice(places)
+    anywhere, head = rng.randrange(len(data) + 1), rng.randrange(min(len(data), 64) + 1)
+    place = rng.choice((anywhere, head, max(len(data) - rng.randrange(64), 0)))
     return data[:place] + value.to_bytes(size, rng.choice(("little", "big"))) + data[place + size :]
 
 
@@ -65,16 +62,7 @@ def _noise(rng: Random, data: bytes) -> bytes:
     return data[:place] + rng.randbytes(rng.choice((1, 16, 300))) + data[place:]
 
 
-_DAMAGES: tuple[Callable[[Random, bytes], bytes], ...] = (
-    _flip,
-    _flip,
-    _cut,
-    _repeat,
-    _splice,
-    _length,
-    _length,
-    _noise,
-)
+_DAMAGES = (_flip, _flip, _cut, _repeat, _splice, _length, _length, _noise)
 
 
 def mutate_safetensors(rng: Random, data: bytes) -> bytes:
@@ -176,13 +164,8 @@ def _attachment(rng: Random, record: Attachment) -> Attachment:
     name = (
         record.name if rng.random() < 0.7 else rng.choice(("", "../x.npy", "x.npy", "seed.npy", "é\n.npy", "a" * 9_999))
     )
-    return Attachment(
-        log_time=record.log_time,
-        create_time=record.create_time,
-        name=_text(name),
-        media_type=record.media_type,
-        data=mutate_npy(rng, record.data) if record.data[:6] == b"\x93NUMPY" else damaged(rng, record.data),
-    )
+    is_array = record.data[:6] == b"\x93NUMPY"
+    return replace(record, name=_text(name), data=(mutate_npy if is_array else damaged)(rng, record.data))
 
 
 def _message(rng: Random, record: Message) -> Message:
@@ -194,24 +177,18 @@ def _message(rng: Random, record: Message) -> Message:
         content = mutate_json(rng, record.data) if is_json else damaged(rng, record.data)
     except (ValueError, RecursionError):  # it is no JSON any more
         content = damaged(rng, record.data)
-    return Message(
-        channel_id=record.channel_id,
-        log_time=time,
-        data=content,
-        publish_time=time,
-        sequence=record.sequence,
-    )
+    return replace(record, log_time=time, data=content, publish_time=time)
 
 
 def _schema(rng: Random, record: Schema) -> Schema:
     encoding = rng.choice((record.encoding, "", "jsonschema", "ros2msg", "protobuf"))
     name = rng.choice((record.name, "", "x", "foxglove.RawImage", "foxglove.CompressedImage", "a\nb"))
-    return Schema(id=record.id, data=damaged(rng, record.data), encoding=encoding, name=name)
+    return replace(record, data=damaged(rng, record.data), encoding=encoding, name=name)
 
 
 def _channel(rng: Random, record: Channel) -> Channel:
-    return Channel(
-        id=record.id,
+    return replace(
+        record,
         topic=rng.choice((record.topic, "", "/x", "/" + "a" * 9_999, "/a\nb", "../x")),
         message_encoding=rng.choice((record.message_encoding, "", "json", "protobuf", "cdr")),
         metadata=rng.choice((record.metadata, {}, {"x": "y" * 9_999})),

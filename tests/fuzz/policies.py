@@ -27,8 +27,8 @@ def make_mlp(folder: Path) -> None:
 
 def _fit(folder: Path, *, resume: bool, init_from: Path | None = None) -> None:
     from manip_il.engine.describe import env_fingerprint, env_spec
-    from manip_il.learn.mlp.configuration_mlp import MLPConfig
-    from manip_il.learn.train import TrainConfig, fit
+    from manip_il.learn.fit_config import FitConfig
+    from manip_il.learn.train import fit
 
     from ..cli.made_runs import ENV
 
@@ -42,8 +42,8 @@ def _fit(folder: Path, *, resume: bool, init_from: Path | None = None) -> None:
         "episode_index": np.repeat(np.arange(4), ROWS // 4),
         "frame_index": np.tile(np.arange(ROWS // 4), 4),
     }
-    policy = MLPConfig(width=16, depth=1, device="cpu")
-    config = TrainConfig(steps=2, batch_size=8, log_freq=1, policy=policy, init_from=init_from)
+    policy = {"width": 16, "depth": 1, "device": "cpu"}
+    config = FitConfig(policy, steps=2, batch_size=8, log_freq=1, init_from=init_from)
     fit(table, config, folder / "run", spec=spec, fingerprint=env_fingerprint(ENV), resume=resume)
 
 

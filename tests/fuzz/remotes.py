@@ -19,28 +19,7 @@ from .target import Target
 from .trees import mutate_json
 
 STATUSES = (
-    200,
-    201,
-    204,
-    206,
-    301,
-    302,
-    304,
-    307,
-    400,
-    401,
-    402,
-    403,
-    404,
-    408,
-    409,
-    412,
-    413,
-    416,
-    429,
-    500,
-    503,
-    507,
+    *(200, 201, 204, 206, 301, 302, 304, 307, 400, 401, 402, 403, 404, 408, 409, 412, 413, 416, 429, 500, 503, 507),
 )
 HEADERS = (
     *("ETag", "X-Repo-Commit", "X-Linked-Etag", "X-Linked-Size", "Content-Range", "Content-Type", "Retry-After"),
@@ -57,7 +36,17 @@ VALUES = (
         "NaN",
         "1e9",
     ),
-    *("\x1b[31mred", "text/html", "0" * 40, '"' + "0" * 64 + '"', "RepoNotFound", "GatedRepo", "EntryNotFound"),
+    *(
+        "NaN",
+        "1e9",
+        "\x1b[31mred",
+        "text/html",
+        "0" * 40,
+        '"' + "0" * 64 + '"',
+        "RepoNotFound",
+        "GatedRepo",
+        "EntryNotFound",
+    ),
 )
 
 
@@ -127,8 +116,8 @@ def make_small_policy(folder: Path) -> Path:
     return folder
 
 
-class HubTalk:
-    """A Hub with one policy to pull, and room for another one to push."""
+class Conversation:
+    """A server with one policy to pull, and room for another one to push."""
 
     def __init__(self, answers: int):
         self.answers = answers
@@ -136,6 +125,10 @@ class HubTalk:
     def make(self, folder: Path) -> None:
         make_small_policy(folder / "policy")
         (folder / "script.json").write_text(json.dumps({"answers": self.answers}))
+
+
+class HubConversation(Conversation):
+    """A Hub with one policy to pull, and room for another one to push."""
 
     @contextlib.contextmanager
     def around(self, folder: Path) -> Iterator[None]:
@@ -174,15 +167,10 @@ class HubTalk:
         do_push(folder / "policy", "hf://user/new")
 
 
-class S3Talk:
+class S3Conversation(Conversation):
     """A bucket with one policy to pull; each push goes to a folder of its own."""
 
-    def __init__(self, answers: int):
-        self.answers, self._pushes = answers, 0
-
-    def make(self, folder: Path) -> None:
-        make_small_policy(folder / "policy")
-        (folder / "script.json").write_text(json.dumps({"answers": self.answers}))
+    _pushes = 0
 
     @contextlib.contextmanager
     def around(self, folder: Path) -> Iterator[None]:
@@ -229,7 +217,7 @@ def _no_waiting(module: Any) -> Iterator[None]:
         yield
 
 
-_PULL, _PUSH, _S3_PULL, _S3_PUSH = HubTalk(12), HubTalk(30), S3Talk(10), S3Talk(20)
+_PULL, _PUSH, _S3_PULL, _S3_PUSH = HubConversation(12), HubConversation(30), S3Conversation(10), S3Conversation(20)
 TARGETS = (
     Target("hub pull", _PULL.make, "script.json", mutate_script, (_PULL.pull,), _PULL.around, share=0.5),
     Target("hub push", _PUSH.make, "script.json", mutate_script, (_PUSH.push,), _PUSH.around, share=0.5),

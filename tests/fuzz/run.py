@@ -208,18 +208,18 @@ def main() -> int:
     parser.add_argument("--target", default="", help="of this one alone; of several by the beginning of their names")
     parser.add_argument("--number", type=int, help="this one input, in this process")
     parser.add_argument("--output", type=Path, default=Path("runs/fuzz"), help="where findings are kept")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     from .table import TARGETS
 
-    output = asked.output.absolute()
-    targets = [target for target in TARGETS if target.name == asked.target]
-    targets = targets or [target for target in TARGETS if target.name.startswith(asked.target)]
+    output = options.output.absolute()
+    targets = [target for target in TARGETS if target.name == options.target]
+    targets = targets or [target for target in TARGETS if target.name.startswith(options.target)]
     if not targets:
         parser.error(f"no such target; there are: {', '.join(target.name for target in TARGETS)}")
-    if asked.number is not None:
-        return one(targets[0], asked.number, asked.seed, output)
+    if options.number is not None:
+        return one(targets[0], options.number, options.seed, output)
     shutil.rmtree(output, ignore_errors=True)
-    print(f"{asked.inputs:,} inputs over {len(targets)} targets, seed {asked.seed}", flush=True)
-    run = Run(targets, asked.inputs, asked.seed, output)
-    run.run(asked.workers)
+    print(f"{options.inputs:,} inputs over {len(targets)} targets, seed {options.seed}", flush=True)
+    run = Run(targets, options.inputs, options.seed, output)
+    run.run(options.workers)
     return run.report()

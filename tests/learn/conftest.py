@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from manip_il.data.schema import RobotTaskSpec
-from manip_il.learn.threads import threads
+from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.columns import LEARNING_COLUMNS
+from manip_il.learn.limits import threads
 
 N, K, EPISODES, LENGTH = 4, 6, 12, 20
 
@@ -16,7 +21,7 @@ def _one_thread():
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def spec() -> RobotTaskSpec:
     return RobotTaskSpec(
         robot="arm",
@@ -51,6 +56,47 @@ def make_table(seed: int = 0) -> dict[str, np.ndarray]:
 @pytest.fixture
 def table() -> dict[str, np.ndarray]:
     return make_table()
+
+
+def make_gapped() -> dict[str, np.ndarray]:
+    table = make_table()
+    table["label_valid"][::10] = 0
+    return table
+
+
+@pytest.fixture
+def gapped() -> dict[str, np.ndarray]:
+    """The table with a tenth of its labels invalid."""
+    return make_gapped()
+
+
+@pytest.fixture(scope="session")
+def dataset(spec, tmp_path_factory):
+    """A LeRobot dataset of the learning columns of the table with a tenth of its labels invalid."""
+    from lerobot.datasets import LeRobotDataset
+
+    table, root = make_gapped(), tmp_path_factory.mktemp("lerobot") / "dataset"
+    columns = {key: value for key, value in features(spec).items() if key in LEARNING_COLUMNS}
+    made = LeRobotDataset.create("manip/test", spec.fps, columns, root=root, use_videos=False)
+    for row in range(EPISODES * LENGTH):
+        made.add_frame({key: table[key][row] for key in columns} | {"task": spec.instruction})
+        if row % LENGTH == LENGTH - 1:
+            made.save_episode()
+    made.finalize()
+    return LeRobotDataset("manip/test", root=root)
+
+
+@pytest.fixture
+def act(spec, tmp_path) -> Path:
+    """A checkpoint of LeRobot's `act`."""
+    from .tiny_policies import write_checkpoint
+
+    return write_checkpoint(tmp_path / "policy", "act", spec, meta=CheckpointMeta.of(spec))
+
+
+@pytest.fixture
+def pictured(spec) -> RobotTaskSpec:
+    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
 
 
 @pytest.fixture

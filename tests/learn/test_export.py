@@ -25,10 +25,10 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.learn import export
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.export import EXTRA_FILE, TOLERANCE, Exported, export_onnx, export_torchscript
+from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.losses import LOSSES
-from manip_il.learn.mlp import MLPConfig
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.train import TrainConfig, fit
+from manip_il.learn.train import fit
 
 from .tiny_policies import edit_config, write_checkpoint
 
@@ -48,7 +48,7 @@ def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
 def mlp(request, tmp_path) -> Path:
     """A few steps of training, so that units, ranges and weights are those of real data."""
     spec, table = sample()
-    config = TrainConfig(steps=20, batch_size=32, policy=MLPConfig(loss=request.param, width=64))
+    config = FitConfig({"loss": request.param, "width": 64}, steps=20, batch_size=32)
     return fit(table, config, tmp_path / "run", spec=spec)
 
 

@@ -15,7 +15,7 @@ from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.lerobot_policy import EpisodePolicy
 from manip_il.learn.policy import LearnedPolicy
 
-from .tiny_policies import edit_config, write_checkpoint
+from .tiny_policies import edit_config, observations, refused, write_checkpoint
 
 STEPS = 11
 POLICIES = {
@@ -31,23 +31,12 @@ def checkpoint(request, spec, tmp_path) -> Path:
     return write_checkpoint(tmp_path / "policy", kind, spec, **options)
 
 
-@pytest.fixture
-def act(spec, tmp_path) -> Path:
-    return write_checkpoint(tmp_path / "policy", "act", spec)
-
-
-def observations(episode: int) -> tuple[np.ndarray, np.ndarray]:
-    """What an episode sees, (STEPS, n) and (STEPS, k)."""
-    rng = np.random.default_rng(episode)
-    return rng.normal(size=(STEPS, 4)).astype(np.float32), rng.normal(size=(STEPS, 6)).astype(np.float32)
-
-
 def actions(policy: LearnedPolicy, starts: dict[int, int]) -> dict[int, np.ndarray]:
     """What a policy does in episodes that begin at their `starts`, (STEPS, n) each."""
     done: dict[int, list[np.ndarray]] = {episode: [] for episode in starts}
     for step in range(STEPS + max(starts.values())):
         running = [episode for episode, start in starts.items() if start <= step < start + STEPS]
-        rows = [[column[step - starts[episode]] for column in observations(episode)] for episode in running]
+        rows = [[column[step - starts[episode]] for column in observations(STEPS, episode)] for episode in running]
         states, environments = (np.array(column) for column in zip(*rows, strict=True))
         for episode, action in zip(running, policy.act(states, environments, None, running), strict=True):
             done[episode].append(action)
@@ -60,7 +49,7 @@ def lerobots_own(checkpoint: Path, episode: int) -> np.ndarray:
     before, after = make_pre_post_processors(policy.config, str(checkpoint))
     policy.reset()
     done = []
-    for step, (state, environment) in enumerate(zip(*observations(episode), strict=True)):
+    for step, (state, environment) in enumerate(zip(*observations(STEPS, episode), strict=True)):
         batch = {"observation.state": torch.from_numpy(state[None]), "task": ["reach"]}
         batch["observation.environment_state"] = torch.from_numpy(environment[None])
         with torch.random.fork_rng(devices=[]), torch.inference_mode():
@@ -80,24 +69,8 @@ def test_an_episode_does_not_feel_its_neighbours_nor_when_it_begins(checkpoint):
     assert not np.array_equal(beside[8], alone)
 
 
-@pytest.mark.slow
-def test_a_fresh_process_acts_bit_equal(warm_lerobot, spec, tmp_path):
-    checkpoint = write_checkpoint(tmp_path / "policy", "diffusion", spec)
-    states, environments = observations(3)
-    np.savez(tmp_path / "in.npz", states=states, environments=environments)
-    code = (
-        "import sys, numpy as np; from manip_il.learn.policy import LearnedPolicy;"
-        "z = np.load(sys.argv[2]); p = LearnedPolicy.load(sys.argv[1]);"
-        "a = [p.act(s[None], e[None], None, [3])[0] for s, e in zip(z['states'], z['environments'])];"
-        "np.save(sys.argv[3], a)"
-    )
-    run = warm_lerobot.run("python", "-c", code, checkpoint, tmp_path / "in.npz", tmp_path / "out.npy")
-    assert (run.returncode, run.stdout) == (0, ""), run.stderr
-    assert np.array_equal(np.load(tmp_path / "out.npy"), actions(LearnedPolicy.load(checkpoint), {3: 0})[3])
-
-
 def test_lerobots_policies_have_no_distribution_here(act):
-    policy, (states, environments) = LearnedPolicy.load(act), observations(1)
+    policy, (states, environments) = LearnedPolicy.load(act), observations(STEPS, 1)
     with pytest.raises(UsageError, match="a policy of type 'act' has no distribution of actions here"):
         policy.sample(states, environments, {}, [np.random.default_rng(0)])
     with pytest.raises(UsageError, match="expected an mlp with loss gaussian, mixture, categorical"):
@@ -106,7 +79,7 @@ def test_lerobots_policies_have_no_distribution_here(act):
 
 def test_an_episode_that_is_left_out_or_reset_begins_anew(act):
     policy = LearnedPolicy.load(act)
-    states, environments = observations(0)
+    states, environments = observations(STEPS, 0)
     one, two = (states[:1], environments[:1]), (states[1:2], environments[1:2])
     first = policy.act(*one, None, [0])
     assert not np.array_equal(policy.act(*one, None, [0]), first)  # the second action of the chunk
@@ -118,7 +91,7 @@ def test_an_episode_that_is_left_out_or_reset_begins_anew(act):
 
 def test_draws_belong_to_the_episode_and_leave_the_global_generator_alone(spec, tmp_path):
     policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "diffusion", spec))
-    state, environment = (np.repeat(column[:1], 2, axis=0) for column in observations(0))
+    state, environment = (np.repeat(column[:1], 2, axis=0) for column in observations(STEPS, 0))
     generator = torch.get_rng_state()
     left, right = policy.act(state, environment, None, [1, 2])
     assert torch.equal(torch.get_rng_state(), generator)
@@ -130,11 +103,11 @@ def test_draws_belong_to_the_episode_and_leave_the_global_generator_alone(spec, 
 
 def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
     policy = LearnedPolicy.load(checkpoint)
-    states, environments = observations(0)
+    states, environments = observations(STEPS, 0)
     policy.act(states[:2], environments[:2], None, [4, 5])
-    chooser = policy._chooser
-    assert isinstance(chooser, EpisodePolicy)
-    one, two = (memory.policy for memory in chooser._memories.values())
+    inner = policy._policy
+    assert isinstance(inner, EpisodePolicy)
+    one, two = (memory.policy for memory in inner._memories.values())
     assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
     name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_queues"
     name = name if hasattr(one, name) else "_action_queue"
@@ -148,7 +121,7 @@ def test_no_rows_give_no_actions(act):
 def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
     seen = []
     monkeypatch.setattr("lerobot.policies.act.modeling_act.ACTPolicy.select_action", lambda _, batch: _act(seen, batch))
-    LearnedPolicy.load(act, task="put it there").act(*observations(0))
+    LearnedPolicy.load(act, task="put it there").act(*observations(STEPS, 0))
     assert seen == [["put it there"]] * STEPS
 
 
@@ -158,7 +131,7 @@ def _act(seen: list, batch: dict) -> torch.Tensor:
 
 
 def test_a_policy_of_mixed_precision_acts_in_it(act):
-    states, environments = observations(0)
+    states, environments = observations(STEPS, 0)
     full = LearnedPolicy.load(act).act(states, environments)
     edit_config(act, use_amp=True)
     mixed = LearnedPolicy.load(act).act(states, environments)
@@ -188,28 +161,20 @@ def test_missing_packages_are_named_with_their_extra(act, monkeypatch):
     settings = json.loads((act / "config.json").read_text())
     wanted = {"type", "input_features", "output_features", "horizon", "n_obs_steps"}
     (act / "config.json").write_text(json.dumps({key: settings[key] for key in wanted}))
-    with pytest.raises(
-        ManipError, match=r"type 'diffusion', which needs more packages.*pip install 'lerobot\[diffusion\]'"
-    ):
-        LearnedPolicy.load(act)
+    refused(act, r"type 'diffusion', which needs more packages.*pip install 'lerobot\[diffusion\]'")
 
 
-def test_weights_of_another_size_and_weights_that_are_none_are_one_line(act):
+def test_weights_of_another_size_are_one_line(act):
     edit_config(act, dim_model=16)
     with pytest.raises(ManipError, match="do not match") as caught:
         LearnedPolicy.load(act)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 600
-    edit_config(act, dim_model=32)
-    (act / "model.safetensors").write_bytes(b"PK not a tensor in here")
-    with pytest.raises(ManipError, match=r"model\.safetensors cannot be read"):
-        LearnedPolicy.load(act)
 
 
 def test_an_option_that_lerobot_does_not_know_is_one_line(act):
     edit_config(act, no_such_option=3)
-    with pytest.raises(ManipError, match=r"LeRobot cannot load it.*no_such_option"):
-        LearnedPolicy.load(act)
+    refused(act, r"LeRobot cannot load it.*no_such_option")
 
 
 def test_a_graphics_card_that_is_not_there_is_refused(act):
@@ -219,14 +184,11 @@ def test_a_graphics_card_that_is_not_there_is_refused(act):
         LearnedPolicy.load(act, device="cuda")
 
 
-def test_pictures_must_be_those_of_the_checkpoint(spec, tmp_path):
-    from dataclasses import replace
-
-    pictured = replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
+def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
     meta = CheckpointMeta.of(pictured, observation="images", look={})
     policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "act", pictured, "images", meta=meta))
-    assert (policy.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
-    states, environments = (column[:2] for column in observations(0))
+    assert (policy.interface.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
+    states, environments = (column[:2] for column in observations(STEPS, 0))
     picture = np.zeros((2, 32, 48, 3), np.uint8)
     dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])
     policy.reset([0, 1])

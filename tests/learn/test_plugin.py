@@ -11,51 +11,20 @@ import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
-from manip_il.data.schema import features
-from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.columns import read_columns
+from manip_il.errors import MismatchError
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
-
-LEARNING = ("observation.state", "observation.environment_state", "action", "label_valid")
-
-
-@pytest.fixture
-def dataset(table, spec, tmp_path):
-    """A LeRobot dataset of `table`'s learning columns, with a tenth of the labels invalid."""
-    from lerobot.datasets import LeRobotDataset
-
-    table["label_valid"][::10] = 0
-    columns = {key: value for key, value in features(spec).items() if key in LEARNING}
-    dataset = LeRobotDataset.create("manip/test", spec.fps, columns, root=tmp_path / "dataset", use_videos=False)
-    for row in range(60):
-        dataset.add_frame({key: table[key][row] for key in LEARNING} | {"task": spec.instruction})
-        if row % 20 == 19:
-            dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDataset("manip/test", root=tmp_path / "dataset")
 
 
 def test_the_plugin_is_known_by_name_after_import():
     assert type(make_policy_config("mlp")).__module__ == "manip_il.learn.mlp.configuration_mlp"
 
 
-def test_columns_come_back_from_a_lerobot_dataset_as_they_went_in(dataset, table):
-    columns = read_columns(dataset.root)
-    for key in LEARNING:
-        assert np.array_equal(columns[key].reshape(60, -1), table[key][:60])
-
-
-def test_a_dataset_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ManipError, match="no folder"):
-        read_columns(tmp_path)
-
-
-def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset, table):
+def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset, gapped):
     policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
     assert isinstance(policy, MLPPolicy)
-    valid = table["label_valid"][:60, 0] != 0
-    relative = (table["action"][:60, :-1] - table["observation.state"][:60, :-1])[valid]
+    valid = gapped["label_valid"][:, 0] != 0
+    relative = (gapped["action"][:, :-1] - gapped["observation.state"][:, :-1])[valid]
     np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
     np.testing.assert_allclose(policy.model.target_scale[:-1], relative.std(0), rtol=1e-4)
     assert sorted(policy.config.input_features) == ["observation.environment_state", "observation.state"]
@@ -81,7 +50,7 @@ def test_features_that_do_not_fit_are_refused(dataset):
 
 
 @pytest.mark.slow
-def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, dataset, table, tmp_path):
+def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, dataset, gapped, tmp_path):
     def lerobot_train(*options: str) -> None:
         run = warm_lerobot.run("lerobot-train", *options, "--policy.discover_packages_path=manip_il.learn.mlp")
         assert run.returncode == 0, run.stderr[-3000:]
@@ -94,9 +63,9 @@ def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, datase
     )  # fmt: skip
     last = tmp_path / "run/checkpoints/last/pretrained_model"
     policy = LearnedPolicy.load(last)
-    actions = policy.act(table["observation.state"][:60], table["observation.environment_state"][:60])
-    relative = table["action"][:60, :-1] - table["observation.state"][:60, :-1]
-    assert np.abs(actions - table["action"][:60])[:, :-1].mean() < 0.4 * np.abs(relative - relative.mean(0)).mean()
+    actions = policy.act(gapped["observation.state"], gapped["observation.environment_state"])
+    relative = gapped["action"][:, :-1] - gapped["observation.state"][:, :-1]
+    assert np.abs(actions - gapped["action"])[:, :-1].mean() < 0.4 * np.abs(relative - relative.mean(0)).mean()
 
     config = tmp_path / "run/checkpoints/000100/pretrained_model/train_config.json"
     assert json.loads(config.read_text())["policy"]["type"] == "mlp"

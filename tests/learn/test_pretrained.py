@@ -10,20 +10,9 @@ from pathlib import Path
 import pytest
 
 from manip_il.errors import ManipError, MismatchError
-from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import Interface, check_interface, read_interface
 
-from .tiny_policies import edit_config, write_checkpoint
-
-
-@pytest.fixture
-def act(spec, tmp_path) -> Path:
-    return write_checkpoint(tmp_path / "policy", "act", spec)
-
-
-@pytest.fixture
-def pictured(spec):
-    return replace(spec, cameras=("front", "wrist"), image_size=(32, 48))
+from .tiny_policies import edit_config, refused, write_checkpoint
 
 
 class Bomb:
@@ -54,24 +43,19 @@ def test_a_folder_with_a_pickle_is_refused_and_the_pickle_not_opened(name, act, 
     mark = tmp_path / "opened"
     (act / name).parent.mkdir(exist_ok=True)
     (act / name).write_bytes(pickle.dumps(Bomb(mark)))
-    with pytest.raises(ManipError, match=rf"{name} is a pickle.*convert it to safetensors"):
-        LearnedPolicy.load(act)
+    refused(act, rf"{name} is a pickle.*convert it to safetensors")
     assert not mark.exists()
     (act / "model.safetensors").unlink()
-    with pytest.raises(ManipError, match=rf"{name} is a pickle"):
-        LearnedPolicy.load(act)
+    refused(act, rf"{name} is a pickle")
 
 
 def test_a_folder_without_weights_says_what_is_missing(act):
     (act / "model.safetensors").rename(act / "adapter_model.safetensors")
-    with pytest.raises(ManipError, match=r"no model\.safetensors in .*adapter"):
-        LearnedPolicy.load(act)
+    refused(act, r"no model\.safetensors in .*adapter")
     (act / "adapter_model.safetensors").unlink()
-    with pytest.raises(ManipError, match=r"no model\.safetensors in .*weights are missing"):
-        LearnedPolicy.load(act)
+    refused(act, r"no model\.safetensors in .*weights are missing")
     (act / "config.json").unlink()
-    with pytest.raises(ManipError, match=r"no config\.json in"):
-        LearnedPolicy.load(act)
+    refused(act, r"no config\.json in")
 
 
 @pytest.mark.parametrize(
@@ -105,14 +89,11 @@ def test_features_that_cannot_be_read_are_refused(act):
 def test_a_downloaded_processor_cannot_name_code_to_run(act):
     path = act / "policy_preprocessor.json"
     path.write_text(json.dumps({"name": "x", "steps": [{"class": "subprocess.Popen", "config": {"args": "true"}}]}))
-    with pytest.raises(ManipError, match=r"subprocess\.Popen"):
-        LearnedPolicy.load(act)
+    refused(act, r"subprocess\.Popen")
     path.write_text("[")
-    with pytest.raises(ManipError, match=r"policy_preprocessor\.json is not valid JSON"):
-        LearnedPolicy.load(act)
+    refused(act, r"policy_preprocessor\.json is not valid JSON")
     path.unlink()
-    with pytest.raises(ManipError, match=r"no .*policy_preprocessor\.json"):
-        LearnedPolicy.load(act)
+    refused(act, r"no .*policy_preprocessor\.json")
 
 
 @pytest.mark.parametrize(
@@ -141,5 +122,4 @@ def test_pictures_that_a_policy_fills_in_itself_are_not_asked_for(act):
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
 def test_a_file_of_another_user_is_said_to_be_that_and_not_missing(name, act, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, mode: Path(path).name != name)
-    with pytest.raises(ManipError, match=rf"{name} may not be read by this user \(uid \d+\); run as its owner"):
-        LearnedPolicy.load(act)
+    refused(act, rf"{name} may not be read by this user \(uid \d+\); run as its owner")

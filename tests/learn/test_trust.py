@@ -12,22 +12,17 @@ import pytest
 
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
-from manip_il.learn.choices import policy_class, policy_config, policy_types
+from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.trust import _NAMES, PLAIN, require_trust
+from manip_il.learn.pretrained import _NAMES, PLAIN, require_trust
 from manip_il.sim.env import EnvConfig
 
-from .tiny_policies import edit_config, write_checkpoint
+from .tiny_policies import edit_config
 
 EVIL = {
     "registry_name": "action_tokenizer_processor",
     "config": {"action_tokenizer_name": "evil/tokenizer", "trust_remote_code": True},
 }
-
-
-@pytest.fixture
-def act(spec, tmp_path) -> Path:
-    return write_checkpoint(tmp_path / "policy", "act", spec)
 
 
 @pytest.fixture

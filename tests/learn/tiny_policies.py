@@ -7,14 +7,29 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 import torch
 from lerobot.configs import FeatureType
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
 from manip_il.data.schema import RobotTaskSpec, features
+from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
-from manip_il.learn.choices import policy_types
-from manip_il.learn.observation import policy_features
+from manip_il.learn.lerobot_config import policy_features, policy_types
+from manip_il.learn.policy import LearnedPolicy
+
+ACT = {  # a policy that plans, by its options
+    "type": "act",
+    "device": "cpu",
+    "chunk_size": 4,
+    "n_action_steps": 2,
+    "dim_model": 16,
+    "n_heads": 2,
+    "dim_feedforward": 16,
+    "n_encoder_layers": 1,
+    "n_vae_encoder_layers": 1,
+}
 
 TINY: dict[str, dict[str, Any]] = {
     "act": {
@@ -64,6 +79,20 @@ def write_checkpoint(
     if meta is not None:
         (folder / META_FILE).write_text(json.dumps(asdict(meta)))
     return folder
+
+
+def observations(rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Joint states (rows, 4) and environment states (rows, 6) of noise."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, 4)).astype(np.float32), rng.normal(size=(rows, 6)).astype(np.float32)
+
+
+def refused(policy: Path, words: str) -> None:
+    """Check that a policy is refused in one line."""
+    with pytest.raises(ManipError, match=words) as caught:
+        LearnedPolicy.load(policy)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1_000
 
 
 def edit_config(folder: Path, **changes: Any) -> None:

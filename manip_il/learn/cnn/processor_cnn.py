@@ -17,7 +17,7 @@ def make_cnn_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Return the mlp's: rename, batch, device, and a normaliser that is the identity.
+    """Return the mlp's: rename, batch (B, ...), device, and a normaliser that is the identity.
 
     LeRobot looks for them by this name.
     """

@@ -44,7 +44,7 @@ class MLPConfig(PreTrainedConfig):
     push_to_hub: bool = False  # type: ignore[assignment]
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_identity_mapping)
 
-    # Read by lerobot-train alone; `manip_il.learn.train` has its own in `TrainConfig`.
+    # Read by lerobot-train alone; `manip_il.learn.train` has its own.
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-4
     scheduler_warmup_steps: int = 100

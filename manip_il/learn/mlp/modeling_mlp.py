@@ -8,11 +8,11 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
+from manip_il.data.lerobot_io import read_tables
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
-from manip_il.learn.columns import INDEX, Table, learning_rows, read_columns, valid_frames
+from manip_il.learn.columns import INDEX, Table, learning_rows, valid_frames
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
-from manip_il.learn.network import MLPNetwork
-from manip_il.learn.normalise import fit_statistics
+from manip_il.learn.network import MLPNetwork, fit_statistics
 
 
 class MLPPolicy(PreTrainedPolicy):
@@ -36,11 +36,13 @@ class MLPPolicy(PreTrainedPolicy):
         self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
             roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
-            self._learn_columns(read_columns(*roots), config.loss)
+            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
+            names = [key for key in wanted if key in dataset_meta.features]
+            self._learn_columns(read_tables(roots, [*names, INDEX]), config.loss)
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return mean loss over the rows with a valid label; with `reduction="none"` each row's, 0 without one."""
+        """Return the mean loss of rows with a valid label; with `reduction="none"` each row's, (B,), 0 without one."""
         losses = self._row_losses(self._inputs(batch), batch)
         valid = self._valid(batch)
         # `where`, as 0 * inf is NaN
@@ -62,7 +64,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def reset(self) -> None:
-        """Do nothing: the policy has no memory."""
+        """Forget nothing: the policy has no memory."""
 
     @override
     def get_optim_params(self) -> Any:
@@ -76,9 +78,8 @@ class MLPPolicy(PreTrainedPolicy):
         self.model = MLPNetwork(width, features[STATE].shape[0], config.network_shape())
 
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        state, action = batch[STATE], batch[ACTION]
-        relative = torch.cat([action[:, :-1] - state[:, :-1], action[:, -1:]], dim=-1)
-        return self.model.row_losses(self.model.encode(inputs), self.model.encode_targets(relative))
+        targets = self.model.encode_targets(self.model.relative(batch[ACTION], inputs))
+        return self.model.row_losses(self.model.encode(inputs), targets)
 
     def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
         return torch.cat([batch[key] for key in self.inputs], dim=-1)

@@ -16,7 +16,7 @@ def make_mlp_pre_post_processors(
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]:
-    """Return LeRobot's default pair: rename, batch, device, normalise; and back.
+    """Return LeRobot's default pair: rename, batch (B, ...), device, normalise; and back.
 
     `config.normalization_mapping` makes the normaliser steps the identity. They stay in the
     pipelines because LeRobot's tools override them by name.

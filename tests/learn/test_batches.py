@@ -1,13 +1,14 @@
-"""Crops and colour jitter: what they keep, what bounds them, and that draws are the generator's alone."""
+"""Rows in their order, and crops and colour jitter of pictures: draws are the generator's or the seed's alone."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from manip_il.errors import MismatchError, UsageError
-from manip_il.learn.augment import Augment, to_float
+from manip_il.learn.batches import Augment, ShuffledRows, WeightedRows, order_of, to_float
 
 NONE = Augment(0, 0.0, 0.0, 0.0)
 
@@ -162,3 +163,31 @@ def test_batches_that_are_no_pictures_are_refused(pictures: Tensor) -> None:
     for batch in (pictures.float(), pictures[0], pictures.permute(0, 2, 3, 1)):
         with pytest.raises(MismatchError, match=r"type of pictures differs.*uint8 \(B, \[T,\] 3, H, W\)"):
             Augment()(batch, generator())
+
+
+def test_every_row_comes_once_an_epoch():
+    order = ShuffledRows(10, 4, seed=0)
+    drawn = torch.cat([order.batch(step) for step in range(5)])
+    assert sorted(drawn[:10].tolist()) == sorted(drawn[10:].tolist()) == list(range(10))
+    assert drawn[:10].tolist() != drawn[10:].tolist()
+    assert torch.equal(ShuffledRows(10, 4, seed=0).batch(3), order.batch(3))
+    assert len(ShuffledRows(3, 8, seed=0).batch(0)) == 8
+
+
+def test_rows_are_drawn_as_often_as_they_weigh():
+    weights = np.array([1.0, 0.0, 3.0, 0.0])
+    order = WeightedRows(weights, 50, seed=1)
+    counts = torch.bincount(torch.cat([order.batch(step) for step in range(200)]), minlength=4).numpy()
+    assert counts[[1, 3]].tolist() == [0, 0]
+    assert counts[2] / counts.sum() == pytest.approx(0.75, abs=5 * np.sqrt(0.75 * 0.25 / 10_000))
+
+
+def test_a_weighted_batch_depends_on_seed_and_step_alone():
+    weights = np.ones(100)
+    assert torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(5))
+    assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(6))
+    assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 2).batch(5))
+
+
+def test_without_weights_every_row_comes_once_an_epoch():
+    assert isinstance(order_of(10, None, 5, 0), ShuffledRows)

@@ -1,22 +1,125 @@
-"""Pictures on their way into a network: to float, with random crops and colour jitter where asked."""
+"""Batches on their way to the network: the order of the samples, batches made ahead, and pictures as floats.
+
+Pictures may be cropped and their colours changed by chance while learning.
+"""
 
 from __future__ import annotations
 
 import math
+import queue
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manip_il.errors import MismatchError, UsageError
 
+_END = object()
 _AT_ONCE = 16  # pictures: what is made of them on the way stays near the processor
 _GREY = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
 
 
+class ShuffledRows:
+    """Row numbers in batches, every row once an epoch, in an order of its own each epoch.
+
+    A batch is a function of the seed and the step alone, so there is no state to save.
+    """
+
+    def __init__(self, rows: int, batch_size: int, seed: int) -> None:
+        self.rows, self.batch_size, self.seed = rows, batch_size, seed
+        self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
+
+    def batch(self, step: int) -> torch.Tensor:
+        """Return row numbers of the batch of `step`, (batch_size,)."""
+        start, end = step * self.batch_size, (step + 1) * self.batch_size
+        pieces = []
+        while start < end:
+            epoch, place = divmod(start, self.rows)
+            piece = self._permutation(epoch)[place : place + end - start]
+            pieces.append(piece)
+            start += len(piece)
+        return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+
+    def _permutation(self, epoch: int) -> torch.Tensor:
+        if epoch != self._epoch:
+            seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0] >> 1)
+            generator = torch.Generator().manual_seed(seed)
+            self._epoch, self._order = epoch, torch.randperm(self.rows, generator=generator)
+        return self._order
+
+
+class WeightedRows:
+    """Row numbers in batches, each drawn with a probability in proportion to its weight, (N,), with replacement."""
+
+    def __init__(self, weights: NDArray[np.float64], batch_size: int, seed: int) -> None:
+        self._edges = np.cumsum(weights) / weights.sum()
+        self.batch_size, self.seed = batch_size, seed
+
+    def batch(self, step: int) -> torch.Tensor:
+        """Return row numbers of the batch of `step`, (batch_size,)."""
+        draws = np.random.default_rng([self.seed, step]).uniform(size=self.batch_size)
+        rows = np.searchsorted(self._edges, draws, side="right")
+        return torch.from_numpy(np.minimum(rows, len(self._edges) - 1))
+
+
+def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, seed: int) -> ShuffledRows | WeightedRows:
+    """Return an order by weights, (N,), where there are some, else every row once an epoch."""
+    return ShuffledRows(rows, batch_size, seed) if weights is None else WeightedRows(weights, batch_size, seed)
+
+
+@contextmanager
+def prefetched[T](items: Iterator[T], depth: int = 2) -> Iterator[Iterator[T]]:
+    """Give the same items in order, up to `depth` of them made ahead by a thread, whose errors are raised here."""
+    ready: queue.Queue[object] = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def put(item: object) -> bool:
+        while not stop.is_set():
+            try:
+                ready.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def work() -> None:
+        try:
+            for item in items:
+                if not put(item):
+                    return
+            put(_END)
+        except BaseException as error:
+            put(error)
+
+    def take() -> Iterator[T]:
+        while (item := ready.get()) is not _END:
+            if isinstance(item, BaseException):
+                raise item
+            yield item  # type: ignore[misc]
+
+    thread = threading.Thread(target=work, daemon=True, name="prefetch")
+    thread.start()
+    try:
+        yield take()
+    finally:
+        stop.set()
+        thread.join()
+
+
 def to_float(pictures: Tensor) -> Tensor:
-    """Return levels 0 to 255 as float32 in [0, 1]: the values that LeRobot's loader gives."""
+    """Return levels 0 to 255 (B, ...) as float32 in [0, 1]: the values that LeRobot's loader gives."""
     return pictures.to(torch.float32).div_(255)
+
+
+def pictures_to_float(batch: dict[str, Any], cameras: Iterable[str]) -> dict[str, Any]:
+    """Return the batch with its uint8 pictures, (B, 3, H, W), as float32 in [0, 1]."""
+    return batch | {key: to_float(batch[key]) for key in cameras if batch[key].dtype == torch.uint8}
 
 
 @dataclass(frozen=True)
@@ -41,7 +144,7 @@ class Augment:
                 raise UsageError(f"augmentation {field.name}={value}; expected {expected}")
 
     def __call__(self, pictures: Tensor, generator: torch.Generator) -> Tensor:
-        """Pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
+        """Return pictures uint8 (B, 3, H, W) or (B, T, 3, H, W), on any device, as float32 of that shape in [0, 1].
 
         One draw a sample, from a generator on the CPU; it is the same for all T.
         """
@@ -54,8 +157,8 @@ class Augment:
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
         moves, factors = self._draw(len(pictures), math.prod(pictures.shape[1:-3]), generator)
         numbers = factors.to(flat.device)
-        sides = (each.split(_AT_ONCE) for each in (changed, flat, moves, numbers))
-        for target, source, move, factor in zip(*sides, strict=True):
+        parts = (each.split(_AT_ONCE) for each in (changed, flat, moves, numbers))
+        for target, source, move, factor in zip(*parts, strict=True):
             _crop(source, move, self.shift, target)
             if self.brightness or self.contrast or self.saturation:
                 _jitter(target, factor)

@@ -1,15 +1,29 @@
+"""Options of LeRobot's, by its names: of policies, optimisers and schedules, and what a policy sees."""
+
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import pytest
 import torch
+from lerobot.configs import FeatureType
 from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
+from manip_il.data.schema import features
 from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.learn.choices import choice, option_lines, policy_class, policy_config, policy_types
+from manip_il.learn.fit_config import NOT_OURS, FitConfig, check_names, policy_files, policy_options
+from manip_il.learn.lerobot_config import (
+    choice,
+    option_lines,
+    policy_class,
+    policy_config,
+    policy_features,
+    policy_types,
+)
+from manip_il.learn.pretrained import observation_of
 
 
 def test_every_policy_of_lerobot_and_ours_is_known() -> None:
@@ -20,10 +34,7 @@ def test_options_have_lerobots_names_and_types() -> None:
     config = policy_config({"type": "diffusion", "down_dims": [32, 64], "horizon": "16", "device": "cpu"})
     assert isinstance(config, DiffusionConfig)
     assert (config.down_dims, config.horizon) == ((32, 64), 16)
-
-
-def test_nothing_is_uploaded_unasked() -> None:
-    assert policy_config({"type": "act", "device": "cpu"}).push_to_hub is False
+    assert config.push_to_hub is False  # LeRobot's default is to upload
 
 
 @pytest.mark.parametrize(
@@ -73,13 +84,13 @@ def test_a_checkpoint_gives_its_options_and_they_can_be_changed(tmp_path) -> Non
 
 
 def test_the_help_lists_a_policys_options() -> None:
-    rows = dict(option_lines(policy_class("act"), "policy"))
+    rows = dict(option_lines("act"))
     assert rows["--policy.chunk_size"] == "100"
     assert "--policy.push_to_hub" not in rows
 
 
 def actions(config: Any) -> int:
-    """Of a plan, before the next one is made."""
+    """The actions that are taken of a plan."""
     return config.n_action_steps
 
 
@@ -126,3 +137,89 @@ def test_what_the_user_gives_stays_as_it_is(tmp_path) -> None:
 def test_packages_that_a_policy_needs_are_named() -> None:
     with pytest.raises(UsageError, match=r"--policy\.type=eo1: 'transformers' is required"):
         policy_config({"type": "eo1", "device": "cpu"}, trust=True)
+
+
+def test_the_policies_are_those_that_lerobot_registers():
+    assert tuple(sorted(policy_files())) == policy_types()
+
+
+@pytest.mark.parametrize("kind", policy_files())
+def test_a_policys_options_are_the_fields_of_its_class(kind: str):
+    wanted = {one.name for one in fields(policy_class(kind)) if one.init and one.name not in NOT_OURS}
+    assert set(policy_options(kind)) == wanted
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"steps": 0}, "steps is 0; expected at least 1"),
+        ({"num_workers": -1}, "num_workers is -1; expected at least 0"),
+        ({"eval_split": 1.0}, "dataset.eval_split is 1.0; expected at least 0 and less than 1"),
+        ({"lr": 0.0}, "lr is 0.0; expected more than 0"),
+        ({"observation": "images"}, "mlp does not take images"),
+        ({"scheduler": {"type": "cosine"}}, "--scheduler is not for --policy.type=mlp"),
+    ],
+)
+def test_options_of_a_fit_out_of_range_or_not_for_the_mlp_are_refused(changes, says):
+    with pytest.raises(UsageError, match=says):
+        FitConfig(**changes)
+
+
+def test_a_name_that_is_not_there_is_refused_with_the_nearest():
+    with pytest.raises(UnknownName, match=r"unknown policy 'atc' \(did you mean 'act'\?\)"):
+        check_names({"type": "atc"})
+    with pytest.raises(
+        UnknownName, match=r"'chunksize' \(did you mean 'chunk_size'\?\); manip-il train --policy\.type=act"
+    ):
+        check_names({"type": "act", "chunksize": 3})
+    check_names({"type": "act", "chunk_size": 3})
+    check_names({"path": "runs/x", "chunk_sice": 3})  # whose type only the checkpoint knows
+
+
+@pytest.mark.parametrize(
+    ("observation", "inputs"),
+    [
+        ("state", ["observation.state", "observation.environment_state"]),
+        ("images", ["observation.state", "observation.images.front", "observation.images.wrist"]),
+        (
+            "both",
+            ["observation.state", "observation.environment_state"]
+            + ["observation.images.front", "observation.images.wrist"],
+        ),
+    ],
+)
+def test_a_choice_is_its_columns_and_a_checkpoint_tells_it(observation, inputs, pictured):
+    seen, given = policy_features(features(pictured), observation)
+    assert list(seen) == inputs
+    assert list(given) == ["action"]
+    assert given["action"].shape == (4,)
+    assert observation_of(seen) == observation
+    assert observation_of(["observation.state"]) == "state"
+
+
+def test_pictures_are_channels_first_for_a_policy_and_kinds_are_lerobots(pictured):
+    table = features(pictured)
+    table["observation.state"] |= {"shape": [4]}  # as JSON has it
+    seen, given = policy_features(table, "both")
+    assert seen["observation.images.front"].shape == (3, 32, 48)
+    assert seen["observation.state"].shape == (4,)
+    kinds = [FeatureType.STATE, FeatureType.ENV, FeatureType.VISUAL, FeatureType.VISUAL]
+    assert [feature.type for feature in seen.values()] == kinds
+    assert given["action"].type is FeatureType.ACTION
+
+
+def test_what_is_missing_is_named_with_a_way_out(spec, pictured):
+    with pytest.raises(UnknownName, match="did you mean 'images'"):
+        policy_features(features(spec), "image")
+    for observation in ("images", "both"):
+        with pytest.raises(ManipError, match=r"no pictures; record with --cameras=front,wrist"):
+            policy_features(features(spec), observation)
+    table = features(pictured)
+    del table["observation.environment_state"]
+    assert "observation.environment_state" not in policy_features(table, "images")[0]
+    for observation in ("state", "both"):
+        with pytest.raises(ManipError, match=r"no observation\.environment_state; .*'images'"):
+            policy_features(table, observation)
+    del table["action"]
+    with pytest.raises(ManipError, match="no action"):
+        policy_features(table, "images")
