@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from manip_il.data.build import Builder, Recording
+from manip_il.data.build import Recording
+from manip_il.data.episodes import Header
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import (
-    Header,
     JournalKeep,
     clean_temporary,
     episode_path,
@@ -22,7 +22,7 @@ from manip_il.data.journal import (
     read_journal,
     set_aside_damaged,
 )
-from manip_il.data.lerobot_io import DatasetInfo
+from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
@@ -134,11 +134,11 @@ def record(
     """
     recording.write(journals)
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
+    selection = recording.selection()
     with recording.open(root, spec, fingerprint, replace=replace) as writer:
-        builder = Builder(writer, recording)
-        for collected in episodes:
-            builder.add(*collected.read(spec, fingerprint))
-        return builder.finish(), builder.failed
+        for episode in selection.take(collected.read(spec, fingerprint) for collected in episodes):
+            writer.add(episode)
+        return writer.finish(recording.provenance | selection.provenance), selection.failed
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:

@@ -91,7 +91,7 @@ class TrainOptions:
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
         from manip_il.data.atomic import exclusive
-        from manip_il.data.lerobot_io import read_fingerprint, read_spec
+        from manip_il.data.lerobot_read import read_fingerprint, read_spec
 
         if not _is_first_process():
             set_quiet(True)
@@ -140,7 +140,7 @@ class TrainOptions:
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {save_freq:,} steps)")
 
     def _fit_mlp(self, config: TrainConfig, spec: Any, fingerprint: Mapping[str, Any], stages: Any) -> Path:
-        from manip_il.data.lerobot_io import read_table
+        from manip_il.data.lerobot_read import read_table
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
@@ -171,7 +171,7 @@ class TrainOptions:
                 return trainer.fit(stages.log)
 
     def _meta(self, config: PolicyFitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> CheckpointMeta:
-        from manip_il.data.lerobot_io import read_provenance
+        from manip_il.data.lerobot_read import read_provenance
         from manip_il.learn.checkpoint import CheckpointMeta
         from manip_il.learn.observation import recorded_look
 
@@ -181,7 +181,7 @@ class TrainOptions:
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
         """What is told how many pictures more have been decoded; a bar, where there are any."""
-        from manip_il.data.lerobot_io import camera_keys, dataset_info
+        from manip_il.data.lerobot_read import camera_keys, dataset_info
 
         with contextlib.ExitStack() as stack:
             bar = None

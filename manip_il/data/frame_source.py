@@ -16,8 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.picture import open_picture
-from manip_il.data.video_read import VideoReader
+from manip_il.data.pictures import VideoReader, open_picture
 from manip_il.doctor.info import Feature, Info, read_info
 from manip_il.doctor.shards import UNREADABLE, Shard, find_shards, floats, integers
 from manip_il.errors import ManipError, MismatchError, UnknownName

@@ -19,13 +19,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import new_folder, writing
 from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
 from manip_il.data.video import CameraFiles, CameraThreads, Clip, VideoConfig
-from manip_il.data.writing import writing
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 

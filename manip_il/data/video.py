@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
-from manip_il.data.video_open import open_video
-from manip_il.data.video_read import count_packets
+from manip_il.data.pictures import count_packets, open_video
 from manip_il.errors import ManipError, UnknownName, UsageError
 
 # crf and preset where nothing else is asked. LeRobot's own codec and settings are those of libsvtav1; h264 takes a

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.picture import open_picture
+from manip_il.data.pictures import open_picture
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, plural
 from manip_il.doctor.info import Feature

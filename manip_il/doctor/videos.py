@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.video_open import open_video
+from manip_il.data.pictures import open_video
 from manip_il.doctor.dataset import Clips, Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, plural, some
 from manip_il.doctor.info import Feature, Info

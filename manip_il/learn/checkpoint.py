@@ -21,9 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manip_il import checks
-from manip_il.data.atomic import umask
+from manip_il.data.atomic import umask, writing
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.data.writing import writing
 from manip_il.errors import ManipError, MismatchError
 
 # LeRobot is imported where something is written: its import takes seconds, which a worker that

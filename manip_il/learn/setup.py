@@ -20,9 +20,9 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import read_tables
+from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_library import lerobot_windows
+from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, IMAGES, LABEL_VALID
 from manip_il.errors import ManipError, NotFiniteError
 from manip_il.learn.checkpoint import readable_state

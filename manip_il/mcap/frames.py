@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_read import read_frames
 from manip_il.data.parquet_limits import check_parquet
-from manip_il.data.picture import open_picture
+from manip_il.data.pictures import open_picture
 from manip_il.errors import ManipError
 
 U8 = NDArray[np.uint8]

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.atomic import exclusive, new_folder, write_file
-from manip_il.data.writing import WriteError
+from manip_il.data.atomic import WriteError, exclusive, new_folder, write_file
 from manip_il.errors import FolderBusyError, FolderExistsError
 
 

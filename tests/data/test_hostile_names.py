@@ -17,7 +17,8 @@ from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, build, local_id
-from manip_il.data.lerobot_io import camera_keys, dataset_info, read_frames, read_spec, write_dataset
+from manip_il.data.lerobot_read import camera_keys, dataset_info, read_frames, read_spec
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.repair import repair
 from manip_il.errors import ManipError, UsageError

@@ -18,8 +18,8 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import find_frames
-from manip_il.data.lerobot_io import dataset_info, read_episodes, read_table, read_tables, write_dataset
-from manip_il.data.lerobot_read import check_dataset
+from manip_il.data.lerobot_read import check_dataset, dataset_info, read_episodes, read_table, read_tables
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.parquet_limits import LARGEST_FOOTER, check_parquet
 from manip_il.doctor.shards import open_shard
 from manip_il.errors import ManipError

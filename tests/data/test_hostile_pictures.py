@@ -18,8 +18,8 @@ from PIL import Image
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import ParquetPart
-from manip_il.data.lerobot_io import write_dataset
-from manip_il.data.picture import open_picture
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.pictures import open_picture
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.pictures import check_pictures
 from manip_il.errors import ManipError

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from av.video.codeccontext import VideoCodecContext
 
-from manip_il.data import video_open
-from manip_il.data.video_open import open_video
-from manip_il.data.video_read import VideoReader, count_frames, count_packets
+from manip_il.data import pictures
+from manip_il.data.pictures import VideoReader, count_frames, count_packets, open_video
 from manip_il.doctor import videos
 from manip_il.errors import ManipError
 
@@ -100,14 +99,14 @@ def test_a_playlist_for_streaming_opens_no_other_file(tmp_path: Path) -> None:
 
 
 def test_pictures_have_a_largest_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(video_open, "MOST_PIXELS", 48 * 64 - 1)
+    monkeypatch.setattr(pictures, "MOST_PIXELS", 48 * 64 - 1)
     refuse(film(tmp_path / "film.mp4", SIZE), "its pictures have 64 x 48 pixels; expected at most 3,071 in all")
 
 
 def test_pictures_may_not_grow_beyond_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = film(tmp_path / "film.mp4", SIZE, (480, 640))
     assert count_frames(path) == 2 * FRAMES
-    monkeypatch.setitem(video_open._OPTIONS, "max_pixels", str(2 * 48 * 64))
+    monkeypatch.setitem(pictures._OPTIONS, "max_pixels", str(2 * 48 * 64))
     with pytest.raises(ManipError, match="cannot read"):
         count_frames(path)
     found = videos.decode(path, 2 * FRAMES)
@@ -120,7 +119,7 @@ def test_pictures_of_two_sizes_are_one_line(tmp_path: Path) -> None:
         VideoReader().read(path, 0, 2 * FRAMES, FPS)
 
 
-@pytest.mark.parametrize("count", [video_open.MOST_INDEXED + 1, 170_000_000, 2**32 - 1])
+@pytest.mark.parametrize("count", [pictures.MOST_INDEXED + 1, 170_000_000, 2**32 - 1])
 def test_an_index_of_equal_sizes_is_not_made_on_its_word(tmp_path: Path, count: int) -> None:
     path = film(tmp_path / "film.mp4", SIZE)
     claim(claim(path, b"stsz", 4, 1), b"stsz", 8, count)

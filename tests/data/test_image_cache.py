@@ -23,8 +23,9 @@ from manip_il.data import frame_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
-from manip_il.data.image_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
-from manip_il.data.lerobot_io import new_dataset, read_frames, write_dataset
+from manip_il.data.frame_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
+from manip_il.data.lerobot_read import read_frames
+from manip_il.data.lerobot_write import new_dataset, write_dataset
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -244,7 +245,7 @@ KILLED = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
 from manip_il.data import frame_source
-from manip_il.data.image_cache import open_frame_cache
+from manip_il.data.frame_cache import open_frame_cache
 
 def die(count):
     print(*[child.pid for child in multiprocessing.active_children()], flush=True)

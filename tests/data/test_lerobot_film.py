@@ -13,14 +13,9 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import (
-    VideoConfig,
-    new_dataset,
-    read_episodes,
-    read_frames,
-    read_spec,
-    write_dataset,
-)
+from manip_il.data.lerobot_read import read_episodes, read_frames, read_spec
+from manip_il.data.lerobot_write import new_dataset, write_dataset
+from manip_il.data.video import VideoConfig
 from manip_il.mdp import Episode
 
 from ..pictures import number_of, numbered_episodes, numbers_of, with_cameras

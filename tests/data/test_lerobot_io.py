@@ -22,17 +22,16 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import lerobot_stats
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
-from manip_il.data.lerobot_io import (
+from manip_il.data.build import merge_datasets
+from manip_il.data.lerobot_read import (
     dataset_info,
-    merge_datasets,
-    new_dataset,
     read_episodes,
     read_fingerprint,
     read_provenance,
     read_spec,
     read_table,
-    write_dataset,
 )
+from manip_il.data.lerobot_write import new_dataset, write_dataset
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -324,11 +323,12 @@ _WRITER = """
 import sys
 from pathlib import Path
 from typing import Any
-from manip_il.data import lerobot_io as io
+from manip_il.data.lerobot_read import read_episodes, read_spec
+from manip_il.data.lerobot_write import write_dataset
 source, folder = Path(sys.argv[1]), Path(sys.argv[2])
-spec, episodes = io.read_spec(source), list(io.read_episodes(source))
+spec, episodes = read_spec(source), list(read_episodes(source))
 for number in range(10_000):
-    io.write_dataset(episodes, folder / str(number), spec, repo_id="x/y", fingerprint={})
+    write_dataset(episodes, folder / str(number), spec, repo_id="x/y", fingerprint={})
     print(number, flush=True)
 """
 
@@ -359,7 +359,7 @@ def test_a_killed_writer_leaves_whole_datasets_only(
 def test_importing_costs_no_torch() -> None:
     code = """
 import sys
-import manip_il.data.journal, manip_il.data.lerobot_io, manip_il.data.fingerprint, manip_il.data.schema
+import manip_il.data.build, manip_il.data.frame_cache
 heavy = {"torch", "lerobot", "datasets", "pandas", "mujoco", "mink"}
 sys.exit(", ".join(heavy & set(sys.modules)))
 """

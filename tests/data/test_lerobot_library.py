@@ -12,13 +12,8 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import (
-    dataset_info,
-    read_episodes,
-    read_spec,
-    read_table,
-    write_dataset,
-)
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_spec, read_table
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 

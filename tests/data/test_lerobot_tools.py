@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import count_frames, read_episodes, video_rows, write_dataset
+from manip_il.data.lerobot_read import read_episodes, video_rows
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.pictures import count_frames
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 

@@ -13,8 +13,10 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import VideoConfig, camera_keys, new_dataset
+from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.video import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 

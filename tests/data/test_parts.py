@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.build import Builder, Recording, build
-from manip_il.data.episodes import count_labels, first_labels, parts
-from manip_il.data.journal import Header, write_episode
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.build import Recording, build
+from manip_il.data.episodes import Header, count_labels, first_labels, parts
+from manip_il.data.journal import write_episode
+from manip_il.data.lerobot_read import read_table
 from manip_il.errors import NothingToLearnError
 from manip_il.mdp import Episode
 
@@ -37,12 +37,13 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
     """The dataset as it is written while rollouts come; their journals beside it."""
     journals, root = folder / "d.journals", folder / "d"
     recording.write(journals)
+    for episode in rollouts:
+        write_episode(journals, episode, spec, {})
+    selection = recording.selection()
     with recording.open(root, spec, {}) as writer:
-        builder = Builder(writer, recording)
-        for episode in rollouts:
-            write_episode(journals, episode, spec, {})
-            builder.add(Header.of(episode, spec, {}), episode)
-        builder.finish()
+        for episode in selection.take((Header.of(episode, spec, {}), episode) for episode in rollouts):
+            writer.add(episode)
+        writer.finish(recording.provenance | selection.provenance)
     return root
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import dataset_info, read_fingerprint, read_table
+from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_table
 from manip_il.doctor.examine import examine_folder
 from manip_il.expert.expert import Expert
 from manip_il.mdp import State
@@ -29,7 +29,7 @@ LABEL = """
 import sys
 from pathlib import Path
 import numpy as np
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.lerobot_read import read_table
 from manip_il.expert.expert import Expert
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene

@@ -18,22 +18,21 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data import video
-from manip_il.data.lerobot_io import (
-    VideoConfig,
+from manip_il.data.build import merge_datasets
+from manip_il.data.lerobot_read import (
     camera_keys,
-    count_frames,
     dataset_info,
-    merge_datasets,
-    new_dataset,
     read_episodes,
     read_frames,
     read_provenance,
     read_spec,
     read_table,
     video_rows,
-    write_dataset,
 )
 from manip_il.data.lerobot_stats import pixel_counts
+from manip_il.data.lerobot_write import new_dataset, write_dataset
+from manip_il.data.pictures import count_frames
+from manip_il.data.video import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.writing import WriteError, writing
+from manip_il.data.atomic import WriteError, writing
 
 
 class RustError(Exception):

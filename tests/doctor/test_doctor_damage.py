@@ -12,7 +12,7 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
-from manip_il.data.lerobot_io import write_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.finding import Finding, Severity
 from manip_il.mdp import Episode
 

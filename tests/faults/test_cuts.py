@@ -9,7 +9,7 @@ import pytest
 
 from manip_il.data.build import build
 from manip_il.data.journal import JournalKeep, list_episodes
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine

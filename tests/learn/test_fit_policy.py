@@ -15,8 +15,8 @@ from huggingface_hub import ModelCard
 from lerobot.configs.default import WandBConfig
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import read_spec, read_table
 from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.choices import policy_config

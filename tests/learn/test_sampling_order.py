@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import read_spec, read_table, read_tables
 from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.lerobot_read import read_spec, read_table, read_tables
 from manip_il.errors import MismatchError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.choices import policy_config
