@@ -1,13 +1,20 @@
-"""Episodes whose pictures say which one they are: their number in twelve squares, light for a one."""
+"""Episodes whose pictures hold their number, as twelve squares, light for a one; and the frames of video files."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from manip_il.data import schema as s
+from manip_il.data.frame_source import episode_clips
+from manip_il.data.lerobot_layout import VIDEO_PATH
+from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
 
 SIDE, COLUMNS, ROWS = 24, 4, 3  # smaller squares, and the default compression may lose one
@@ -48,3 +55,18 @@ def numbered_episodes(make_episode: Callable[..., Episode], spec: s.RobotTaskSpe
         columns = plain.columns | pictures
         episodes.append(replace(plain, columns={key: columns[key] for key in s.features(spec)}))
     return episodes
+
+
+def video_rows(root: Path) -> dict[Path, int]:
+    """Every video file of a dataset -> the frames that the rows of `meta/episodes` put into it."""
+    rows: Counter[Path] = Counter()
+    for key in camera_keys(root):
+        for clip in episode_clips(root, key, 1, VIDEO_PATH):
+            rows[root / clip.path] += clip.count
+    return dict(rows)
+
+
+def count_frames(path: Path) -> int:
+    """The frames that a whole video file decodes to."""
+    with closing(open_video(path)) as container:
+        return sum(1 for _ in container.decode(video=0))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,9 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.frame_source import VideoPart, episode_clips
 from manip_il.data.parquet_files import check_files, read_column, read_file
-from manip_il.data.pictures import DatasetPictures
+from manip_il.data.pictures import VideoReader
 from manip_il.doctor.info import LARGEST_META, info_problems
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
@@ -30,7 +29,7 @@ _INDEX = {"dtype": "int64", "shape": (1,)}
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What a dataset holds. success: episodes that succeeded at some step; None where no column says so."""
+    """Names and counts of a dataset. success: episodes that succeeded at some step; None where no column says so."""
 
     root: Path
     robot: str
@@ -46,7 +45,7 @@ class DatasetInfo:
 def read_table(
     root: Path, columns: Sequence[str] | None = None, episodes: Sequence[int] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Whole columns in stored order: (T,) for scalars, (T, d) for vectors; views of Arrow's memory, read-only.
+    """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; views of Arrow's memory, read-only.
 
     columns: all that are not pictures by default. episodes: indices of the episodes to keep; all by default.
     Raises `ManipError` for a folder that is no dataset or a file that cannot be read, `UnknownName` for a column
@@ -68,7 +67,7 @@ def read_table(
 
 
 def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return the columns of several datasets one after the other, with frames and episodes numbered throughout.
+    """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
 
     Raises what `read_table` raises.
     """
@@ -94,7 +93,9 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
     stored = [key for key in shapes if key not in cameras]
     _check_rows(root, sum(len(read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
-    with closing(_pictures(root, cameras)) as frames:
+    clips = {key: _clips(root, key) for key in cameras}
+    with ExitStack() as stack:
+        readers = {key: stack.enter_context(closing(VideoReader())) for key in cameras}
         for path in _data_files(root):
             table = read_file(path, [*stored, layout.EPISODE_INDEX])
             columns = {key: read_column(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
@@ -102,7 +103,7 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
-                own |= {key: frames.read(key, int(index[start])) for key in cameras}
+                own |= {key: _decode(root, readers[key], clips[key], int(index[start]), spec.fps) for key in cameras}
                 yield _episode({key: own[key] for key in shapes})
 
 
@@ -114,17 +115,8 @@ def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
     """
     if key not in (known := camera_keys(root)):
         raise UnknownName(f"camera in {root}", key, known)
-    with closing(_pictures(root, [key])) as pictures:
-        return pictures.read(key, episode)
-
-
-def video_rows(root: Path) -> dict[Path, int]:
-    """Return every video file that `meta/episodes` names, with the number of frames that it says are in it."""
-    pictures = _pictures(root, camera_keys(root))
-    rows: Counter[Path] = Counter()
-    for key, episode in itertools.product(camera_keys(root), range(len(pictures.lengths))):
-        rows[pictures.place(key, episode)[0]] += pictures.lengths[episode]
-    return dict(rows)
+    with closing(VideoReader()) as reader:
+        return _decode(root, reader, _clips(root, key), episode, int(_read_info(root)["fps"]))
 
 
 def read_spec(root: Path) -> s.RobotTaskSpec:
@@ -207,14 +199,16 @@ def check_dataset(root: Path) -> None:
         check_files(root, sorted(root.glob(pattern)), None)
 
 
-def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
-    names = [f"videos/{key}/{name}" for key in keys for name in layout.VIDEO_COLUMNS]
-    paths = sorted(root.glob(layout.EPISODES_FILES))
-    check_files(root, paths, ["length", *names])
-    tables = [read_file(path, ["length", *names]) for path in paths]
-    if not tables:
-        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
-    return DatasetPictures(root, int(_read_info(root)["fps"]), pa.concat_tables(tables).to_pydict())
+def _clips(root: Path, key: str) -> list[VideoPart]:
+    info = _read_info(root)
+    return episode_clips(root, key, info["fps"], info.get("video_path") or layout.VIDEO_PATH)
+
+
+def _decode(root: Path, reader: VideoReader, clips: list[VideoPart], episode: int, fps: int) -> NDArray[np.uint8]:
+    if not 0 <= episode < len(clips):
+        raise UsageError(f"{root} has no episode {episode}; it has 0 to {len(clips) - 1}")
+    clip = clips[episode]
+    return reader.read(root / clip.path, clip.first, clip.count, fps)
 
 
 def _episode(columns: dict[str, NDArray[Any]]) -> Episode:

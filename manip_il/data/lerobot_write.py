@@ -1,7 +1,7 @@
 """Write LeRobot v3.0 datasets with pyarrow and PyAV, episode by episode, in memory that does not grow.
 
-LeRobot's own writer takes 80 to 160 ms an episode and loses all of them when it dies; this one writes the same files
-in a few milliseconds an episode, and the dataset is there whole or not at all. LeRobot's reader and tools judge it.
+LeRobot's own writer takes 80 to 160 ms an episode and loses all of them when it is killed; this one writes the same
+files in a few milliseconds an episode, and the dataset is there whole or not at all. Tests read it with LeRobot.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FORMAT = 1  # of meta/manip_il.json
 def own_file(
     repo_id: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], provenance: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """What stands in `meta/manip_il.json`."""
+    """Return the content of `meta/manip_il.json`."""
     ours = {"format": FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
     return ours | {"provenance": dict(provenance or {})}
 
@@ -97,7 +97,7 @@ def write_dataset(
 
 
 class DatasetWriter:
-    """Takes a dataset's episodes as they come; made by `new_dataset`."""
+    """Writes a dataset's episodes as they come; made by `new_dataset`."""
 
     def __init__(
         self,
@@ -170,16 +170,16 @@ class DatasetWriter:
         )
 
     def wait(self) -> None:
-        """Until every picture so far is encoded."""
+        """Wait until every picture so far is encoded."""
         for _, clips in self._encoding:
             for clip in clips.values():
                 clip.result()
 
     def close(self) -> None:
-        """Let go of files and threads, finished or not."""
+        """Close files and end threads, finished or not."""
         self._cameras.stop()
         for files in (self._data, self._meta, self._stats):
-            with contextlib.suppress(OSError):  # a full disk has been complained of
+            with contextlib.suppress(OSError):  # a full disk was reported by `add` or `finish`
                 files.close()
 
     def _index_columns(self, length: int) -> dict[str, NDArray[Any]]:

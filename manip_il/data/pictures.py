@@ -11,11 +11,10 @@ import itertools
 import mmap
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -23,9 +22,8 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 from PIL import Image
 
-from manip_il.data import lerobot_layout as layout
 from manip_il.data.schema import MOST_PIXELS
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError
 
 MOST_INDEXED = 5_000_000  # frames of a file: 46 hours at 30 a second
 _OPTIONS = {
@@ -40,6 +38,8 @@ _ELSEWHERE = re.compile(rb"moof|mvex|cmov")  # fragments and a packed index: wha
 
 _UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 _FORMATS = ("PNG", "JPEG")
+
+Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 
 def open_picture(content: bytes) -> Image.Image:
@@ -89,7 +89,7 @@ class VideoReader:
         self._path: Path | None = None
         self._container: InputContainer | None = None
 
-    def read(self, path: Path, first: int, count: int, fps: int) -> NDArray[np.uint8]:
+    def read(self, path: Path, first: int, count: int, fps: int) -> Pictures:
         """Decode frames `first` to `first + count - 1`, (count, height, width, 3).
 
         Raises `ManipError` for a file that cannot be read or does not hold each of them.
@@ -113,46 +113,6 @@ class VideoReader:
             self.close()
             self._container, self._path = open_video(path), path
         return self._container
-
-
-class DatasetPictures:
-    """Frames of a dataset's cameras by episode. columns: those of `meta/episodes` that say where they are."""
-
-    def __init__(self, root: Path, fps: int, columns: Mapping[str, list[Any]]):
-        self._root, self._fps, self._columns = root, fps, columns
-        self._readers: dict[str, VideoReader] = {}
-
-    @property
-    def lengths(self) -> list[int]:
-        """Frames of every episode."""
-        return self._columns["length"]
-
-    def place(self, key: str, episode: int) -> tuple[Path, int]:
-        """Return the file that holds an episode's frames, and the number of the first one in it."""
-        if not 0 <= episode < len(self.lengths):
-            raise UsageError(f"{self._root} has no episode {episode}; it has 0 to {len(self.lengths) - 1}")
-        chunk, file, start, _ = (self._columns[f"videos/{key}/{name}"][episode] for name in layout.VIDEO_COLUMNS)
-        name = layout.VIDEO_PATH.format(video_key=key, chunk_index=chunk, file_index=file)
-        return self._root / name, round(start * self._fps)
-
-    def read(self, key: str, episode: int) -> NDArray[np.uint8]:
-        """Decode one camera's frames of one episode, (T, height, width, 3)."""
-        path, first = self.place(key, episode)
-        return self._readers.setdefault(key, VideoReader()).read(path, first, self.lengths[episode], self._fps)
-
-    def close(self) -> None:
-        """Close the open files."""
-        for reader in self._readers.values():
-            reader.close()
-
-
-def count_frames(path: Path) -> int:
-    """Decode a whole video file and count its frames. Raises `ManipError` for one that cannot be decoded."""
-    try:
-        with closing(open_video(path)) as container:
-            return sum(1 for _ in container.decode(container.streams.video[0]))
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
 
 
 def count_packets(path: Path) -> int:
@@ -185,7 +145,7 @@ def _check_index(path: Path) -> None:
 
 
 def _outside_media(data: mmap.mmap) -> Iterator[tuple[int, int]]:
-    """Where everything but coded frames lies: (start, stop) [bytes]."""
+    """Start and stop [bytes] of everything but coded frames."""
     at = 0
     for _ in range(_MOST_BOXES):
         if at + _BOX > len(data):
@@ -201,7 +161,7 @@ def _outside_media(data: mmap.mmap) -> Iterator[tuple[int, int]]:
 
 
 def _decode(container: InputContainer, first: int, count: int, fps: int) -> list[NDArray[np.uint8]]:
-    """As many of the frames as there are without a gap."""
+    """The frames as far as there is no gap."""
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]
     container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before

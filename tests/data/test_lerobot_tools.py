@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import read_episodes, video_rows
+from manip_il.data.lerobot_read import read_episodes
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.pictures import count_frames
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import count_frames, numbered_episodes, numbers_of, video_rows, with_cameras
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"

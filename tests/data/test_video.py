@@ -27,17 +27,15 @@ from manip_il.data.lerobot_read import (
     read_provenance,
     read_spec,
     read_table,
-    video_rows,
 )
 from manip_il.data.lerobot_stats import pixel_counts
 from manip_il.data.lerobot_write import new_dataset, write_dataset
-from manip_il.data.pictures import count_frames
 from manip_il.data.video import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import count_frames, numbered_episodes, numbers_of, video_rows, with_cameras
 
 MakeEpisode = Callable[..., Episode]
 OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": {}}
