@@ -2,8 +2,7 @@
 
 A footer's sizes and counts are only claims, and a run of a billion equal numbers takes eight bytes. The pages' own
 headers are what pyarrow allocates and decodes by; they are read first (parquet-format, `PageHeader` in compact Thrift).
-pyarrow ends the whole process at some damaged footers, so footers are read here too: any bytes give `ValueError` or
-`IndexError` at most.
+So are footers: pyarrow ends the whole process at some damaged ones.
 """
 
 from __future__ import annotations
@@ -37,10 +36,9 @@ _CHUNK_FIELDS = (4, 5, 7, 9, 11)  # of its meta data: codec, values, packed size
 _DATA, _DICTIONARY, _DATA_V2 = 0, 2, 3  # types of pages; 1 is an index
 _OWN_HEADER = {_DATA: 5, _DICTIONARY: 7, _DATA_V2: 8}  # the field of a page's header that says the rest
 _BY_DICTIONARY = (2, 8)  # encodings
-_DELTA_BYTES = 7  # each text repeats so much of the one before: no size of a page says how long they are
+_DELTA_BYTES = 7  # each text repeats part of the one before, so a page's size does not say how long they are
 _ENCODINGS = (0, *_BY_DICTIONARY, 3, 4, 5, 6, 9)
 _HEADS = (256, 16_384, MIB)  # bytes that a page header is looked for in: with long statistics it is long
-
 
 # Kinds of values (thrift-compact-protocol, `Struct encoding`); parquet has no sets, maps and UUIDs
 _TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _DOUBLE, _BINARY, _LIST, _, _, _STRUCT = range(1, 13)
@@ -91,17 +89,17 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
         with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
             footer = _footer(data)
             schema = pq.read_metadata(stream).schema  # which looks at no column's place or size
-            leaves = [schema.column(i) for i in range(len(schema.names))]
-            if len(leaves) > MOST_COLUMNS:
-                raise ValueError(f"it has {len(leaves):,} columns; expected at most {MOST_COLUMNS:,}")
+            count = len(schema.names)
+            if count > MOST_COLUMNS:
+                raise ValueError(f"it has {count:,} columns; expected at most {MOST_COLUMNS:,}")
             if twice := [name for name, n in Counter(schema.to_arrow_schema().names).items() if n > 1]:
                 raise ValueError(f"it has more than one column {twice[0][:100]!r}; expected different names")
+            read = ("",) if columns is None else tuple(f"{column}." for column in columns)
+            leaves = {i: schema.column(i) for i in range(count) if f"{schema.column(i).path}.".startswith(read)}
+            widths = {i: _width(leaf) for i, leaf in leaves.items()}
             try:
-                return sum(
-                    _column_size(data, chunk, _width(leaves[number]))
-                    for number, chunk in _chunks(footer, len(leaves))
-                    if _is_in(leaves[number].path, columns)
-                )
+                chunks = ((number, chunk) for number, chunk in _chunks(footer, count) if number in widths)
+                return sum(_column_size(data, chunk, widths[number]) for number, chunk in chunks)
             except IndexError as error:
                 raise ValueError("its footer is damaged") from error
 
@@ -139,13 +137,9 @@ def _chunks(footer: bytes, columns: int) -> Iterator[tuple[int, _Chunk]]:
 def _chunk(reader: _Thrift) -> _Chunk:
     found: dict[int, int] = {}
     for _ in reader.select(_META_DATA, _STRUCT):
-        found = reader.integers()
+        found |= reader.integers(*_CHUNK_FIELDS)
     codec, values, size, start, dictionary = (found.get(field, 0) for field in _CHUNK_FIELDS)
     return _Chunk(codec, values, dictionary if 0 < dictionary < start else start, size)
-
-
-def _is_in(leaf: str, columns: Sequence[str] | None) -> bool:
-    return columns is None or any(leaf == column or leaf.startswith(f"{column}.") for column in columns)
 
 
 def _column_size(data: mmap.mmap, chunk: _Chunk, width: int | None) -> int:
@@ -170,23 +164,18 @@ def _pages(data: mmap.mmap, chunk: _Chunk) -> Iterator[_Page]:
         raise ValueError("a column is outside the file")
     while seen < chunk.values and at < stop:
         page = _page(data, at, stop)
-        _check_page(page, stop)
+        if min(page.packed, page.unpacked, page.values) < 0 or page.start + page.packed > stop:
+            raise ValueError("a page's header is damaged")
+        most = max(LARGEST_PAGE, _PAGE_RATIO * page.packed)
+        if page.unpacked > most:
+            raise ValueError(f"a page of {page.packed:,} bytes unpacks to {page.unpacked:,}; expected at most {most:,}")
+        if page.encoding not in _ENCODINGS and page.kind in (_DATA, _DATA_V2):
+            name = "DELTA_BYTE_ARRAY" if page.encoding == _DELTA_BYTES else f"number {page.encoding}"
+            problem = f"a page has the encoding {name}, which does not tell its size"
+            raise ValueError(f"{problem}; write the file with another encoding")
         seen += page.values if page.kind != _DICTIONARY else 0
         at = page.start + page.packed
         yield page
-
-
-def _check_page(page: _Page, stop: int) -> None:
-    if min(page.packed, page.unpacked, page.values) < 0 or page.start + page.packed > stop:
-        raise ValueError("a page's header is damaged")
-    most = max(LARGEST_PAGE, _PAGE_RATIO * page.packed)
-    if page.unpacked > most:
-        raise ValueError(f"a page of {page.packed:,} bytes unpacks to {page.unpacked:,}; expected at most {most:,}")
-    if page.encoding not in _ENCODINGS and page.kind in (_DATA, _DATA_V2):
-        name = "DELTA_BYTE_ARRAY" if page.encoding == _DELTA_BYTES else f"number {page.encoding}"
-        raise ValueError(
-            f"a page has the encoding {name}, which does not tell its size; write the file with another encoding"
-        )
 
 
 def _page(data: mmap.mmap, at: int, stop: int) -> _Page:
@@ -198,7 +187,7 @@ def _page(data: mmap.mmap, at: int, stop: int) -> _Page:
                 if 1 <= number <= len(sizes):
                     sizes[number - 1] = reader.integer(kind)
                 elif number == _OWN_HEADER.get(sizes[0]) and kind == _STRUCT:
-                    found = reader.integers()
+                    found = reader.integers(1, 2, 4)
                 else:
                     reader.skip(kind)
         except IndexError:
@@ -213,14 +202,12 @@ def _page(data: mmap.mmap, at: int, stop: int) -> _Page:
 def _longest(data: mmap.mmap, page: _Page, codec: int) -> int:
     """The longest text in a dictionary [bytes]: what every value may be."""
     packed = data[page.start : page.start + page.packed]
+    if codec not in (0, *_CODECS):
+        return page.unpacked
     if codec:
-        if codec not in _CODECS:
-            return page.unpacked
         packed = pa.Codec(_CODECS[codec]).decompress(packed, page.unpacked, asbytes=True)
     at = longest = 0
-    for _ in range(page.values):
-        if at + 4 > len(packed):
-            break  # pyarrow refuses it
+    for _ in range(min(page.values, len(packed) // 4)):
         length = int.from_bytes(packed[at : at + 4], "little")
         longest, at = max(longest, length), at + 4 + length
     return min(longest, page.unpacked)
@@ -257,9 +244,15 @@ class _Thrift:
         for _ in range(count):
             yield head & 15
 
-    def integers(self) -> dict[int, int]:
-        """Return a struct's whole numbers by their field's number; -1 for values of another kind."""
-        return {number: self.integer(kind) for number, kind in self.fields()}
+    def integers(self, *wanted: int) -> dict[int, int]:
+        """Return a struct's wanted fields that are whole numbers, by their field's number."""
+        found: dict[int, int] = {}
+        for number, kind in self.fields():
+            if number in wanted and kind in _INTEGERS:
+                found[number] = self.integer(kind)
+            else:
+                self.skip(kind)
+        return found
 
     def integer(self, kind: int) -> int:
         """Return a whole number; -1 for a value of another kind, which is skipped."""
