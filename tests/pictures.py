@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from manip_il.data import schema as s
 from manip_il.data.frame_source import episode_clips
 from manip_il.data.lerobot_layout import VIDEO_PATH
 from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
 
@@ -55,6 +57,15 @@ def numbered_episodes(make_episode: Callable[..., Episode], spec: s.RobotTaskSpe
         columns = plain.columns | pictures
         episodes.append(replace(plain, columns={key: columns[key] for key in s.features(spec)}))
     return episodes
+
+
+def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options: Any) -> Path:
+    """Write a dataset with options of `new_dataset`."""
+    with new_dataset(root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options)) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        writer.finish()
+    return root
 
 
 def video_rows(root: Path) -> dict[Path, int]:

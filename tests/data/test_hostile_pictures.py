@@ -84,13 +84,13 @@ def pictured(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> 
     return root
 
 
-def test_the_attack_is_one(marker: Path) -> None:
+def test_the_attack_is_one(marker):
     with pytest.raises(Image.UnidentifiedImageError), Image.open(io.BytesIO(EPS)) as picture:  # what the program wrote
         picture.load()
     assert marker.exists()
 
 
-def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) -> None:
+def test_no_reader_hands_a_picture_to_ghostscript(marker, pictured):
     found = [str(finding) for finding in check_pictures(Dataset(pictured))]
     assert any(
         "the picture in row 0 cannot be decoded: it is not a PNG or JPEG (1 row like this)" in one for one in found
@@ -106,19 +106,19 @@ def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) 
 
 
 @pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "WEBP"])
-def test_other_formats_are_refused(kind: str) -> None:
+def test_other_formats_are_refused(kind):
     with pytest.raises(ValueError, match="not a PNG or JPEG"):
         open_picture(saved(np.zeros((8, 8, 3), np.uint8), kind))
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-def test_a_picture_of_a_robots_camera_is_read(kind: str) -> None:
+def test_a_picture_of_a_robots_camera_is_read(kind):
     level = np.full((1080, 1920, 3), 90, np.uint8)
     assert (decode_bytes(saved(level, kind)) == 90).all()
 
 
 @pytest.mark.parametrize(("width", "height"), [(5_000, 5_000), (10_000, 10_000), (60_000, 60_000)])
-def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(width: int, height: int) -> None:
+def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(width, height):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # nor does Pillow's own warning appear
         with pytest.raises(ManipError, match="pixels"):

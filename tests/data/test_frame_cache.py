@@ -25,11 +25,10 @@ from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
 from manip_il.data.frame_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
 from manip_il.data.lerobot_read import read_frames
-from manip_il.data.lerobot_write import new_dataset, write_dataset
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, picture, with_cameras
+from ..pictures import numbered_episodes, numbers_of, picture, write
 from .test_video import largest_file
 
 MakeEpisode = Callable[..., Episode]
@@ -39,28 +38,18 @@ PLENTY = 10 * BYTES
 
 
 @pytest.fixture(scope="module")
-def two(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
-    return with_cameras(spec, "front", "wrist")
-
-
-@pytest.fixture(scope="module")
 def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
     return numbered_episodes(make_episode, two)
 
 
 @pytest.fixture
 def root(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
-    return write(tmp_path / "lift", filmed, two)
+    return write(filmed, tmp_path / "lift", two)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return tmp_path / "cache"
-
-
-def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
-    write_dataset(episodes, root, spec, repo_id="someone/lift", fingerprint={})
-    return root
 
 
 def opened(root: Path, folder: Path, *keys: str, max_bytes: int = PLENTY, **options: Any) -> dict[str, Any]:
@@ -77,7 +66,7 @@ def entries(folder: Path) -> set[str]:
     return {path.parent.name for path in folder.glob(f"[!.]*/{FRAMES}")}
 
 
-def test_a_row_is_the_frame_of_its_index(root: Path, folder: Path) -> None:
+def test_a_row_is_the_frame_of_its_index(root, folder):
     frames = opened(root, folder)
     assert list(frames) == KEYS
     assert shown(frames[FRONT]) == list(range(21))
@@ -88,25 +77,16 @@ def test_a_row_is_the_frame_of_its_index(root: Path, folder: Path) -> None:
             values[0] = 0
 
 
-def test_a_row_is_bit_equal_to_the_decoded_frame(root: Path, folder: Path) -> None:
+def test_a_row_is_bit_equal_to_the_decoded_frame(root, folder):
     for key, values in opened(root, folder).items():
         decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
         np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
 
 
-def test_pieces_files_and_processes_change_nothing(
-    tmp_path: Path,
-    folder: Path,
-    make_episode: MakeEpisode,
-    two: s.RobotTaskSpec,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pieces_files_and_processes_change_nothing(tmp_path, folder, make_episode, two, monkeypatch):
     episodes = numbered_episodes(make_episode, two, 9)
     root = tmp_path / "small"
-    with new_dataset(root, two, repo_id="a/b", fingerprint={}, video_files_size_in_mb=0.001) as writer:
-        for episode in episodes:
-            writer.add(episode)
-        writer.finish()
+    write(episodes, root, two, video_files_size_in_mb=0.001)
     assert len(list((root / "videos" / FRONT).rglob("*.mp4"))) > 2
     whole = opened(root, folder, FRONT)
     monkeypatch.setattr(frame_source, "_PART_BYTES", 1)
@@ -119,10 +99,8 @@ def test_pieces_files_and_processes_change_nothing(
     np.testing.assert_array_equal(whole[FRONT], in_pieces[FRONT])
 
 
-def test_pictures_in_the_data_files_are_the_stored_bytes(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
-    root = write(tmp_path / "lift", [make_episode(1, 7), make_episode(2, 5)], spec)
+def test_pictures_in_the_data_files_are_the_stored_bytes(tmp_path, folder, make_episode, spec):
+    root = write([make_episode(1, 7), make_episode(2, 5)], tmp_path / "lift", spec)
     path = store_pictures(root, [picture(number) for number in range(12)])
     frames = opened(root, folder, FRONT)[FRONT]
     np.testing.assert_array_equal(frames, np.stack([picture(number).transpose(2, 0, 1) for number in range(12)]))
@@ -152,7 +130,7 @@ def store_pictures(root: Path, pictures: list[np.ndarray]) -> Path:
     return path
 
 
-def test_what_is_there_is_not_decoded_again(root: Path, folder: Path) -> None:
+def test_what_is_there_is_not_decoded_again(root, folder):
     told: list[int] = []
     opened(root, folder, FRONT, on_frames=told.append)
     assert sum(told) == 21
@@ -165,14 +143,12 @@ def test_what_is_there_is_not_decoded_again(root: Path, folder: Path) -> None:
     assert sum(told) == 42
 
 
-def test_a_changed_dataset_is_decoded_again(
-    root: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
-) -> None:
+def test_a_changed_dataset_is_decoded_again(root, folder, make_episode, two):
     video = next((root / "videos" / FRONT).rglob("*.mp4"))
     before = opened(root, folder, FRONT)
     other = numbered_episodes(make_episode, two, 4)[1:]  # one more number in the wrist's; the front's start at 7
     root.rename(root.with_name("old"))
-    write(root, other, two)
+    write(other, root, two)
     assert video.exists()
     assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(7, 28))
     assert shown(before[FRONT]) == list(range(21))
@@ -182,16 +158,14 @@ def test_a_changed_dataset_is_decoded_again(
     assert sum(told) == 21
 
 
-def test_what_does_not_fit_is_left_to_the_plain_path(root: Path, folder: Path) -> None:
+def test_what_does_not_fit_is_left_to_the_plain_path(root, folder):
     assert open_frame_cache(root, KEYS, max_bytes=2 * BYTES - 1, folder=folder) is None
     assert not folder.exists()
     assert opened(root, folder, max_bytes=2 * BYTES)
 
 
-def test_the_one_not_opened_for_longest_makes_room(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
-) -> None:
-    roots = [write(tmp_path / f"{i}", numbered_episodes(make_episode, two, 3 + i)[i:], two) for i in range(3)]
+def test_the_one_not_opened_for_longest_makes_room(tmp_path, folder, make_episode, two):
+    roots = [write(numbered_episodes(make_episode, two, 3 + i)[i:], tmp_path / f"{i}", two) for i in range(3)]
     names: list[str] = []
     for root in roots[:2]:
         opened(root, folder, FRONT)
@@ -205,11 +179,9 @@ def test_the_one_not_opened_for_longest_makes_room(
     assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 2.5 * BYTES
 
 
-def test_what_is_in_use_stays(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, filmed: list[Episode], two: s.RobotTaskSpec
-) -> None:
-    first = write(tmp_path / "first", filmed, two)
-    second = write(tmp_path / "second", numbered_episodes(make_episode, two, 4)[1:], two)
+def test_what_is_in_use_stays(tmp_path, folder, make_episode, filmed, two):
+    first = write(filmed, tmp_path / "first", two)
+    second = write(numbered_episodes(make_episode, two, 4)[1:], tmp_path / "second", two)
     held = opened(first, folder, FRONT)[FRONT][3:5]  # any part of it counts
     (name,) = entries(folder)
     limit = int(1.5 * BYTES)
@@ -221,7 +193,7 @@ def test_what_is_in_use_stays(
     assert name not in entries(folder)
 
 
-def test_of_two_at_once_one_decodes(root: Path, folder: Path) -> None:
+def test_of_two_at_once_one_decodes(root, folder):
     told: list[int] = []
     results: list[dict[str, Any]] = []
 
@@ -265,7 +237,7 @@ def kill_while_decoding(root: Path, folder: Path, workers: int) -> list[int]:
     return [int(word) for word in done.stdout.split()]
 
 
-def test_what_a_kill_leaves_is_neither_used_nor_kept(root: Path, folder: Path) -> None:
+def test_what_a_kill_leaves_is_neither_used_nor_kept(root, folder):
     kill_while_decoding(root, folder, 1)
     assert entries(folder) == set()
     assert len(list(folder.glob(f".*{PARTIAL}/{FRAMES}"))) == 1
@@ -275,7 +247,7 @@ def test_what_a_kill_leaves_is_neither_used_nor_kept(root: Path, folder: Path) -
 
 
 @pytest.mark.slow  # starting them
-def test_processes_that_decode_end_with_the_one_that_started_them(root: Path, folder: Path) -> None:
+def test_processes_that_decode_end_with_the_one_that_started_them(root, folder):
     started = kill_while_decoding(root, folder, 2)
     assert started
     patience = time.monotonic() + 120
@@ -292,14 +264,14 @@ def is_running(process: int) -> bool:
     return state != "Z"
 
 
-def test_an_entry_cut_short_is_decoded_again(root: Path, folder: Path) -> None:
+def test_an_entry_cut_short_is_decoded_again(root, folder):
     opened(root, folder, FRONT)
     (path,) = folder.glob(f"*/{FRAMES}")
     os.truncate(path, BYTES // 2)
     assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
 
 
-def test_an_entry_tells_of_itself_and_numpy_reads_it(root: Path, folder: Path) -> None:
+def test_an_entry_tells_of_itself_and_numpy_reads_it(root, folder):
     frames = opened(root, folder, FRONT)[FRONT]
     (path,) = folder.glob(f"*/{FRAMES}")
     np.testing.assert_array_equal(np.load(path), frames)
@@ -307,7 +279,7 @@ def test_an_entry_tells_of_itself_and_numpy_reads_it(root: Path, folder: Path) -
     assert about == {"dataset": str(root), "camera": FRONT, "shape": [21, 3, 72, 96]}
 
 
-def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root: Path, folder: Path) -> None:
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root, folder):
     told: list[int] = []
     with largest_file(BYTES // 2), pytest.raises(ManipError, match=r"cannot keep decoded .*File too large; make room"):
         opened(root, folder, FRONT, on_frames=told.append)
@@ -315,7 +287,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root: Path, folder: P
     assert [path.name for path in folder.iterdir()] == [".lock"]
 
 
-def test_a_folder_that_cannot_be_is_one_clear_error(root: Path, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_is_one_clear_error(root, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ManipError, match="cannot keep decoded pictures in"):
         opened(root, tmp_path / "file" / "cache")
@@ -324,7 +296,7 @@ def test_a_folder_that_cannot_be_is_one_clear_error(root: Path, tmp_path: Path) 
     assert not (root / "cache").exists()
 
 
-def test_a_damaged_dataset_is_named_and_leaves_nothing(root: Path, folder: Path) -> None:
+def test_a_damaged_dataset_is_named_and_leaves_nothing(root, folder):
     video = next((root / "videos" / FRONT).rglob("*.mp4"))
     content = video.read_bytes()
     video.write_bytes(content[: len(content) // 2])
@@ -337,7 +309,7 @@ def test_a_damaged_dataset_is_named_and_leaves_nothing(root: Path, folder: Path)
         opened(root, folder, FRONT)
 
 
-def test_what_is_no_picture_is_refused(root: Path, folder: Path, tmp_path: Path) -> None:
+def test_what_is_no_picture_is_refused(root, folder, tmp_path):
     with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
         opened(root, folder, "observation.images.fron")
     with pytest.raises(UnknownName, match="unknown camera"):
@@ -360,7 +332,7 @@ def test_what_is_no_picture_is_refused(root: Path, folder: Path, tmp_path: Path)
         opened(root, folder, FRONT)
 
 
-def test_the_folder_is_in_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_folder_is_in_the_users_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache_folder() == tmp_path / "xdg" / "manip_il" / "frames"
