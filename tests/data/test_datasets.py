@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,7 +19,6 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import lerobot_stats
 from manip_il.data import schema as s
-from manip_il.data.atomic import PARTIAL
 from manip_il.data.build import merge_datasets
 from manip_il.data.lerobot_read import (
     dataset_info,
@@ -259,41 +256,6 @@ def test_broken_json_and_other_versions_are_named(root):
     (root / layout.INFO).write_text("{")
     with pytest.raises(ManipError, match=r"info\.json is not valid JSON"):
         read_table(root)
-
-
-_WRITER = """
-import sys
-from pathlib import Path
-from typing import Any
-from manip_il.data.lerobot_read import read_episodes, read_spec
-from manip_il.data.lerobot_write import write_dataset
-source, folder = Path(sys.argv[1]), Path(sys.argv[2])
-spec, episodes = read_spec(source), list(read_episodes(source))
-for number in range(10_000):
-    write_dataset(episodes, folder / str(number), spec, repo_id="x/y", fingerprint={})
-    print(number, flush=True)
-"""
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.006, 0.013])
-def test_a_killed_writer_leaves_whole_datasets_only(root, tmp_path, episodes, spec, delay):
-    folder = tmp_path / "out"
-    command = [sys.executable, "-c", _WRITER, str(root), str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "0\n"
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(delay)
-        os.kill(process.pid, signal.SIGKILL)
-    visible = [path for path in folder.iterdir() if not path.name.endswith(PARTIAL)]
-    assert visible
-    for path in visible:
-        assert dataset_info(path).frames == 20
-        assert len(list(read_episodes(path))) == 3
-    for path in folder.glob(f".*{PARTIAL}"):  # the next writer of the same dataset clears it away
-        name = path.name.split(".")[1]
-        write_dataset(episodes, folder / name, spec, **OPTIONS)
-        assert not path.exists()
 
 
 def test_importing_costs_no_torch():

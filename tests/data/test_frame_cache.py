@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 
 from manip_il.data import frame_source
 from manip_il.data import lerobot_layout as layout
@@ -28,7 +26,8 @@ from manip_il.data.lerobot_read import read_frames
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, picture, write
+from ..damage import edit_json
+from ..pictures import encoded, numbered_episodes, numbers_of, picture, store_pictures, write
 from .test_video import largest_file
 
 MakeEpisode = Callable[..., Episode]
@@ -66,21 +65,17 @@ def entries(folder: Path) -> set[str]:
     return {path.parent.name for path in folder.glob(f"[!.]*/{FRAMES}")}
 
 
-def test_a_row_is_the_frame_of_its_index(root, folder):
+def test_a_row_is_the_frame_of_its_index_bit_by_bit(root, folder):
     frames = opened(root, folder)
     assert list(frames) == KEYS
     assert shown(frames[FRONT]) == list(range(21))
     assert shown(frames[WRIST]) == list(range(21, 42))
-    for values in frames.values():
+    for key, values in frames.items():
+        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
+        np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
         assert (values.shape, values.dtype) == ((21, 3, 72, 96), np.uint8)
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 0
-
-
-def test_a_row_is_bit_equal_to_the_decoded_frame(root, folder):
-    for key, values in opened(root, folder).items():
-        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
-        np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
 
 
 def test_pieces_files_and_processes_change_nothing(tmp_path, folder, make_episode, two, monkeypatch):
@@ -101,7 +96,7 @@ def test_pieces_files_and_processes_change_nothing(tmp_path, folder, make_episod
 
 def test_pictures_in_the_data_files_are_the_stored_bytes(tmp_path, folder, make_episode, spec):
     root = write([make_episode(1, 7), make_episode(2, 5)], tmp_path / "lift", spec)
-    path = store_pictures(root, [picture(number) for number in range(12)])
+    path = store_pictures(root, FRONT, [encoded(picture(number)) for number in range(12)], (72, 96))
     frames = opened(root, folder, FRONT)[FRONT]
     np.testing.assert_array_equal(frames, np.stack([picture(number).transpose(2, 0, 1) for number in range(12)]))
     rows = pq.read_table(path)
@@ -111,23 +106,6 @@ def test_pictures_in_the_data_files_are_the_stored_bytes(tmp_path, folder, make_
     pq.write_table(rows.slice(1), path)
     with pytest.raises(ManipError, match="do not hold each of 12 frames once"):
         opened(root, folder, FRONT)
-
-
-def store_pictures(root: Path, pictures: list[np.ndarray]) -> Path:
-    """Give the dataset a camera of LeRobot's dtype `image`."""
-    path = root / layout.DATA_PATH.format(chunk_index=0, file_index=0)
-    files = root.parent / "pictures"
-    files.mkdir()
-    for number, levels in enumerate(pictures):
-        Image.fromarray(levels).save(files / f"{number}.png")
-    stored = [{"bytes": (files / f"{number}.png").read_bytes(), "path": None} for number in range(len(pictures))]
-    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    pq.write_table(pq.read_table(path).append_column(FRONT, pa.array(stored, kind)), path, row_group_size=5)
-    info = json.loads((root / layout.INFO).read_text())
-    names = ["height", "width", "channels"]
-    info["features"][FRONT] = {"dtype": "image", "shape": pictures[0].shape, "names": names}
-    (root / layout.INFO).write_text(json.dumps(info))
-    return path
 
 
 def test_what_is_there_is_not_decoded_again(root, folder):
@@ -264,19 +242,15 @@ def is_running(process: int) -> bool:
     return state != "Z"
 
 
-def test_an_entry_cut_short_is_decoded_again(root, folder):
-    opened(root, folder, FRONT)
-    (path,) = folder.glob(f"*/{FRAMES}")
-    os.truncate(path, BYTES // 2)
-    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
-
-
-def test_an_entry_tells_of_itself_and_numpy_reads_it(root, folder):
+def test_an_entry_tells_of_itself_numpy_reads_it_and_cut_short_it_is_decoded_again(root, folder):
     frames = opened(root, folder, FRONT)[FRONT]
     (path,) = folder.glob(f"*/{FRAMES}")
     np.testing.assert_array_equal(np.load(path), frames)
     about = json.loads(path.with_name(ABOUT).read_text())
     assert about == {"dataset": str(root), "camera": FRONT, "shape": [21, 3, 72, 96]}
+    del frames
+    os.truncate(path, BYTES // 2)
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
 
 
 def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root, folder):
@@ -316,18 +290,15 @@ def test_what_is_no_picture_is_refused(root, folder, tmp_path):
         opened(root, folder, s.STATE)
     with pytest.raises(ManipError, match="not a LeRobot dataset"):
         opened(tmp_path / "nothing", folder)
-    path = root / layout.INFO
-    info = json.loads(path.read_text())
-    info["features"][FRONT]["shape"] = [72, 90, 3]
-    path.write_text(json.dumps(info))
-    with pytest.raises(MismatchError, match=r"shape of observation\.images\.front differs"):
-        opened(root, folder, FRONT)
-    info["features"][FRONT]["shape"] = [72, 96, 1]
-    path.write_text(json.dumps(info))
-    with pytest.raises(ManipError, match="expected RGB pictures"):
-        opened(root, folder, FRONT)
-    info["features"][FRONT]["shape"] = [72, 96, 3]
-    path.write_text(json.dumps({**info, "total_frames": 22}))
+    for changes, error, message in (
+        ({"shape": [72, 90, 3]}, MismatchError, r"shape of observation\.images\.front differs"),
+        ({"shape": [72, 96, 1]}, ManipError, "expected RGB pictures"),
+    ):
+        edit_json(root / layout.INFO, lambda info, changes=changes: info["features"][FRONT].update(changes))
+        with pytest.raises(error, match=message):
+            opened(root, folder, FRONT)
+    edit_json(root / layout.INFO, lambda info: info["features"][FRONT].update(shape=[72, 96, 3]))
+    edit_json(root / layout.INFO, lambda info: info.update(total_frames=22))
     with pytest.raises(ManipError, match="counts 22 frames, its episodes 21"):
         opened(root, folder, FRONT)
 
