@@ -109,7 +109,7 @@ def _open(folder: Path, source: FrameSource) -> Frames | None:
             npy.read_array_header_1_0(file)
             # the mapping keeps the file open, and by that its lock, for as long as any array of it lives
             return np.memmap(file, np.uint8, "r", file.tell(), source.shape)
-        except ValueError:  # somebody else's file, or one cut short: built anew
+        except ValueError:  # another program's file, or one cut short: built anew
             return None
 
 

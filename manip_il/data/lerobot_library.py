@@ -56,12 +56,12 @@ def write_with_library(
 
 def _save(dataset: LeRobotDataset) -> None:
     """Save an episode without LeRobot's progress bar."""
-    shown = is_progress_bar_enabled()
+    enabled = is_progress_bar_enabled()
     disable_progress_bar()
     try:
         dataset.save_episode(parallel_encoding=False)
     finally:
-        if shown:
+        if enabled:
             enable_progress_bar()
 
 
@@ -123,7 +123,7 @@ def lerobot_windows(
     delta_timestamps: Mapping[str, Sequence[float]] | None,
     episodes: Sequence[int] | None = None,
 ) -> LeRobotDataset:
-    """Return LeRobot's own reading of a dataset, for a `DataLoader`: decodes as it goes, and never asks the Hub.
+    """Open a dataset with LeRobot's own reader, for a `DataLoader`; it decodes on access, and never uses the Hub.
 
     A picture is uint8 (3, height, width), the same bytes as in the frame cache, and (K, 3, height, width) where
     `delta_timestamps` [s] asks for a window; episodes: the ones to read, all by default. Raises `ManipError` for a

@@ -122,7 +122,7 @@ class DatasetWriter:
         self.finished = False
 
     def add(self, episode: Episode) -> None:
-        """Append one episode. Its pictures are encoded beside the caller and must not be changed any more.
+        """Append one episode. Its pictures are encoded in other threads and must not be changed any more.
 
         Raises what `schema.fitted_columns` raises for an episode that does not fit, `ManipError` where an episode,
         this one or one before it, cannot be written.

@@ -127,7 +127,7 @@ def count_packets(path: Path) -> int:
 def _check_index(path: Path) -> None:
     """Raise `ValueError` where FFmpeg would make a larger index of the file than any video needs."""
     if path.stat().st_size < _BOX:
-        return  # FFmpeg says what it is
+        return  # FFmpeg refuses it
     frames, edits = 0, 1
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for start, stop in _outside_media(data):
@@ -166,7 +166,7 @@ def _decode(container: InputContainer, first: int, count: int, fps: int) -> list
     tick = stream.time_base or 1  # [s]
     container.seek(round(first / fps / tick), stream=stream)  # to the key frame there or before
     pictures: list[NDArray[np.uint8]] = []
-    for frame in itertools.islice(container.decode(stream), first + count):  # however many say that they come before
+    for frame in itertools.islice(container.decode(stream), first + count):  # also where more claim to come before
         ahead = round((frame.pts or 0) * tick * fps) - first - len(pictures)
         if ahead == 0:
             pictures.append(frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False))

@@ -103,10 +103,10 @@ class RobotTaskSpec:
 
 def check_picture_size(what: str, size: object, least: int = 1) -> tuple[int, int]:
     """Return height and width [pixels] of a picture: each at least `least`, in all at most `MOST_PIXELS`."""
-    sides = checks.array(what, size, 2)
-    if len(sides) != 2:
+    lengths = checks.array(what, size, 2)
+    if len(lengths) != 2:
         raise ManipError(f"{what} is {checks.shorten(size)}; expected height and width [pixels]")
-    height, width = (checks.whole(what, side, least, LONGEST_SIDE) for side in sides)
+    height, width = (checks.whole(what, one, least, LONGEST_SIDE) for one in lengths)
     if height * width > MOST_PIXELS:
         raise ManipError(f"{what} is {height} x {width} pixels; expected at most {MOST_PIXELS:,} in all")
     return height, width
