@@ -28,9 +28,9 @@ from _machine import describe_machine
 from lerobot.datasets import LeRobotDataset
 
 import datasets
-from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import camera_keys, read_table
+from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.lerobot_read import camera_keys, read_table
 from manip_il.learn.batches import Augment, pictures_to_float
 from manip_il.learn.limits import threads
 from manip_il.learn.samples import JoinedFrames, MemorySource, Windows

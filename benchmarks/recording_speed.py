@@ -27,7 +27,7 @@ from _machine import describe_machine
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
 
-from manip_il.data.build import Builder, Recording
+from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_episode
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
@@ -123,16 +123,17 @@ def record_seconds(
     paused = 0.0
     started = time.perf_counter()
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
+    selection = recording.selection()
     with recording.open(root, spec, fingerprint) as writer:
-        builder = Builder(writer, recording)
         for collected in collect(engine, job, seeds, journals):
-            builder.add(*collected.read(spec, fingerprint))
+            for episode in selection.take([collected.read(spec, fingerprint)]):
+                writer.add(episode)
             if between is not None:
                 writer.wait()  # else what is still being encoded would slow down what comes now
                 paused -= time.perf_counter()
                 between(collected.path)
                 paused += time.perf_counter()
-        builder.finish()
+        writer.finish(recording.provenance | selection.provenance)
     return time.perf_counter() - started - paused
 
 

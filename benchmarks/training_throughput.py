@@ -20,7 +20,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 import datasets
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.lerobot_read import read_table
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
 from manip_il.learn.columns import learning_rows
 from manip_il.learn.fit_config import FitConfig

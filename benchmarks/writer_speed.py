@@ -27,7 +27,8 @@ from lerobot.datasets import LeRobotDataset
 
 import datasets
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import VideoConfig, new_dataset
+from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.video import VideoConfig
 from manip_il.mdp import Episode
 
 LENGTH = 100  # frames of an episode

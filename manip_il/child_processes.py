@@ -22,7 +22,7 @@ _forking = 0  # process id, where the main thread is forking
 
 @contextlib.contextmanager
 def bound_to_this_process() -> Generator[None]:
-    """Python processes that are started inside end with this one, from the moment that they import `manip_il`."""
+    """Start Python processes inside that end with this one, from the moment that they import `manip_il`."""
     if threading.current_thread() is not threading.main_thread():  # Linux would kill them when this thread ends
         yield
         return
@@ -34,7 +34,7 @@ def bound_to_this_process() -> Generator[None]:
 
 
 def obey_parent() -> None:
-    """End with the parent where that asked for it by `bound_to_this_process`; so will what this process forks."""
+    """End with the parent where it started this process in `bound_to_this_process`; processes forked here do too."""
     parent = os.environ.pop(_VARIABLE, None)
     if parent is not None:
         _end_with(int(parent))
@@ -47,7 +47,7 @@ def watch_parent() -> None:
 
 
 def initialize_worker() -> None:
-    """What a pool's process does first: Ctrl-C and what follows from it is for the process that started it."""
+    """Begin a pool's process: it ignores Ctrl-C, which the process that started it handles, and ends with that one."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     watch_parent()
 

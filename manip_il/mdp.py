@@ -1,8 +1,7 @@
-"""What passes between the parts: states, observations, labels, transitions, episodes.
+"""States, observations, labels, transitions, episodes: the types that pass between the rooms.
 
-Every type is frozen and refuses itself on construction when shapes disagree or a value is not
-finite. Numpy only. Vectors over joints have length `n` = arm joints + 1: arm [rad], gripper
-opening [m].
+Every type is frozen and raises on construction when lengths disagree or a value is not finite. Numpy only. Vectors
+over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
 
 
 class Actor(IntEnum):
-    """Who drove the robot in a frame."""
+    """Driver of the robot in a frame."""
 
     EXPERT = 0
     LEARNER = 1
@@ -55,7 +54,7 @@ class State:
 
     @classmethod
     def from_vector(cls, vector: F64) -> State:
-        """Return the inverse of `to_vector`, bit for bit. Raises `ManipError` for a vector that is none of its."""
+        """Return the inverse of `to_vector` of (p + v + 4,), bit for bit. Raises `ManipError` for any other vector."""
         vector = np.asarray(vector, dtype=np.float64)
         end = len(vector) - STATE_EXTRAS
         count, step, streak, ever = vector[end:] if end >= 0 else (-1, 0, 0, 0)
@@ -68,7 +67,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a learner sees. state: (n,); environment_state: (k,), privileged, for state-based policies."""
+    """An observation for a learner. state: (n,); environment_state: (k,), privileged, for state-based policies."""
 
     state: F32
     environment_state: F32
@@ -104,7 +103,7 @@ class Transition:
 
     `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
     `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame, and there
-    `final` is what was seen after it.
+    `final` is the observation after it.
     """
 
     seed: int
@@ -126,8 +125,9 @@ class Episode:
     """A finished episode as columns, keyed as the dataset is (without LeRobot's own index columns).
 
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
-    at some time. success_at_end: within the tolerance for the required steps at the last frame. final: what was seen
-    after every frame that is `next.done`, in their order, so that algorithms can bootstrap; empty where nobody looked.
+    at some time. success_at_end: within the tolerance for the required steps at the last frame. final: the
+    observation after every frame that is `next.done`, in order, so that algorithms can bootstrap; empty where none was
+    made.
     """
 
     seed: int
@@ -157,7 +157,7 @@ class Episode:
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:
-    """Raise `NotFiniteError` naming `what` and the first bad row, unless every value is finite."""
+    """Raise `NotFiniteError` naming `what` and the first bad row of (T, ...), unless every value is finite."""
     if values.dtype.kind != "f":
         return
     if np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Record episodes: run what is missing, keep each one the moment it ends, write datasets from them."""
+"""Record episodes: run the seeds that have no journal, write each journal the moment it ends, and the dataset."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from manip_il.data.build import Builder, Recording
+from manip_il.data.build import Recording
+from manip_il.data.episodes import Header
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import (
-    Header,
     JournalKeep,
     clean_temporary,
     episode_path,
@@ -22,7 +22,7 @@ from manip_il.data.journal import (
     read_journal,
     set_aside_damaged,
 )
-from manip_il.data.lerobot_io import DatasetInfo
+from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
@@ -32,7 +32,7 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
-_IN_HAND = 64  # episodes that may wait in memory; others are read again
+_IN_MEMORY = 64  # episodes that may wait in memory; others are read again
 MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
 
 
@@ -45,7 +45,7 @@ class Collected:
     episode: Episode | None
 
     def read(self, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> tuple[Header, Episode]:
-        """What `read_journal` gives. spec, fingerprint: of what was run here."""
+        """Return what `read_journal` gives. spec, fingerprint: of what was run here."""
         if self.episode is None:
             return read_journal(self.path)
         return Header.of(self.episode, spec, fingerprint), self.episode
@@ -60,41 +60,30 @@ def collect(
     and again is left out: a warning names it. on_episode is called once an episode is on disk; what it raises ends
     the run, and what is on disk stays.
     """
-    shelf = _Shelf(job, journals)
-    missing = [seed for seed in seeds if seed not in shelf.there]
+    on_disk = dict.fromkeys(list_seeds(journals), False)  # seed -> whether it was run here and succeeded
+    in_memory: dict[int, Episode] = {}
+
+    def collected(seed: int) -> Collected:
+        path = episode_path(journals, seed)
+        return Collected(path, on_disk[seed] or read_header(path).success, in_memory.pop(seed, None))
+
+    missing = [seed for seed in seeds if seed not in on_disk]
     keep = JournalKeep(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
     waiting = deque(seeds)
     for episode in engine.run(job, missing, keep):
-        shelf.put(episode)
+        on_disk[episode.seed] = episode.success
+        whole = job.cameras is None or any(key.startswith(IMAGES) for key in episode.columns)
+        if whole and len(in_memory) < _IN_MEMORY:
+            in_memory[episode.seed] = episode
         if on_episode is not None:
             on_episode(episode)
-        while waiting and waiting[0] in shelf.there:
-            yield shelf.take(waiting.popleft())
+        while waiting and waiting[0] in on_disk:
+            yield collected(waiting.popleft())
     for seed in waiting:
-        if seed in shelf.there:
-            yield shelf.take(seed)
+        if seed in on_disk:
+            yield collected(seed)
         else:
             _LOG.warning("seed %d is left out: it repeatedly killed its worker", seed)
-
-
-class _Shelf:
-    """Episodes on disk, some of them in memory for those before them."""
-
-    def __init__(self, job: RolloutJob, journals: Path):
-        self._journals = journals
-        self._pictured = job.cameras is not None
-        self._in_hand: dict[int, Episode] = {}
-        self.there = dict.fromkeys(list_seeds(journals), False)  # seed -> whether it was run here and succeeded
-
-    def put(self, episode: Episode) -> None:
-        self.there[episode.seed] = episode.success
-        whole = not self._pictured or any(key.startswith(IMAGES) for key in episode.columns)
-        if whole and len(self._in_hand) < _IN_HAND:
-            self._in_hand[episode.seed] = episode
-
-    def take(self, seed: int) -> Collected:
-        path, episode = episode_path(self._journals, seed), self._in_hand.pop(seed, None)
-        return Collected(path, self.there[seed] or read_header(path).success, episode)
 
 
 def collect_successes(
@@ -134,24 +123,24 @@ def record(
     """
     recording.write(journals)
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
+    selection = recording.selection()
     with recording.open(root, spec, fingerprint, replace=replace) as writer:
-        builder = Builder(writer, recording)
-        for collected in episodes:
-            builder.add(*collected.read(spec, fingerprint))
-        return builder.finish(), builder.failed
+        for episode in selection.take(collected.read(spec, fingerprint) for collected in episodes):
+            writer.add(episode)
+        return writer.finish(recording.provenance | selection.provenance), selection.failed
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:
-    """Who drove, as datasets say it."""
-    said = {"driver": job.driver, "round": job.round, "beta": job.beta}
+    """Return a job's driver, round and labels, as datasets name them."""
+    source = {"driver": job.driver, "round": job.round, "beta": job.beta}
     if job.driver not in ("policy", "mixture"):
-        return said
+        return source
     steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}
-    return {**said, "label": job.label, "query": str(job.query), **steps}
+    return {**source, "label": job.label, "query": str(job.query), **steps}
 
 
 def check_journals(journals: Path, job: RolloutJob) -> list[str]:
-    """Return whether journals that are there already may be gone on with: `MismatchError`, or warnings to show.
+    """Check that a recording may continue from these journals: `MismatchError`, or a list of warnings to show.
 
     Every file is read; one that is damaged is set aside, so that its seed runs again.
     """

@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 
 
 class Environment(Protocol):
-    """What the loop needs of an environment."""
+    """An environment as the loop needs it."""
 
     @property
     def solved(self) -> bool:
@@ -29,7 +29,7 @@ class Environment(Protocol):
 
     @property
     def progress(self) -> float:
-        """How much of the task is done, 0 to 1."""
+        """Share of the task that is done, 0 to 1."""
         ...
 
     def start(self, seed: int) -> None:
@@ -41,7 +41,7 @@ class Environment(Protocol):
         ...
 
     def observe(self) -> Observation:
-        """What a learner sees now."""
+        """Return what a learner sees now."""
         ...
 
     def get_state(self) -> State:
@@ -69,7 +69,7 @@ class Intruder(Protocol):
     """Disturbs one episode: before a step in the environment, or in the action on its way to the robot."""
 
     def before(self, step: int) -> None:
-        """Called before the state of `step` is read."""
+        """Apply what happens before the state of `step` is read."""
         ...
 
     def action(self, action: F64) -> F64:
@@ -99,7 +99,7 @@ class Turn:
         return self.label
 
     def peek(self) -> Label:
-        """What `ask` would give, without keeping it."""
+        """Return what `ask` gives, without keeping it."""
         if self.labeller is None:
             raise ManipError(f"episode {self.seed}: nobody to ask for a label at step {self.step}")
         return self.labeller.label(self.state)
@@ -107,7 +107,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Rules:
-    """How long an episode runs and when the expert is queried.
+    """Length of an episode, and the states in which the expert is queried.
 
     horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
     query: in every state, in the last one only, or only where the driver asks.

@@ -1,4 +1,4 @@
-"""Named random streams that cannot meet.
+"""Named random streams that share no seed.
 
 An episode's seed is `base(stream) + index`. Each stream owns a block of `BLOCK` seeds, and each
 value of the user's `--seed` shifts all of them into a block of its own, so that demonstrations,
@@ -23,7 +23,7 @@ MAX_SEED = 1_000
 
 
 def stream_base(stream: str, seed: int = 0) -> int:
-    """First seed of a named stream (`demonstrations`, `training`, `validation`, `test`, `round/3`).
+    """Return the first seed of a named stream (`demonstrations`, `training`, `validation`, `test`, `round/3`).
 
     Raises `UsageError` for an unknown stream, or for a `seed` outside [0, 1000].
     """

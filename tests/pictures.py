@@ -1,14 +1,29 @@
-"""Episodes whose pictures say which one they are: their number in twelve squares, light for a one."""
+"""Episodes whose pictures hold their number, as twelve squares, light for a one; and the frames of video files."""
 
 from __future__ import annotations
 
+import io
+from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image
 
 from manip_il.data import schema as s
+from manip_il.data.frame_source import episode_clips
+from manip_il.data.lerobot_layout import INFO, VIDEO_PATH
+from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
+
+from .damage import DATA, edit_json
 
 SIDE, COLUMNS, ROWS = 24, 4, 3  # smaller squares, and the default compression may lose one
 LENGTHS = (7, 1, 13)
@@ -48,3 +63,45 @@ def numbered_episodes(make_episode: Callable[..., Episode], spec: s.RobotTaskSpe
         columns = plain.columns | pictures
         episodes.append(replace(plain, columns={key: columns[key] for key in s.features(spec)}))
     return episodes
+
+
+def encoded(picture: np.ndarray, kind: str = "PNG") -> bytes:
+    """A picture as a PNG or another format of Pillow's."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, kind)
+    return stream.getvalue()
+
+
+def store_pictures(root: Path, key: str, pictures: list[bytes], size: tuple[int, int]) -> Path:
+    """Give a dataset a camera of LeRobot's dtype `image`, whose pictures are in its data file; return that file."""
+    path = root / DATA
+    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    cells = pa.array([{"bytes": content, "path": None} for content in pictures], kind)
+    pq.write_table(pq.read_table(path).append_column(key, cells), path, row_group_size=5)
+    feature: dict[str, Any] = {"dtype": "image", "shape": [*size, 3], "names": ["height", "width", "channels"]}
+    edit_json(root / INFO, lambda info: info["features"].update({key: feature}))
+    return path
+
+
+def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options: Any) -> Path:
+    """Write a dataset with options of `new_dataset`."""
+    with new_dataset(root, spec, **({"repo_id": "someone/lift", "fingerprint": {}} | options)) as writer:
+        for episode in episodes:
+            writer.add(episode)
+        writer.finish()
+    return root
+
+
+def video_rows(root: Path) -> dict[Path, int]:
+    """Every video file of a dataset -> the frames that the rows of `meta/episodes` put into it."""
+    rows: Counter[Path] = Counter()
+    for key in camera_keys(root):
+        for clip in episode_clips(root, key, 1, VIDEO_PATH):
+            rows[root / clip.path] += clip.count
+    return dict(rows)
+
+
+def count_frames(path: Path) -> int:
+    """The frames that a whole video file decodes to."""
+    with closing(open_video(path)) as container:
+        return sum(1 for _ in container.decode(video=0))

@@ -40,7 +40,7 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
     learnt from, or its errors are taken for smaller than they are. trust: see `LearnedPolicy.load`. Raises `ManipError`
     without a sound label.
     """
-    from manip_il.data.lerobot_io import read_table
+    from manip_il.data.lerobot_read import read_table
     from manip_il.learn.columns import EPISODE_INDEX, LEARNING_COLUMNS
     from manip_il.learn.policy import LearnedPolicy
 

@@ -28,9 +28,9 @@ from manip_il.algorithms.fitting import fit_round, round_fit
 from manip_il.algorithms.rounds import Drive, Fitted, Rollouts, RoundResult, best_round
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
-from manip_il.data.build import Recording
+from manip_il.data.build import Recording, merge_datasets
 from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.lerobot_io import dataset_info, merge_datasets, read_table
+from manip_il.data.lerobot_read import dataset_info, read_table
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.query import QueryRule

@@ -11,8 +11,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.cli.options import CONFIG_HEADER
-from manip_il.data.atomic import PARTIAL, write_file
-from manip_il.data.writing import writing
+from manip_il.data.atomic import PARTIAL, write_file, writing
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
 _MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a folder

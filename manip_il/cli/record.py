@@ -87,7 +87,7 @@ class RecordOptions:
         """Record; the dataset is written as the episodes come."""
         env, cameras = self.env.config(self.robot.type, self.task.type), self.image.config(self.cameras)
         if cameras:
-            from manip_il.data.lerobot_io import VideoConfig
+            from manip_il.data.video import VideoConfig
 
             VideoConfig(**asdict(self.dataset.rgb_encoder)).check(cameras.size, env.control_hz)
         from manip_il.data.atomic import exclusive
@@ -120,7 +120,7 @@ class RecordOptions:
 
     def _is_there(self, root: Path, journals: Path) -> bool:
         """Whether a resumed recording has nothing to do."""
-        from manip_il.data.lerobot_io import dataset_info
+        from manip_il.data.lerobot_read import dataset_info
 
         if not self.resume:
             return False

@@ -40,7 +40,7 @@ class RenderOptions:
             raise UsageError("--cameras names none; expected front, wrist or both")
         from manip_il.data.atomic import exclusive
         from manip_il.data.build import local_id
-        from manip_il.data.lerobot_io import dataset_info
+        from manip_il.data.lerobot_read import dataset_info
         from manip_il.engine.engine import default_workers
         from manip_il.engine.render import open_source, render_dataset
 

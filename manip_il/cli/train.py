@@ -88,7 +88,7 @@ class TrainOptions:
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
         from manip_il.data.atomic import exclusive
-        from manip_il.data.lerobot_io import read_fingerprint, read_spec
+        from manip_il.data.lerobot_read import read_fingerprint, read_spec
         from manip_il.learn.lerobot_config import LeRobotFit
 
         if not _is_first_process():
@@ -128,7 +128,7 @@ class TrainOptions:
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
     def _fit_mlp(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.data.lerobot_io import read_table
+        from manip_il.data.lerobot_read import read_table
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
@@ -148,7 +148,7 @@ class TrainOptions:
             )
 
     def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.data.lerobot_io import read_provenance
+        from manip_il.data.lerobot_read import read_provenance
         from manip_il.learn.checkpoint import recorded_look
         from manip_il.learn.fit_policy import PolicyTrainer
 
@@ -173,7 +173,7 @@ class TrainOptions:
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
         """What is told how many pictures more have been decoded; a bar, where there are any."""
-        from manip_il.data.lerobot_io import camera_keys, dataset_info
+        from manip_il.data.lerobot_read import camera_keys, dataset_info
 
         with contextlib.ExitStack() as stack:
             bar = None

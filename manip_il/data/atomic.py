@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all, whatever kills the writer."""
+"""Write files and folders so that they are there whole or not at all, and name the path where a disk refuses."""
 
 from __future__ import annotations
 
@@ -7,15 +7,48 @@ import ctypes
 import errno
 import fcntl
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
-from manip_il.data.writing import writing
-from manip_il.errors import FolderBusyError, FolderExistsError
+from manip_il.errors import FolderBusyError, FolderExistsError, ManipError
 
 PARTIAL = ".partial"  # suffix of what is not finished
+_ROOM = "free space there, or choose another disk"
+_REMEDIES = {  # errors that reading never gives
+    errno.ENOSPC: _ROOM,
+    errno.EDQUOT: _ROOM,
+    errno.EFBIG: _ROOM,
+    errno.EROFS: "choose a folder that may be written",
+}
+_IN_TEXT = re.compile(r"\(os error (\d+)\)|\[[Ee]rrno (\d+)\]")  # of Rust (safetensors), of Arrow and FFmpeg
+
+
+class WriteError(ManipError):
+    """A file or folder that cannot be written."""
+
+    def __init__(self, path: Path, number: int):
+        super().__init__(f"cannot write {path}: {os.strerror(number)}; {_REMEDIES[number]}")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Generator[None]:
+    """Raise `WriteError` for what the disk refuses inside (no space, read-only, a quota).
+
+    It names the file that the refusal names, else `path`.
+    """
+    try:
+        yield
+    except ManipError:
+        raise
+    except Exception as error:  # libraries raise errors of their own types
+        number = _disk_errno(error)
+        if number is None:
+            raise
+        named = getattr(error, "filename", None)
+        raise WriteError(Path(os.fsdecode(named)) if isinstance(named, str | bytes) else path, number) from error
 
 
 @contextlib.contextmanager
@@ -195,3 +228,13 @@ def umask() -> int:
     mask = os.umask(0o077)  # there is no way to only read it
     os.umask(mask)
     return mask
+
+
+def _disk_errno(error: BaseException) -> int | None:
+    """The errno of a disk's refusal that an error reports; None for any other error."""
+    if isinstance(error, OSError):
+        number = error.errno
+    else:
+        found = _IN_TEXT.search(str(error))
+        number = int(found[1] or found[2]) if found else None
+    return number if number in _REMEDIES else None

@@ -1,4 +1,4 @@
-"""Journals to a LeRobot dataset: one by one while they are recorded, or all at once, with the same bytes."""
+"""Make datasets of what is on disk: of a folder of journals (`build`), or of several datasets (`merge_datasets`)."""
 
 from __future__ import annotations
 
@@ -7,20 +7,32 @@ import itertools
 import json
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.data.atomic import write_file
-from manip_il.data.episodes import count_labels, first_labels, parts
+from manip_il.data import lerobot_layout as layout
+from manip_il.data.atomic import new_folder, write_file
+from manip_il.data.episodes import Header, Selection
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.journal import Header, list_episodes, read_journal
-from manip_il.data.lerobot_io import DatasetInfo, DatasetWriter, VideoConfig, new_dataset
-from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError, NothingToLearnError
+from manip_il.data.journal import list_episodes, read_journal
+from manip_il.data.lerobot_read import (
+    UNKNOWN_TASK,
+    DatasetInfo,
+    camera_keys,
+    dataset_info,
+    read_episodes,
+    read_fingerprint,
+    read_provenance,
+    read_spec,
+)
+from manip_il.data.lerobot_write import DatasetWriter, new_dataset, own_file, write_dataset
+from manip_il.data.schema import RobotTaskSpec, check_same_spec
+from manip_il.data.video import VideoConfig
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
@@ -30,11 +42,11 @@ _LARGEST = 16 * 1024 * 1024  # of a recording.json [bytes]
 
 @dataclass(frozen=True)
 class Recording:
-    """What a folder of journals becomes: its `recording.json`.
+    """The dataset that a folder of journals becomes: its `recording.json`.
 
     A rollout becomes as many episodes as it has parts (see `parts`). only_successes: failed ones are left out.
-    only_labelled: those without a sound label are. episodes: at most so many, the first in seed order; None: all.
-    labels: at most so many sound ones; what comes after the last has `label_valid` 0, episodes beyond it are left out.
+    only_labelled: those without a valid label are. episodes: at most so many, the first in seed order; None: all.
+    labels: at most so many valid ones; after the last one `label_valid` is 0, episodes beyond it are left out.
     provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it.
     Raises `ManipError` naming what is wrong.
     """
@@ -57,6 +69,10 @@ class Recording:
         checks.mapping("provenance", self.provenance)
         VideoConfig.from_json(self.video)
 
+    def selection(self) -> Selection:
+        """Return its rules, with nothing taken yet."""
+        return Selection(self.only_successes, self.only_labelled, self.episodes, self.labels)
+
     def open(
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
     ) -> AbstractContextManager[DatasetWriter]:
@@ -65,13 +81,13 @@ class Recording:
         return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
 
     def write(self, journals: Path) -> None:
-        """Write it beside the episodes."""
+        """Write `recording.json` beside the journals."""
         journals.mkdir(parents=True, exist_ok=True)
         write_file(journals / RECORDING, (json.dumps(asdict(self), indent=1) + "\n").encode())
 
     @classmethod
     def read(cls, journals: Path) -> Recording:
-        """Return the folder's own; where it has none, one that takes every episode."""
+        """Return the folder's recording; where it has none, one that takes every episode."""
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
@@ -100,65 +116,8 @@ class BuildResult:
     damaged: tuple[str, ...]
 
 
-class Builder:
-    """Feeds journals, given in seed order, to a dataset's writer; the result depends on the journals alone."""
-
-    def __init__(self, writer: DatasetWriter, recording: Recording):
-        self._writer, self._recording = writer, recording
-        self._first: Header | None = None
-        self._seeds: list[int] = []  # first and last
-        self._rollouts = 0
-        self.count = self.failed = self.labels = 0  # episodes taken and left out as they failed; sound labels
-
-    @property
-    def is_full(self) -> bool:
-        """Whether every asked episode or label is in."""
-        episodes, labels = self._recording.episodes, self._recording.labels
-        return (episodes is not None and self.count >= episodes) or (labels is not None and self.labels >= labels)
-
-    def add(self, header: Header, episode: Episode) -> None:
-        """Take an episode and what its journal says; `MismatchError` where that is about something else than before."""
-        self._first = self._first or header
-        if header.spec != self._first.spec:
-            who = f"the journal of seed {header.seed}"
-            raise MismatchError("robot, task or cameras", who, header.spec, "the first", self._first.spec)
-        for line in compare_fingerprints(
-            f"the journal of seed {header.seed}", header.fingerprint, "the first", self._first.fingerprint
-        ):
-            _LOG.warning("%s", line)
-        if self.is_full:
-            return
-        self._seeds = [*self._seeds[:1], header.seed]
-        self._rollouts += 1
-        for part in parts(episode):
-            if not self.is_full:
-                self._add_part(part)
-
-    def _add_part(self, part: Episode) -> None:
-        if self._recording.only_successes and not part.success:
-            self.failed += 1
-            return
-        if self._recording.labels is not None:
-            part = first_labels(part, self._recording.labels - self.labels)
-        labels = count_labels(part)
-        if self._recording.only_labelled and not labels:
-            return
-        self._writer.add(part)
-        self.count += 1
-        self.labels += labels
-
-    def finish(self) -> DatasetInfo:
-        """Make the dataset whole, with where it came from. Raises `NothingToLearnError` where no episode is left."""
-        if not self.count:
-            raise NothingToLearnError(
-                "no episode has labels to learn from: the expert was never queried, or gave no valid label"
-            )
-        seeds = {"seeds": [self._seeds[0], self._seeds[-1]], "tried": self._rollouts} if self._seeds else {}
-        return self._writer.finish({**self._recording.provenance, **seeds})
-
-
 def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bool = False) -> BuildResult:
-    """Return the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
+    """Build the LeRobot dataset of a folder of journals, in seed order: equal to what `record` writes as it goes.
 
     Files that cannot be read are left out and named in the result. Raises `ManipError` where no episode is left,
     `FolderExistsError` where `root` holds something, unless `replace` is to swap it for the new one at the end.
@@ -166,25 +125,80 @@ def build(journals: Path, root: Path, *, repo_id: str | None = None, replace: bo
     recording = Recording.read(journals)
     if repo_id is not None:
         recording = dataclasses.replace(recording, repo_id=repo_id)
+    selection = recording.selection()
     damaged: list[str] = []
-    readable = _read_all(journals, damaged)
+    readable = _read_until_full(journals, selection, damaged)
     first = next(readable, None)
     if first is None:
         raise ManipError(f"{journals} holds no readable episode{f': {damaged[0]}' if damaged else ''}")
     header = first[0]
     with recording.open(root, header.spec, header.fingerprint, replace=replace) as writer:
-        builder = Builder(writer, recording)
-        for one in itertools.chain([first], readable):
-            builder.add(*one)
-            if builder.is_full:
-                break
-        info = builder.finish()
-    return BuildResult(info, builder.failed, tuple(damaged))
+        for episode in selection.take(itertools.chain([first], readable)):
+            writer.add(episode)
+        info = writer.finish(recording.provenance | selection.provenance)
+    return BuildResult(info, selection.failed, tuple(damaged))
 
 
-def _read_all(journals: Path, damaged: list[str]) -> Iterator[tuple[Header, Episode]]:
+def _read_until_full(journals: Path, selection: Selection, damaged: list[str]) -> Iterator[tuple[Header, Episode]]:
     for path in list_episodes(journals):
         try:
-            yield read_journal(path)
+            entry = read_journal(path)
         except ManipError as error:
             damaged.append(str(error))
+            continue
+        yield entry
+        if selection.is_full:
+            return
+
+
+def merge_datasets(
+    roots: Sequence[Path],
+    root: Path,
+    *,
+    repo_id: str,
+    fingerprint: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> DatasetInfo:
+    """Merge the episodes of several datasets, in order, into one: equal to `write_dataset` of them.
+
+    The fingerprint is the first one's unless given; where theirs differ, a warning is logged. The provenance names the
+    sources and theirs, beside what is given. Datasets with cameras are joined by LeRobot, which copies their videos;
+    its statistics of pictures are approximate. Raises `MismatchError` naming both sides where the specs differ.
+    """
+    if not roots:
+        raise ManipError("no datasets to merge")
+    specs, first = [read_spec(source) for source in roots], read_fingerprint(roots[0])
+    for other, spec in zip(roots, specs, strict=True):
+        _check_mergeable(str(roots[0]), specs[0], str(other), spec)
+        for warning in compare_fingerprints(str(roots[0]), first, str(other), read_fingerprint(other)):
+            _LOG.warning("%s", warning)
+    sources = [{"name": source.name, "provenance": read_provenance(source)} for source in roots]
+    spec = next((spec for spec in specs if spec.task != UNKNOWN_TASK), specs[0])
+    origin = {**(provenance or {}), "merged": sources}
+    fingerprint = first if fingerprint is None else fingerprint
+    if any(camera_keys(source) for source in roots):
+        return _join_by_lerobot(roots, root, repo_id, own_file(repo_id, spec, fingerprint, origin))
+    episodes = itertools.chain.from_iterable(read_episodes(source) for source in roots)
+    return write_dataset(episodes, root, spec, repo_id=repo_id, fingerprint=fingerprint, provenance=origin)
+
+
+def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Mapping[str, Any]) -> DatasetInfo:
+    from manip_il.data.lerobot_library import join_datasets  # imports torch
+
+    with new_folder(root) as folder:
+        work = folder / root.name  # LeRobot makes its folder itself
+        join_datasets(roots, work, repo_id)
+        for path in list(work.iterdir()):
+            path.rename(folder / path.name)
+        work.rmdir()
+        layout.write_json(folder / layout.OURS, about)
+    return dataset_info(root)
+
+
+def _check_mergeable(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
+    """Compare what must be the same for a policy, and what a dataset has only one of."""
+    check_same_spec(left_name, left, right_name, right)
+    for what in ("instruction", "sim_state_size", "task"):
+        left_value, right_value = getattr(left, what), getattr(right, what)
+        if left_value != right_value and UNKNOWN_TASK not in (left_value, right_value):
+            raise MismatchError(what, left_name, left_value, right_name, right_value)

@@ -1,13 +1,14 @@
-"""Transitions to episodes: the columns that a dataset holds.
+"""Turn transitions into episodes with a dataset's columns, and rollouts into the episodes that a dataset takes.
 
-One rollout is one episode here, whatever comes of it: the learner's path, and what the expert did from where it took
-over or was asked to show the way. Each part ends with `next.done`; in a dataset each is an episode (`parts`).
+One rollout is one `Episode`: the learner's path, and what the expert did from where it took over or demonstrated a
+branch. Each of these parts ends with `next.done`; in a dataset each is an episode (`parts`).
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,30 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import schema
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.mdp import Episode, Observation, Transition
 
-_FINAL = "final/"  # before the number of a part and a column: what was seen after its last frame
+_FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Header:
+    """An episode without its columns: how it ended, and the environment that it comes from."""
+
+    seed: int
+    success: bool
+    success_at_end: bool
+    frames: int
+    spec: RobotTaskSpec
+    fingerprint: dict[str, Any]
+
+    @classmethod
+    def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
+        """Return the header of an episode."""
+        return cls(episode.seed, episode.success, episode.success_at_end, len(episode), spec, fingerprint)
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
@@ -33,9 +55,9 @@ def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transitio
 def to_episode(
     frames: Sequence[Transition], round_: int = 0, beta: float = 1.0, *, labelled: bool = True, path: int | None = None
 ) -> Episode:
-    """Return an episode with the schema's columns.
+    """Return an episode with the schema's columns, (T, 1) or (T, d).
 
-    labelled: with the columns of labels; where nobody asked, `label_valid` is 0, the phase 0, and the label the
+    labelled: with the columns of labels; in frames without one `label_valid` is 0, the phase 0, and the label the
     executed action. path: the first so many frames decide whether it succeeded; by default all.
     """
     count = len(frames)
@@ -57,7 +79,7 @@ def to_episode(
     for camera in frames[0].observation.images:
         columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
     if labelled:
-        columns[schema.ACTION] = np.stack([_taught(frame) for frame in frames]).astype(np.float32)
+        columns[schema.ACTION] = np.stack([_label(frame) for frame in frames]).astype(np.float32)
         columns[schema.LABEL_VALID] = _column([bool(frame.label and frame.label.valid) for frame in frames], np.int64)
     decides = frames[:path]
     return Episode(
@@ -70,7 +92,7 @@ def to_episode(
 
 
 def parts(episode: Episode) -> list[Episode]:
-    """What a dataset has as episodes of their own: cut behind every frame that is `next.done`."""
+    """Cut a rollout behind every frame that is `next.done`: each part is an episode of a dataset."""
     ends = np.flatnonzero(episode.columns[schema.DONE].ravel()) + 1
     if len(ends) < 2:
         return [episode]
@@ -80,17 +102,20 @@ def parts(episode: Episode) -> list[Episode]:
 
 
 def final_columns(final: Sequence[Observation]) -> dict[str, NDArray[Any]]:
-    """What was seen after each part of an episode as named arrays, the inverse of `take_final`."""
+    """Return the observations after each part of an episode as named arrays, (n,), (k,) and (height, width, 3).
+
+    The inverse of `take_final`.
+    """
     columns: dict[str, NDArray[Any]] = {}
     for number, one in enumerate(final):
         pictures = {schema.IMAGES + camera: picture for camera, picture in one.images.items()}
-        shown = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
-        columns |= {f"{_FINAL}{number}/{key}": values for key, values in shown.items()}
+        arrays = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
+        columns |= {f"{_FINAL}{number}/{key}": values for key, values in arrays.items()}
     return columns
 
 
 def take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
-    """Remove what `final_columns` gave from `columns`, and return it as it was.
+    """Remove from `columns` the arrays (n,), (k,), ... that `final_columns` gave, and return their observations.
 
     Raises `ValueError` for numbers that are not counted from 0, or without joints or environment.
     """
@@ -99,19 +124,19 @@ def take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
         number, _, key = name.removeprefix(_FINAL).partition("/")
         found.setdefault(number, {})[key] = columns.pop(name)
     if sorted(found) != sorted(map(str, range(len(found)))) or any(
-        {schema.STATE, schema.ENVIRONMENT_STATE} - shown.keys() for shown in found.values()
+        {schema.STATE, schema.ENVIRONMENT_STATE} - arrays.keys() for arrays in found.values()
     ):
         raise ValueError(f"it holds last observations {checks.shorten(sorted(found))}; expected them whole, from 0 on")
     return tuple(_final(found[str(number)]) for number in range(len(found)))
 
 
-def _final(shown: dict[str, NDArray[Any]]) -> Observation:
-    pictures = {key.removeprefix(schema.IMAGES): one for key, one in shown.items() if key.startswith(schema.IMAGES)}
-    return Observation(shown[schema.STATE], shown[schema.ENVIRONMENT_STATE], pictures)
+def _final(arrays: dict[str, NDArray[Any]]) -> Observation:
+    pictures = {key.removeprefix(schema.IMAGES): one for key, one in arrays.items() if key.startswith(schema.IMAGES)}
+    return Observation(arrays[schema.STATE], arrays[schema.ENVIRONMENT_STATE], pictures)
 
 
 def count_labels(episode: Episode) -> int:
-    """Return its sound labels."""
+    """Return the number of an episode's valid labels."""
     return int(episode.columns[schema.LABEL_VALID].sum()) if schema.LABEL_VALID in episode.columns else 0
 
 
@@ -122,13 +147,79 @@ def first_labels(episode: Episode, most: int) -> Episode:
     return replace(episode, columns=episode.columns | {schema.LABEL_VALID: kept})
 
 
+class Selection:
+    """The episodes that a dataset takes of rollouts in seed order, by the rules of a `Recording`.
+
+    It depends on the rollouts alone, so that recording as they come and building later give the same dataset.
+    """
+
+    def __init__(self, only_successes: bool, only_labelled: bool, episodes: int | None, labels: int | None):
+        self._only_successes, self._only_labelled = only_successes, only_labelled
+        self._most_episodes, self._most_labels = episodes, labels
+        self._first: Header | None = None
+        self._seeds: list[int] = []  # of the rollouts until it was full
+        self._episodes = self._labels = 0
+        self.failed = 0  # episodes left out as they failed
+
+    @property
+    def is_full(self) -> bool:
+        """Whether every asked episode or label is in."""
+        episodes, labels = self._most_episodes, self._most_labels
+        return (episodes is not None and self._episodes >= episodes) or (labels is not None and self._labels >= labels)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """First and last seed of the rollouts that were taken from, and their number."""
+        return {"seeds": [self._seeds[0], self._seeds[-1]], "tried": len(self._seeds)}
+
+    def take(self, rollouts: Iterable[tuple[Header, Episode]]) -> Iterator[Episode]:
+        """Yield the episodes to write; every rollout is read, also once it is full.
+
+        Raises `MismatchError` for a rollout of another robot, task or cameras than the first, and at the end
+        `NothingToLearnError` where there was no episode. Other fingerprints than the first's are logged as warnings.
+        """
+        for header, rollout in rollouts:
+            self._check_source(header)
+            if self.is_full:
+                continue
+            self._seeds.append(header.seed)
+            for part in parts(rollout):
+                if not self.is_full:
+                    yield from self._take_part(part)
+        if not self._episodes:
+            raise NothingToLearnError(
+                "no episode has labels to learn from: the expert was never queried, or gave no valid label"
+            )
+
+    def _check_source(self, header: Header) -> None:
+        first = self._first = self._first or header
+        name = f"the journal of seed {header.seed}"
+        if header.spec != first.spec:
+            raise MismatchError("robot, task or cameras", name, header.spec, "the first", first.spec)
+        for line in compare_fingerprints(name, header.fingerprint, "the first", first.fingerprint):
+            _LOG.warning("%s", line)
+
+    def _take_part(self, part: Episode) -> Iterator[Episode]:
+        if self._only_successes and not part.success:
+            self.failed += 1
+            return
+        if self._most_labels is not None:
+            part = first_labels(part, self._most_labels - self._labels)
+        labels = count_labels(part)
+        if self._only_labelled and not labels:
+            return
+        yield part
+        self._episodes += 1
+        self._labels += labels
+
+
 def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Episode:
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
     return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final)
 
 
-def _taught(frame: Transition) -> NDArray[np.float64]:
+def _label(frame: Transition) -> NDArray[np.float64]:
     return frame.executed_action if frame.label is None else frame.label.action
 
 

@@ -1,4 +1,4 @@
-"""What an environment was made of: versions and hashes, compared whenever two sides meet."""
+"""Fingerprints of environments: versions and hashes that decide what is computed, and their comparison."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def compare_fingerprints(
         left_value, right_value = left.get(key, "nothing"), right.get(key, "nothing")
         if left_value != right_value:
             what = _MEANING.get(key, key)
-            sides = (f"{left_name} has {_short(left_value)}", f"{right_name} has {_short(right_value)}")
-            warnings.append(f"{what} differs: {', '.join(sides)}")
+            left_text, right_text = _short(left_value), _short(right_value)
+            warnings.append(f"{what} differs: {left_name} has {left_text}, {right_name} has {right_text}")
     return warnings
 
 

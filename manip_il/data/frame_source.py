@@ -1,4 +1,4 @@
-"""Where a camera's pictures are in a LeRobot v3.0 dataset, and what tells whether they are still the same."""
+"""Find a camera's pictures in a LeRobot v3.0 dataset, and a fingerprint that changes when they do."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info, read_info
-from manip_il.data.picture import open_picture
+from manip_il.data.pictures import Pictures, VideoReader, open_picture
 from manip_il.data.shards import UNREADABLE, Shard, find_shards, floats, integers
-from manip_il.data.video_read import VideoReader
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
-Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` of the first
 
 _VERSION = 1  # of what is stored: another one makes all caches stale
@@ -86,12 +84,12 @@ class FrameSource:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Of all its pictures, channels before pixels: (N, 3, height, width)."""
+        """Shape of all its pictures, channels before pixels: (N, 3, height, width)."""
         return (self.frames, 3, *self.size)
 
     @property
     def nbytes(self) -> int:
-        """Of all its pictures, as uint8."""
+        """Size of all its pictures as uint8 [bytes]."""
         return self.frames * 3 * self.size[0] * self.size[1]
 
     def read(self, part: Part) -> Iterator[Rows]:
@@ -151,7 +149,8 @@ def _video_runs(root: Path, info: Info, key: str) -> Iterator[VideoPart]:
     """Consecutive frames of a file that are consecutive frames of the dataset: mostly the whole file."""
     last: VideoPart | None = None
     expected = 0
-    for part in _episodes(root, info, key):
+    clips = [clip for clip in episode_clips(root, key, info.fps, info.video_path) if clip.count]
+    for part in sorted(clips, key=lambda clip: clip.row):
         if part.row != expected:
             raise ManipError(f"{root}: its episodes hold no frame {expected}, or hold it twice; {_SEE_DOCTOR}")
         expected += part.count
@@ -166,21 +165,24 @@ def _video_runs(root: Path, info: Info, key: str) -> Iterator[VideoPart]:
     yield last
 
 
-def _episodes(root: Path, info: Info, key: str) -> list[VideoPart]:
-    """Every episode's frames, in order of the dataset."""
+def episode_clips(root: Path, key: str, fps: float, video_path: str) -> list[VideoPart]:
+    """Find every episode's frames of one camera. video_path: the template of `info.json`.
+
+    Raises `ManipError` for files that cannot be read.
+    """
     names = [*_PLACES, *(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))]
     parts: list[VideoPart] = []
     for shard in _whole_shards(root, layout.EPISODES_FILES):
         try:
             for table in shard.tables(names):
                 length, row, chunk, file = (integers(table, name) for name in names[:4])
-                first = np.round(floats(table, names[4]) * info.fps).astype(np.int64)
+                first = np.round(floats(table, names[4]) * fps).astype(np.int64)
                 for count, start, *place, number in zip(length, row, chunk, file, first, strict=True):
-                    path = info.video_path.format(video_key=key, chunk_index=int(place[0]), file_index=int(place[1]))
+                    path = video_path.format(video_key=key, chunk_index=int(place[0]), file_index=int(place[1]))
                     parts.append(VideoPart(path, int(number), int(count), int(start)))
         except UNREADABLE as error:
             raise ManipError(f"cannot read {shard.path}: {error}; {_SEE_DOCTOR}") from error
-    return sorted((part for part in parts if part.count), key=lambda part: part.row)
+    return parts
 
 
 def _whole_shards(root: Path, pattern: str) -> Iterator[Shard]:

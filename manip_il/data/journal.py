@@ -1,7 +1,7 @@
-"""One crash-safe MCAP file a finished episode: what recording stands on.
+"""Journals: one crash-safe MCAP file for every finished episode.
 
-A file is written under a temporary name, synced and renamed, so it is whole or it is not there. Every column travels
-bit for bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages as they stand.
+A file is written under a temporary name, synced and renamed, so it is whole or not there. Every column is kept bit for
+bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove shows all messages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import schema
 from manip_il.data.atomic import PARTIAL, write_file
-from manip_il.data.episodes import final_columns, take_final
+from manip_il.data.episodes import Header, final_columns, take_final
 from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
 from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mcap import foxglove
@@ -62,36 +62,19 @@ _NPY_HEADERS: dict[tuple[int, int], Callable[[io.BytesIO], Any]] = {
 
 
 @dataclass(frozen=True)
-class Header:
-    """What a journal file says of its episode without its columns."""
-
-    seed: int
-    success: bool
-    success_at_end: bool
-    frames: int
-    spec: RobotTaskSpec
-    fingerprint: dict[str, Any]
-
-    @classmethod
-    def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
-        """What the journal of an episode says."""
-        return cls(episode.seed, episode.success, episode.success_at_end, len(episode), spec, fingerprint)
-
-
-@dataclass(frozen=True)
 class JournalKeep:
-    """Makes a journal file of every episode that an engine runs."""
+    """Writes the journal of every episode that an engine runs."""
 
     folder: Path
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
 
     def pack(self, episode: Episode) -> bytes:
-        """Return the file's content."""
+        """Return the content of an episode's journal."""
         return encode_episode(episode, self.spec, self.fingerprint)
 
     def store(self, seed: int, packed: bytes) -> None:
-        """Have the file on disk. Raises `ManipError` where the disk is full or may not be written."""
+        """Write the journal to disk. Raises `ManipError` where the disk is full or may not be written."""
         path = episode_path(self.folder, seed)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -112,15 +95,15 @@ def write_episode(folder: Path, episode: Episode, spec: RobotTaskSpec, fingerpri
 
 
 def read_episode(path: Path) -> Episode:
-    """Return the episode as it was written, bit for bit; every checksum of the file is checked.
-
-    Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
-    """
+    """Return the episode of `read_journal`."""
     return read_journal(path)[1]
 
 
 def read_journal(path: Path) -> tuple[Header, Episode]:
-    """What `read_header` and `read_episode` give, in one reading. Raises `ManipError` naming the file."""
+    """Return the header and the episode as they were written, bit for bit; every checksum of the file is checked.
+
+    Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
+    """
     with _explain(path), path.open("rb") as stream:
         check_both_sums(stream)
         header = _header(stream)
@@ -137,21 +120,19 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
         return header, episode
 
 
-def check_header(path: Path) -> Header:
-    """Give what `read_header` gives, once both checksums of the file fit. Raises `ManipError` naming the file."""
-    with _explain(path), path.open("rb") as stream:
-        check_both_sums(stream)
-        return _header(stream)
+def read_header(path: Path, *, check_sums: bool = False) -> Header:
+    """Read the header without the columns; check_sums: and check both checksums of the file.
 
-
-def read_header(path: Path) -> Header:
-    """Seed, success, spec and fingerprint without reading the columns. Raises `ManipError` naming the file."""
+    Raises `ManipError` naming the file.
+    """
     with _explain(path), path.open("rb") as stream:
+        if check_sums:
+            check_both_sums(stream)
         return _header(stream)
 
 
 def episode_path(folder: Path, seed: int) -> Path:
-    """Return where the episode of a seed lies."""
+    """Return the path of the journal of a seed."""
     return folder / f"episode-{seed:012d}.mcap"
 
 
@@ -166,7 +147,7 @@ def list_episodes(folder: Path) -> list[Path]:
 
 
 def set_aside_damaged(folder: Path) -> list[str]:
-    """Rename every file that cannot be read to `<name>.damaged`, so that its seed is free; what was wrong with each.
+    """Rename every file that cannot be read to `<name>.damaged`, so that its seed is free; return what was wrong.
 
     Only for when no writer is at work in `folder`.
     """
@@ -183,7 +164,7 @@ def set_aside_damaged(folder: Path) -> list[str]:
 
 
 def clean_temporary(folder: Path) -> list[Path]:
-    """Remove what killed writers left half-written and return it. Only for when no writer is at work in `folder`."""
+    """Remove unfinished files of killed writers and return them. Only for when no writer is at work in `folder`."""
     leftovers = sorted(folder.glob(f".episode-*{PARTIAL}"))
     for path in leftovers:
         path.unlink(missing_ok=True)
@@ -210,7 +191,8 @@ def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str,
             "fingerprint": json.dumps(fingerprint),
         },
     )
-    _add_channels(writer, episode, spec)
+    channels, times = foxglove.episode_channels(episode, spec), foxglove.frame_times(episode, spec)
+    foxglove.add_channels(writer, list(channels), times)
     for key, column in (episode.columns | final_columns(episode.final)).items():
         if key.startswith(IMAGES):
             continue  # pictures travel as messages, without loss as well
@@ -232,10 +214,6 @@ def _check_limits(stream: io.BytesIO, seed: int) -> None:
         raise ManipError(f"the journal of the episode with seed {seed} could not be read: {error}; {advice}") from error
 
 
-def _add_channels(writer: Writer, episode: Episode, spec: RobotTaskSpec) -> None:
-    foxglove.add_channels(writer, list(foxglove.episode_channels(episode, spec)), foxglove.frame_times(episode, spec))
-
-
 def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
     stream = io.BytesIO()
     try:
@@ -246,7 +224,7 @@ def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
 
 
 def _from_npy(data: memoryview) -> NDArray[Any]:
-    """The array in a file of numpy's format; what its header declares must be what is there."""
+    """The array in a file of numpy's format; `ValueError` where its header declares another size than it has."""
     head = io.BytesIO(data[:_LONGEST_NPY_HEADER])
     version = npy.read_magic(head)
     if version not in _NPY_HEADERS:
@@ -265,7 +243,7 @@ def _budget(stream: BinaryIO, times: int = 1) -> Budget:
 
 
 def _attachments(stream: BinaryIO, budget: Budget) -> Iterator[tuple[str, memoryview]]:
-    """Names and files of the columns that are no pictures."""
+    """Names and files of the columns, without those of pictures."""
     for count, record in enumerate(read_records(stream, Opcode.ATTACHMENT), start=1):
         if count > _MOST_COLUMNS:
             raise ValueError(f"it holds more than {_MOST_COLUMNS} columns")
@@ -294,14 +272,14 @@ def _header(stream: BinaryIO) -> Header:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
     if missing := [key for key in _HEADER_KEYS if key not in data]:
         raise ValueError(f"its header lacks {', '.join(missing)}")
-    said = {key: checks.parse_json(f"its {key}", data[key]) for key in _HEADER_KEYS}
+    values = {key: checks.parse_json(f"its {key}", data[key]) for key in _HEADER_KEYS}
     return Header(
-        checks.whole("its seed", said["seed"], 0, checks.LARGEST_SEED),
-        checks.truth("its success", said["success"]),
-        checks.truth("its success_at_end", said["success_at_end"]),
-        checks.whole("its number of frames", said["frames"], 1, MOST_FRAMES),
-        RobotTaskSpec.from_json(said["spec"]),
-        checks.mapping("its fingerprint", said["fingerprint"]),
+        checks.whole("its seed", values["seed"], 0, checks.LARGEST_SEED),
+        checks.truth("its success", values["success"]),
+        checks.truth("its success_at_end", values["success_at_end"]),
+        checks.whole("its number of frames", values["frames"], 1, MOST_FRAMES),
+        RobotTaskSpec.from_json(values["spec"]),
+        checks.mapping("its fingerprint", values["fingerprint"]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Where a LeRobot v3.0 dataset keeps what, and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
+"""Paths of a LeRobot v3.0 dataset and the Arrow types of its columns (lerobot 0.6.1, `datasets/utils.py`).
 
 Restated here, and held against the library by the tests, because importing `lerobot.datasets` imports torch (seconds).
 """
@@ -17,7 +17,7 @@ VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
 TASKS = "meta/tasks.parquet"
-OURS = "meta/manip_il.json"  # spec, fingerprint, provenance: LeRobot leaves files alone that it does not know
+OURS = "meta/manip_il.json"  # spec, fingerprint, provenance: LeRobot does not touch files that it does not know
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
@@ -57,7 +57,7 @@ def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 
 
 def table_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """Those of the columns that are in the data files: all but the pictures."""
+    """Return the features of the columns in the data files: all but the pictures."""
     return {key: feature for key, feature in all_features(spec).items() if key not in spec.image_keys}
 
 
@@ -66,7 +66,7 @@ def info_json(
 ) -> dict[str, Any]:
     """Return content of `meta/info.json`, keys in LeRobot's order.
 
-    file_sizes: of data and video files [MB]. videos: camera column -> what LeRobot says of its video files.
+    file_sizes: of data and video files [MB]. videos: camera column -> the `info` of its video files.
     """
     table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in all_features(spec).items()}
     for key, info in videos.items():
@@ -144,7 +144,7 @@ def tasks_table(instruction: str) -> pa.Table:
 
 
 def numbered(template: str, number: int, **names: str) -> tuple[str, int, int]:
-    """Path, chunk and file index of the `number`-th file. names: what else the template asks for."""
+    """Return path, chunk and file index of the `number`-th file. names: other fields of the template."""
     chunk, file = divmod(number, CHUNKS_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **names), chunk, file
 

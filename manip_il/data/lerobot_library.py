@@ -1,4 +1,4 @@
-"""Write a dataset of any features through LeRobot's own writer: slow, but it knows every feature that LeRobot has."""
+"""Datasets through LeRobot's own code: for features that only its writer knows, and for training with its loader."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ def write_with_library(
 
 
 def _save(dataset: LeRobotDataset) -> None:
-    """Without the progress bar that it shows for every episode."""
-    shown = is_progress_bar_enabled()
+    """Save an episode without LeRobot's progress bar."""
+    enabled = is_progress_bar_enabled()
     disable_progress_bar()
     try:
         dataset.save_episode(parallel_encoding=False)
     finally:
-        if shown:
+        if enabled:
             enable_progress_bar()
 
 
 def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
-    """LeRobot's own joining of datasets into `root`, which must not exist; every video stays a file of its own."""
+    """Join datasets into `root`, which must not exist, by LeRobot; every video stays a file of its own."""
     for source in roots:
         check_dataset(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
@@ -80,7 +80,7 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
 
 
 class Metadata(LeRobotDatasetMetadata):
-    """LeRobot's, of one dataset or of several as one; `roots` are their folders."""
+    """LeRobot's metadata of one dataset, or of several as one; `roots` are their folders."""
 
     roots: tuple[Path, ...] = ()
 
@@ -113,7 +113,7 @@ def _nature(meta: LeRobotDatasetMetadata) -> tuple[list[str], int, list[str]]:
 
 
 def _metadata(root: Path) -> Metadata:
-    if not (root / INFO).is_file():  # LeRobot would ask the Hub for it
+    if not (root / INFO).is_file():  # LeRobot would request it from the Hub
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {INFO}")
     check_dataset(root)
     meta = Metadata(f"local/{root.name}", root=root)
@@ -128,13 +128,13 @@ def lerobot_windows(
     delta_timestamps: Mapping[str, Sequence[float]] | None,
     episodes: Sequence[int] | None = None,
 ) -> LeRobotDataset:
-    """Return LeRobot's own reading of a dataset, for a `DataLoader`: decodes as it goes, and never asks the Hub.
+    """Open a dataset with LeRobot's own reader, for a `DataLoader`; it decodes on access, and never uses the Hub.
 
     A picture is uint8 (3, height, width), the same bytes as in the frame cache, and (K, 3, height, width) where
     `delta_timestamps` [s] asks for a window; episodes: the ones to read, all by default. Raises `ManipError` for a
     folder that is no dataset or that lacks files.
     """
-    for pattern in (INFO, TASKS, EPISODES_FILES):  # what LeRobot would ask the Hub for
+    for pattern in (INFO, TASKS, EPISODES_FILES):  # LeRobot would request them from the Hub
         if not any(root.glob(pattern)):
             raise ManipError(f"{root} is not a complete LeRobot dataset: no file matches {pattern}")
     check_dataset(root)

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.frame_source import VideoPart, episode_clips
 from manip_il.data.info import LARGEST_META, info_problems
-from manip_il.data.parquet_limits import check_parquet
-from manip_il.data.video_read import DatasetPictures
+from manip_il.data.parquet_files import check_files, read_column, read_file
+from manip_il.data.pictures import VideoReader
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -31,7 +29,7 @@ _INDEX = {"dtype": "int64", "shape": (1,)}
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What a dataset holds. success: episodes that succeeded at some step; None where no column says so."""
+    """Names and counts of a dataset. success: episodes that succeeded at some step; None where no column says so."""
 
     root: Path
     robot: str
@@ -47,7 +45,7 @@ class DatasetInfo:
 def read_table(
     root: Path, columns: Sequence[str] | None = None, episodes: Sequence[int] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Whole columns in stored order: (T,) for scalars, (T, d) for vectors; views of Arrow's memory, read-only.
+    """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; views of Arrow's memory, read-only.
 
     columns: all that are not pictures by default. episodes: indices of the episodes to keep; all by default.
     Raises `ManipError` for a folder that is no dataset or a file that cannot be read, `UnknownName` for a column
@@ -60,16 +58,16 @@ def read_table(
         if name not in table_features:
             raise UnknownName(f"column in {root}", name, table_features)
     wanted = names if episodes is None else list(dict.fromkeys([*names, layout.EPISODE_INDEX]))
-    _check_files(root, _data_files(root), wanted)
-    table = pa.concat_tables(_read_file(path, wanted) for path in _data_files(root))
+    check_files(root, _data_files(root), wanted)
+    table = pa.concat_tables(read_file(path, wanted) for path in _data_files(root))
     _check_rows(root, len(table))
     if episodes is not None:
         table = _keep(root, table, episodes, info["total_episodes"])
-    return {name: _values(root, name, table, table_features[name]) for name in names}
+    return {name: read_column(root, name, table, table_features[name]) for name in names}
 
 
 def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return the columns of several datasets one after the other, with frames and episodes numbered throughout.
+    """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
 
     Raises what `read_table` raises.
     """
@@ -94,16 +92,18 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     wanted = {key: one for key, one in s.features(spec).items() if pictures or key not in spec.image_keys}
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
     stored = [key for key in shapes if key not in cameras]
-    _check_rows(root, sum(len(_read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
-    with closing(_pictures(root, cameras)) as frames:
+    _check_rows(root, sum(len(read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
+    clips = {key: _clips(root, key) for key in cameras}
+    with ExitStack() as stack:
+        readers = {key: stack.enter_context(closing(VideoReader())) for key in cameras}
         for path in _data_files(root):
-            table = _read_file(path, [*stored, layout.EPISODE_INDEX])
-            columns = {key: _values(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
-            index = _values(root, layout.EPISODE_INDEX, table, _INDEX)
+            table = read_file(path, [*stored, layout.EPISODE_INDEX])
+            columns = {key: read_column(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
+            index = read_column(root, layout.EPISODE_INDEX, table, _INDEX)
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
-                own |= {key: frames.read(key, int(index[start])) for key in cameras}
+                own |= {key: _decode(root, readers[key], clips[key], int(index[start]), spec.fps) for key in cameras}
                 yield _episode({key: own[key] for key in shapes})
 
 
@@ -115,17 +115,8 @@ def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
     """
     if key not in (known := camera_keys(root)):
         raise UnknownName(f"camera in {root}", key, known)
-    with closing(_pictures(root, [key])) as pictures:
-        return pictures.read(key, episode)
-
-
-def video_rows(root: Path) -> dict[Path, int]:
-    """Return every video file that `meta/episodes` names, with the number of frames that it says are in it."""
-    pictures = _pictures(root, camera_keys(root))
-    rows: Counter[Path] = Counter()
-    for key, episode in itertools.product(camera_keys(root), range(len(pictures.lengths))):
-        rows[pictures.place(key, episode)[0]] += pictures.lengths[episode]
-    return dict(rows)
+    with closing(VideoReader()) as reader:
+        return _decode(root, reader, _clips(root, key), episode, int(_read_info(root)["fps"]))
 
 
 def read_spec(root: Path) -> s.RobotTaskSpec:
@@ -205,25 +196,19 @@ def check_dataset(root: Path) -> None:
     """
     _read_info(root)
     for pattern in (layout.TASKS, layout.EPISODES_FILES, layout.DATA_FILES):
-        _check_files(root, sorted(root.glob(pattern)), None)
+        check_files(root, sorted(root.glob(pattern)), None)
 
 
-def _check_files(root: Path, paths: list[Path], columns: list[str] | None) -> None:
-    try:
-        check_parquet(paths, columns)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        where = paths[0] if len(paths) == 1 else f"{root}/{paths[0].relative_to(root).parts[0]}"
-        raise ManipError(f"cannot read {where}: {error}; run `manip-il doctor` to see what is left") from error
+def _clips(root: Path, key: str) -> list[VideoPart]:
+    info = _read_info(root)
+    return episode_clips(root, key, info["fps"], info.get("video_path") or layout.VIDEO_PATH)
 
 
-def _pictures(root: Path, keys: Iterable[str]) -> DatasetPictures:
-    names = [f"videos/{key}/{name}" for key in keys for name in layout.VIDEO_COLUMNS]
-    paths = sorted(root.glob(layout.EPISODES_FILES))
-    _check_files(root, paths, ["length", *names])
-    tables = [_read_file(path, ["length", *names]) for path in paths]
-    if not tables:
-        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
-    return DatasetPictures(root, int(_read_info(root)["fps"]), pa.concat_tables(tables).to_pydict())
+def _decode(root: Path, reader: VideoReader, clips: list[VideoPart], episode: int, fps: int) -> NDArray[np.uint8]:
+    if not 0 <= episode < len(clips):
+        raise UsageError(f"{root} has no episode {episode}; it has 0 to {len(clips) - 1}")
+    clip = clips[episode]
+    return reader.read(root / clip.path, clip.first, clip.count, fps)
 
 
 def _episode(columns: dict[str, NDArray[Any]]) -> Episode:
@@ -286,19 +271,6 @@ def _data_files(root: Path) -> list[Path]:
     return paths
 
 
-def _read_file(path: Path, columns: list[str]) -> pa.Table:
-    try:
-        check_parquet([path], columns)
-        # one thread: handing out pieces of one episode costs more than reading them
-        table = pq.ParquetFile(path).read(columns, use_threads=False)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise ManipError(f"cannot read {path}: {error}; run `manip-il doctor` to see what is left") from error
-    for name in columns:
-        if name not in table.column_names:
-            raise UnknownName(f"column in {path}", name, table.column_names)
-    return table.replace_schema_metadata(None)
-
-
 def _keep(root: Path, table: pa.Table, episodes: Sequence[int], count: int) -> pa.Table:
     for episode in episodes:
         if not 0 <= episode < count:
@@ -306,38 +278,6 @@ def _keep(root: Path, table: pa.Table, episodes: Sequence[int], count: int) -> p
     return table.filter(np.isin(table.column(layout.EPISODE_INDEX).to_numpy(), list(episodes)))
 
 
-def _values(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
-    """A column; `ManipError` where its values are of another kind or shape than `feature` says, or some are missing."""
-    shape, dtype = tuple(feature["shape"]), feature["dtype"]
-    column = table.column(name)
-    try:
-        values = _to_numpy(column, shape)
-        kind = "O" if dtype == "string" else np.dtype(dtype).kind
-    except (ValueError, TypeError, pa.ArrowException) as error:
-        raise ManipError(f"{root}: column {name!r} is not {dtype} of shape {shape}: {error}") from error
-    fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
-    if column.null_count or values.dtype.kind != kind or len(values) != len(column) or not fits:
-        missing = f" with {column.null_count} missing" if column.null_count else ""
-        holds = checks.shorten(str(column.type))
-        raise ManipError(f"{root}: column {name!r} holds {holds}{missing}; expected {dtype} of shape {shape}")
-    return values
-
-
-def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
-    array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):  # what older versions give for no chunk at all
-        array = pa.concat_arrays(array.chunks)
-    length, nested = len(array), False
-    while _is_list(array.type):
-        array, nested = array.flatten(), True
-    values = array.to_numpy(zero_copy_only=False)
-    return values.reshape(length, *shape) if nested else values
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
-
-
 def _instruction(root: Path) -> str:
-    tasks = _read_file(root / layout.TASKS, ["task"]).column("task").to_pylist()
+    tasks = read_file(root / layout.TASKS, ["task"]).column("task").to_pylist()
     return tasks[0] if tasks else ""

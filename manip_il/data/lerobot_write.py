@@ -1,7 +1,7 @@
 """Write LeRobot v3.0 datasets with pyarrow and PyAV, episode by episode, in memory that does not grow.
 
-LeRobot's own writer takes 80 to 160 ms an episode and loses all of them when it dies; this one writes the same files
-in a few milliseconds an episode, and the dataset is there whole or not at all. LeRobot's reader and tools judge it.
+LeRobot's own writer takes 80 to 160 ms an episode and loses all of them when it is killed; this one writes the same
+files in a few milliseconds an episode, and the dataset is there whole or not at all. Tests read it with LeRobot.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import new_folder
+from manip_il.data.atomic import new_folder, writing
 from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
 from manip_il.data.video import CameraFiles, CameraThreads, Clip, VideoConfig
-from manip_il.data.writing import writing
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -38,7 +37,7 @@ FORMAT = 1  # of meta/manip_il.json
 def own_file(
     repo_id: str, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], provenance: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """What stands in `meta/manip_il.json`."""
+    """Return the content of `meta/manip_il.json`."""
     ours = {"format": FORMAT, "repo_id": repo_id, "spec": spec.to_json(), "fingerprint": dict(fingerprint)}
     return ours | {"provenance": dict(provenance or {})}
 
@@ -98,7 +97,7 @@ def write_dataset(
 
 
 class DatasetWriter:
-    """Takes a dataset's episodes as they come; made by `new_dataset`."""
+    """Writes a dataset's episodes as they come; made by `new_dataset`."""
 
     def __init__(
         self,
@@ -123,7 +122,7 @@ class DatasetWriter:
         self.finished = False
 
     def add(self, episode: Episode) -> None:
-        """Append one episode. Its pictures are encoded beside the caller and must not be changed any more.
+        """Append one episode. Its pictures are encoded in other threads and must not be changed any more.
 
         Raises what `schema.fitted_columns` raises for an episode that does not fit, `ManipError` where an episode,
         this one or one before it, cannot be written.
@@ -171,16 +170,16 @@ class DatasetWriter:
         )
 
     def wait(self) -> None:
-        """Until every picture so far is encoded."""
+        """Wait until every picture so far is encoded."""
         for _, clips in self._encoding:
             for clip in clips.values():
                 clip.result()
 
     def close(self) -> None:
-        """Let go of files and threads, finished or not."""
+        """Close files and end threads, finished or not."""
         self._cameras.stop()
         for files in (self._data, self._meta, self._stats):
-            with contextlib.suppress(OSError):  # a full disk has been complained of
+            with contextlib.suppress(OSError):  # a full disk was reported by `add` or `finish`
                 files.close()
 
     def _index_columns(self, length: int) -> dict[str, NDArray[Any]]:

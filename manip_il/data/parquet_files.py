@@ -1,8 +1,8 @@
-"""Numbered parquet files that are appended to, a row group at a time."""
+"""Parquet files of datasets: write numbered ones a row group at a time, read checked columns as numpy arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.parquet_limits import check_parquet
+from manip_il.errors import ManipError, UnknownName
 
 
 class ParquetFiles:
@@ -84,3 +87,64 @@ def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table
         else:
             arrays.append(pa.array(values, field.type))
     return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def check_files(root: Path, paths: list[Path], columns: list[str] | None) -> None:
+    """Raise `ManipError` where files of a dataset cannot be read, or columns (None: all) unpack to too much."""
+    try:
+        check_parquet(paths, columns)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        place = paths[0] if len(paths) == 1 else f"{root}/{paths[0].relative_to(root).parts[0]}"
+        raise ManipError(f"cannot read {place}: {error}; run `manip-il doctor` to see what is left") from error
+
+
+def read_file(path: Path, columns: list[str]) -> pa.Table:
+    """Return columns of a file.
+
+    Raises `ManipError` for one that is damaged or unpacks to too much, `UnknownName` for a missing column.
+    """
+    try:
+        check_parquet([path], columns)
+        # one thread: handing out pieces of one episode costs more than reading them
+        table = pq.ParquetFile(path).read(columns, use_threads=False)
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise ManipError(f"cannot read {path}: {error}; run `manip-il doctor` to see what is left") from error
+    for name in columns:
+        if name not in table.column_names:
+            raise UnknownName(f"column in {path}", name, table.column_names)
+    return table.replace_schema_metadata(None)
+
+
+def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
+    """Return a column, (T,) or (T, *shape), as `feature` says.
+
+    Raises `ManipError` naming the dataset `root` where values have another kind or shape, or some are missing.
+    """
+    shape, dtype = tuple(feature["shape"]), feature["dtype"]
+    column = table.column(name)
+    try:
+        values = _to_numpy(column, shape)
+        kind = "O" if dtype == "string" else np.dtype(dtype).kind
+    except (ValueError, TypeError, pa.ArrowException) as error:
+        raise ManipError(f"{root}: column {name!r} is not {dtype} of shape {shape}: {error}") from error
+    fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
+    if column.null_count or values.dtype.kind != kind or len(values) != len(column) or not fits:
+        missing = f" with {column.null_count} missing" if column.null_count else ""
+        holds = checks.shorten(str(column.type))
+        raise ManipError(f"{root}: column {name!r} holds {holds}{missing}; expected {dtype} of shape {shape}")
+    return values
+
+
+def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
+    array = column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):  # what older versions give for no chunk at all
+        array = pa.concat_arrays(array.chunks)
+    length, nested = len(array), False
+    while _is_list(array.type):
+        array, nested = array.flatten(), True
+    values = array.to_numpy(zero_copy_only=False)
+    return values.reshape(length, *shape) if nested else values
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)

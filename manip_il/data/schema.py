@@ -1,4 +1,4 @@
-"""The one list of a dataset's columns: keys, dtypes, shapes, meaning (LeRobot v3.0)."""
+"""The columns of a dataset: keys, dtypes, shapes (LeRobot v3.0), and the checks that an episode fits them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _LARGEST_STATE = 1_000_000  # numbers in a `sim_state`
 
 @dataclass(frozen=True)
 class RobotTaskSpec:
-    """What a dataset is about: names, sizes and rate that dataset, policy and environment must share.
+    """Names, sizes and rate that a dataset, a policy and an environment must share.
 
     Robot, task and cameras may become parts of paths. Raises `ManipError` naming what is wrong.
     """
@@ -79,7 +79,7 @@ class RobotTaskSpec:
         check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON knows it."""
+        """Return the spec as JSON types."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     @classmethod
@@ -103,10 +103,10 @@ class RobotTaskSpec:
 
 def check_picture_size(what: str, size: object, least: int = 1) -> tuple[int, int]:
     """Return height and width [pixels] of a picture: each at least `least`, in all at most `MOST_PIXELS`."""
-    sides = checks.array(what, size, 2)
-    if len(sides) != 2:
+    lengths = checks.array(what, size, 2)
+    if len(lengths) != 2:
         raise ManipError(f"{what} is {checks.shorten(size)}; expected height and width [pixels]")
-    height, width = (checks.whole(what, side, least, LONGEST_SIDE) for side in sides)
+    height, width = (checks.whole(what, one, least, LONGEST_SIDE) for one in lengths)
     if height * width > MOST_PIXELS:
         raise ManipError(f"{what} is {height} x {width} pixels; expected at most {MOST_PIXELS:,} in all")
     return height, width
@@ -186,7 +186,7 @@ def _fitted(who: str, key: str, values: NDArray[Any] | None, feature: dict[str, 
 
 
 def _check_flags(who: str, episode: Episode, columns: dict[str, NDArray[Any]]) -> None:
-    """What is stored once an episode and what is stored in every frame must say the same."""
+    """Compare what an episode says with what its columns say in every frame."""
     if (columns[SEED] != episode.seed).any():
         frame = int(np.argmax(columns[SEED] != episode.seed))
         raise MismatchError("seed", who, episode.seed, f"its column at frame {frame}", int(columns[SEED][frame]))

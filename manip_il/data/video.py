@@ -26,26 +26,23 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
-from manip_il.data.video_open import open_video
-from manip_il.data.video_read import count_packets
+from manip_il.data.pictures import Pictures, count_packets, open_video
 from manip_il.errors import ManipError, UnknownName, UsageError
 
-# crf and preset where nothing else is asked. LeRobot's own codec and settings are those of libsvtav1; h264 takes a
-# sixth of its time for the same error, which is what lets encoding keep up with drawing on one core.
+# Default crf and preset. LeRobot's own codec and settings are those of libsvtav1; h264 takes a sixth of its time for
+# the same error, which lets encoding keep up with rendering on one core.
 CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
 QUEUE_BYTES = 128 * 1024 * 1024  # of pictures that wait to be encoded; an episode that is alone may be larger
 _MIB = 1024 * 1024
 _MOST_SETTING = 1_000_000  # no codec knows a larger one
 
-Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
-
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """How pictures are compressed, by the names of LeRobot's `RGBEncoderConfig`; `libsvtav1` also has its defaults.
+    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`; those of `libsvtav1` default as there.
 
-    Raises `UnknownName` for the codec, `UsageError` for g, `ManipError` for a value of another type; what a codec makes
-    of the rest, only `check` can tell.
+    Raises `UnknownName` for the codec, `UsageError` for g, `ManipError` for a value of another type; `check` tries the
+    rest with the codec itself.
     """
 
     vcodec: str = "h264"
@@ -106,7 +103,7 @@ class VideoConfig:
                 av.logging.set_level(level)
 
     def info(self, path: Path) -> dict[str, Any]:
-        """What LeRobot's `info.json` says of a camera whose video files are like `path`."""
+        """Return the entry of LeRobot's `info.json` for a camera whose video files are like `path`."""
         with contextlib.closing(open_video(path)) as container:
             stream = container.streams.video[0]
             found = {
@@ -124,7 +121,7 @@ class VideoConfig:
 
 @dataclass(frozen=True)
 class Clip:
-    """Where one camera's frames of one episode are: from frame `first` of a file on; their `pixel_counts`."""
+    """One camera's frames of one episode: from frame `first` of a file on; counts: their `pixel_counts`."""
 
     chunk: int
     file: int
@@ -175,7 +172,7 @@ class CameraFiles:
             raise ManipError(f"{name} holds {found} frames; {file.frames} were encoded")
 
     def info(self) -> dict[str, Any]:
-        """`VideoConfig.info` of the first file, which must be closed."""
+        """Return `VideoConfig.info` of the first file, which must be closed."""
         return self._config.info(self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0])
 
 
@@ -189,7 +186,7 @@ class CameraThreads:
         self._bytes = 0
 
     def write(self, pictures: Mapping[str, Pictures]) -> dict[str, Future[Clip]]:
-        """Hand over an episode's frames, which must not change from now on; wait while too many wait already.
+        """Add an episode's frames, which must not change from now on, to the queue; wait while it is full.
 
         Raises the `ManipError` of an earlier episode that could not be encoded.
         """
@@ -209,7 +206,7 @@ class CameraThreads:
         return {key: camera.info() for key, camera in self._cameras.items()}
 
     def stop(self) -> None:
-        """End the threads without a word, whatever they were at."""
+        """End the threads, whatever they are doing, and raise nothing."""
         for thread in self._threads.values():
             thread.shutdown(cancel_futures=True)
         for camera in self._cameras.values():
@@ -261,7 +258,7 @@ def _encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodec
 
 
 def _set_up(encoder: VideoCodecContext, config: VideoConfig, size: tuple[int, int], fps: int) -> None:
-    os.environ.setdefault("SVT_LOG", "1")  # errors only: it greets on standard error whenever an encoder opens
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: else it prints its version whenever an encoder opens
     encoder.height, encoder.width = size
     encoder.pix_fmt = config.pix_fmt
     encoder.framerate, encoder.time_base = Fraction(fps), Fraction(1, fps)

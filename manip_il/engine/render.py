@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.data import schema
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.lerobot_io import (
+from manip_il.data.lerobot_layout import OURS
+from manip_il.data.lerobot_read import (
+    UNKNOWN_TASK,
     DatasetInfo,
-    new_dataset,
     read_episodes,
     read_fingerprint,
     read_provenance,
     read_spec,
 )
-from manip_il.data.lerobot_layout import OURS
-from manip_il.data.lerobot_read import UNKNOWN_TASK
+from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError

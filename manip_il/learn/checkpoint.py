@@ -29,9 +29,8 @@ from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.data.atomic import umask
+from manip_il.data.atomic import umask, writing
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.data.writing import writing
 from manip_il.errors import ManipError, MismatchError
 
 META_FILE = "manip_il.json"

@@ -13,8 +13,7 @@ from typing import Any
 from lerobot.configs.train import TrainPipelineConfig
 
 from manip_il import checks
-from manip_il.data.atomic import write_file
-from manip_il.data.writing import writing
+from manip_il.data.atomic import write_file, writing
 from manip_il.errors import ManipError, UsageError
 
 METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"

@@ -18,9 +18,9 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import read_tables
+from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_library import lerobot_windows
+from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames

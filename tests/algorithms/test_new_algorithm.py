@@ -11,7 +11,7 @@ import pytest
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import Rollouts, RoundResult, mixture
 from manip_il.algorithms.run import Run, Watch
-from manip_il.data.lerobot_io import dataset_info
+from manip_il.data.lerobot_read import dataset_info
 from manip_il.engine.engine import Engine
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode

@@ -15,7 +15,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.run import Watch, round_folder
 from manip_il.algorithms.table import run_algorithm
-from manip_il.data.lerobot_io import dataset_info, read_table, read_tables
+from manip_il.data.lerobot_read import dataset_info, read_table, read_tables
 from manip_il.engine.engine import Engine
 from manip_il.engine.query import QueryRule
 from manip_il.evaluation.results import EpisodeResult, EvalResult

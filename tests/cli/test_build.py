@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.data.journal import list_episodes
-from manip_il.data.lerobot_io import dataset_info, read_episodes, read_table
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_table
 
 
 def record(root: Path, *words: str) -> list[str]:

@@ -20,7 +20,7 @@ from manip_il.cli import groups, story
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
 from manip_il.cli.options import from_yaml, options_of, parse
-from manip_il.data.lerobot_io import dataset_info, read_provenance, read_table
+from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
 from manip_il.evaluation.results import EvalResult
 from manip_il.sim.env import EnvConfig
 

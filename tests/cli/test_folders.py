@@ -12,7 +12,7 @@ from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, rea
 from manip_il.cli.groups import CONFIG_FILE, check_same_options
 from manip_il.cli.options import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
-from manip_il.data.writing import WriteError
+from manip_il.data.atomic import WriteError
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
 
 

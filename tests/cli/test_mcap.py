@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import read_table, write_dataset
+from manip_il.data.lerobot_read import read_table
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec, features
 from manip_il.mdp import Episode
 

@@ -1,7 +1,8 @@
-"""Files and folders are whole or absent, and a folder has one writer."""
+"""Files and folders are whole or absent, a folder has one writer, and what a disk refuses names the path."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -10,9 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.data.atomic import exclusive, new_folder, write_file
-from manip_il.data.writing import WriteError
+from manip_il.data.atomic import WriteError, exclusive, new_folder, write_file, writing
 from manip_il.errors import FolderBusyError, FolderExistsError
+
+FULL = "No space left on device"
+
+
+class RustError(Exception):
+    pass
 
 
 def test_a_folder_appears_at_the_end_and_not_after_an_error(tmp_path):
@@ -42,7 +48,21 @@ def test_what_is_there_is_not_written_over_unless_asked_and_stays_until_the_new_
     assert [path.name for path in tmp_path.iterdir()] == ["root"]
 
 
-def test_a_killed_writers_folder_is_removed_by_the_next_and_a_living_ones_is_not(tmp_path):
+def test_of_two_writers_of_one_folder_one_wins_whole(tmp_path):
+    def race() -> None:
+        with new_folder(tmp_path / "x") as slow:
+            (slow / "by").write_text("slow")
+            with new_folder(tmp_path / "x") as fast:  # which does not clear away what the other still writes
+                (fast / "by").write_text("fast")
+            assert (slow / "by").exists()
+
+    with pytest.raises(FolderExistsError):
+        race()
+    assert [(path.name, (path / "by").read_text()) for path in tmp_path.iterdir()] == [("x", "fast")]
+
+
+def test_a_killed_writers_folder_is_removed_by_the_next_and_no_other(tmp_path):
+    (tmp_path / ".rooted.abc.partial").mkdir()  # another folder's
     writer = start("new_folder", tmp_path / "root")
     with new_folder(tmp_path / "root"):
         assert len(list(tmp_path.glob(".root.*.partial"))) == 2
@@ -51,6 +71,7 @@ def test_a_killed_writers_folder_is_removed_by_the_next_and_a_living_ones_is_not
     (tmp_path / "root").rmdir()
     with new_folder(tmp_path / "root"):
         assert len(list(tmp_path.glob(".root.*.partial"))) == 1
+    assert (tmp_path / ".rooted.abc.partial").exists()
 
 
 def test_a_second_writer_is_refused_by_the_firsts_process_id(tmp_path):
@@ -70,9 +91,14 @@ def test_one_process_may_hold_a_folder_again_and_two_folders_at_once(tmp_path):
         pass
 
 
-def test_a_file_holds_what_it_held_where_writing_fails(tmp_path, monkeypatch):
+def test_a_file_is_replaced_whole_and_holds_what_it_held_where_writing_fails(tmp_path, monkeypatch):
     path = tmp_path / "file"
+    write_file(path, b"one")
     write_file(path, b"old")
+
+    def full_disk(handle: int) -> None:
+        raise OSError(errno.ENOSPC, FULL)
+
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(WriteError, match=f"cannot write {path}: No space left"):
         write_file(path, b"new")
@@ -80,8 +106,43 @@ def test_a_file_holds_what_it_held_where_writing_fails(tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 
-def full_disk(handle: int) -> None:
-    raise OSError(28, "No space left on device")
+@pytest.mark.parametrize(
+    ("error", "why", "remedy"),
+    [
+        (OSError(errno.ENOSPC, FULL), FULL, "free space"),
+        (OSError(errno.EDQUOT, "x"), "quota exceeded", "free space"),
+        (OSError(errno.EFBIG, "x"), "File too large", "free space"),
+        (OSError(errno.EROFS, "x"), "Read-only file system", "may be written"),
+        (RustError(f"Error while serializing: I/O error: {FULL} (os error 28)"), FULL, "free space"),
+        (RuntimeError(f"Error writing bytes to file. Detail: [errno 28] {FULL}"), FULL, "free space"),
+    ],
+)
+def test_a_refusal_names_the_path_the_reason_and_a_remedy(error, why, remedy):
+    with pytest.raises(WriteError, match=rf"^cannot write out/x: .*{why}; .*{remedy}"), writing(Path("out/x")):
+        raise error
+
+
+def test_a_refusal_that_names_its_file_keeps_it():
+    with pytest.raises(WriteError, match="cannot write out/x/part: "), writing(Path("out/x")):
+        raise OSError(errno.ENOSPC, FULL, "out/x/part")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [OSError(errno.ENOENT, "x", "in"), PermissionError(errno.EACCES, "x", "in"), ValueError("28"), KeyError(28)],
+)
+def test_other_errors_pass(error):
+    with pytest.raises(type(error)) as raised, writing(Path("out")):
+        raise error
+    assert raised.value is error
+
+
+def test_what_the_kernel_says_is_understood():
+    """/dev/full is a disk that is always full."""
+    why = f"cannot write /dev/full: {os.strerror(errno.ENOSPC)}"
+    path = Path("/dev/full")
+    with pytest.raises(WriteError, match=why), writing(path), path.open("wb", buffering=0) as file:
+        file.write(b"x")
 
 
 def start(what: str, root: Path) -> subprocess.Popen[str]:

@@ -17,7 +17,8 @@ from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, build, local_id
-from manip_il.data.lerobot_io import camera_keys, dataset_info, read_frames, read_spec, write_dataset
+from manip_il.data.lerobot_read import camera_keys, dataset_info, read_frames, read_spec
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import repair
 from manip_il.errors import ManipError, UsageError
@@ -69,9 +70,7 @@ def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec, mon
     return tmp_path / "lift.journals"
 
 
-def test_a_camera_named_as_a_path_overwrites_no_other_dataset(
-    attack: Path, victim: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_camera_named_as_a_path_overwrites_no_other_dataset(attack, victim, capsys):
     before = digests(victim)
     assert main(["build", str(attack), str(attack.with_name("lift"))]) == 1
     error = capsys.readouterr().err.strip()
@@ -81,9 +80,7 @@ def test_a_camera_named_as_a_path_overwrites_no_other_dataset(
     assert not attack.with_name("lift").exists()
 
 
-def test_neither_does_a_repair_from_such_journals(
-    attack: Path, victim: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_neither_does_a_repair_from_such_journals(attack, victim, capsys):
     root = shutil.copytree(victim, attack.with_name("lift"))
     (root / layout.TASKS).unlink()  # so that a repair would build it again
     before = digests(victim)
@@ -116,14 +113,14 @@ def test_neither_does_a_repair_from_such_journals(
         ({"instruction": "x" * 100_000}, "instruction is 'xxx"),
     ],
 )
-def test_a_spec_refuses_what_it_cannot_be(spec: s.RobotTaskSpec, change: dict[str, Any], words: str) -> None:
+def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
     with pytest.raises(ManipError) as error:
         s.RobotTaskSpec.from_json(spec.to_json() | change)
     assert words in str(error.value)
     assert len(str(error.value)) < 500
 
 
-def test_a_spec_is_an_object() -> None:
+def test_a_spec_is_an_object():
     with pytest.raises(ManipError, match="a robot-task spec is 3"):
         s.RobotTaskSpec.from_json(3)  # pyright: ignore[reportArgumentType]
 
@@ -144,7 +141,7 @@ def test_a_spec_is_an_object() -> None:
         ({"video": None}, "video is None"),
     ],
 )
-def test_a_recording_is_checked_and_its_file_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+def test_a_recording_is_checked_and_its_file_named(tmp_path, change, words):
     Recording("a/b").write(tmp_path)
     edit_json(tmp_path / RECORDING, lambda data: data.update(change))
     with pytest.raises(ManipError) as error:
@@ -157,15 +154,13 @@ def test_a_recording_is_checked_and_its_file_named(tmp_path: Path, change: dict[
     ("folder", "wanted"),
     [("my demos", "local/my_demos"), ("...", "local/dataset"), ("é", "local/_"), ("a..b", "local/a.b")],
 )
-def test_a_folder_of_any_name_gives_a_repository_id(folder: str, wanted: str, tmp_path: Path) -> None:
+def test_a_folder_of_any_name_gives_a_repository_id(folder, wanted, tmp_path):
     assert local_id(folder) == wanted
     assert Recording(local_id(folder)).repo_id == wanted
 
 
 @pytest.mark.parametrize("field", ["fingerprint", "spec"])
-def test_a_journal_whose_header_holds_null_is_refused(
-    tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, field: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, field, monkeypatch):
     real = json.dumps
     wrong = {"fingerprint": {"mark": 1}, "spec": spec.to_json()}[field]
     monkeypatch.setattr(journal.json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
@@ -197,7 +192,7 @@ def lie(root: Path, **changes: Any) -> None:
         ({"features": None}, "features is None"),
     ],
 )
-def test_what_info_says_is_checked_by_every_reader(victim: Path, change: dict[str, Any], words: str) -> None:
+def test_what_info_says_is_checked_by_every_reader(victim, change, words):
     lie(victim, **change)
     assert any(words in line for line in lines(victim))
     for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, FRONT, 0)):
@@ -206,7 +201,7 @@ def test_what_info_says_is_checked_by_every_reader(victim: Path, change: dict[st
         assert words in str(error.value)
 
 
-def test_a_feature_named_as_a_path_leads_nowhere(victim: Path, tmp_path: Path) -> None:
+def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
     secret = shutil.copytree(victim / "videos" / FRONT, tmp_path / "secret")
     key = "../../secret"
     assert (victim / "videos" / key).resolve() == secret
@@ -227,7 +222,7 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim: Path, tmp_path: Path) -
         ({"spec": {"robot": "r"}}, "written with schema 1"),
     ],
 )
-def test_our_own_file_is_checked(victim: Path, change: dict[str, Any], words: str) -> None:
+def test_our_own_file_is_checked(victim, change, words):
     edit_json(victim / layout.OURS, lambda ours: ours.update(change))
     for read in (dataset_info, read_spec):
         with pytest.raises(ManipError) as error:
@@ -236,7 +231,7 @@ def test_our_own_file_is_checked(victim: Path, change: dict[str, Any], words: st
         assert "manip_il.json" in str(error.value)
 
 
-def test_a_repair_writes_and_moves_nothing_through_a_link(victim: Path, tmp_path: Path) -> None:
+def test_a_repair_writes_and_moves_nothing_through_a_link(victim, tmp_path):
     outside = tmp_path / "outside"
     shutil.move(victim / "meta", outside)
     (victim / "meta").symlink_to(outside)
@@ -250,17 +245,17 @@ def test_a_repair_writes_and_moves_nothing_through_a_link(victim: Path, tmp_path
 
 
 @pytest.mark.parametrize("name", ["../x", "a b", "", ".hidden", "x" * 200])
-def test_a_condition_is_named_so_that_a_file_may_be(name: str) -> None:
+def test_a_condition_is_named_so_that_a_file_may_be(name):
     with pytest.raises(UsageError, match="a condition's name is"):
         Condition(name)
 
 
-def test_a_range_beyond_what_a_float_holds_is_refused() -> None:
+def test_a_range_beyond_what_a_float_holds_is_refused():
     with pytest.raises(UsageError, match="expected a number"):
         Condition.from_mapping("mine", {"mass": 10**400})
 
 
-def test_a_whole_journal_is_still_built(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec) -> None:
+def test_a_whole_journal_is_still_built(tmp_path, make_episode, seen):
     for episode in numbered_episodes(make_episode, seen):
         journal.write_episode(tmp_path / "my demos.journals", episode, seen, {})
     assert build(tmp_path / "my demos.journals", tmp_path / "d").info.episodes == 3

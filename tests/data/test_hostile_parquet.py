@@ -18,8 +18,8 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import find_frames
-from manip_il.data.lerobot_io import dataset_info, read_episodes, read_table, read_tables, write_dataset
-from manip_il.data.lerobot_read import check_dataset
+from manip_il.data.lerobot_read import check_dataset, dataset_info, read_episodes, read_table, read_tables
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.parquet_limits import LARGEST_FOOTER, check_parquet
 from manip_il.data.shards import open_shard
 from manip_il.errors import ManipError
@@ -121,9 +121,7 @@ BOMBS: list[tuple[Callable[[Path], Path], str]] = [
 
 
 @pytest.mark.parametrize(("bomb", "words"), BOMBS, ids=[bomb.__name__ for bomb, _ in BOMBS])
-def test_a_bomb_is_found_before_it_is_decoded(
-    tmp_path: Path, bomb: Callable[[Path], Path], words: str, arrow_peak: Callable[[], int]
-) -> None:
+def test_a_bomb_is_found_before_it_is_decoded(tmp_path, bomb, words, arrow_peak):
     path = bomb(tmp_path / "x.parquet")
     assert path.stat().st_size < 40 * MIB
     before = arrow_peak()
@@ -134,7 +132,7 @@ def test_a_bomb_is_found_before_it_is_decoded(
     assert arrow_peak() - before < 2 * MIB or bomb is nested
 
 
-def test_values_are_counted_by_pages_and_not_by_the_footer(tmp_path: Path) -> None:
+def test_values_are_counted_by_pages_and_not_by_the_footer(tmp_path):
     path = tmp_path / "x.parquet"
     pq.write_table(pa.table({"x": np.zeros(20_000, np.int64)}), path, use_dictionary=False, compression="zstd")
     check_parquet([path], least=MIB)
@@ -145,7 +143,7 @@ def test_values_are_counted_by_pages_and_not_by_the_footer(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("compression", ["none", "snappy", "gzip", "zstd", "brotli", "lz4"])
-def test_a_dictionarys_longest_text_is_found_whatever_packs_it(tmp_path: Path, compression: str) -> None:
+def test_a_dictionarys_longest_text_is_found_whatever_packs_it(tmp_path, compression):
     with pytest.raises(ValueError, match="unpack to 1,04"):
         check_parquet([repeated_text(tmp_path / "x.parquet", compression)])
     texts = pa.array(["pick", "place" * 1_000] * 100_000)
@@ -155,7 +153,7 @@ def test_a_dictionarys_longest_text_is_found_whatever_packs_it(tmp_path: Path, c
         check_parquet([tmp_path / "y.parquet"], least=200_000 * 5_000)
 
 
-def test_only_the_columns_that_are_read_count(tmp_path: Path) -> None:
+def test_only_the_columns_that_are_read_count(tmp_path):
     table = pa.table(
         {"x": np.zeros(12_000_000, np.int64), "x.y": [1] * 12_000_000, "z": np.zeros(12_000_000, np.bool_)}
     )
@@ -165,7 +163,7 @@ def test_only_the_columns_that_are_read_count(tmp_path: Path) -> None:
         check_parquet([tmp_path / "x.parquet"], ["x.y"])
 
 
-def test_many_small_bombs_are_one(tmp_path: Path) -> None:
+def test_many_small_bombs_are_one(tmp_path):
     paths = [run_of_zeros(tmp_path / f"{number}.parquet", 6_000_000) for number in range(2)]
     for path in paths:
         check_parquet([path])
@@ -175,7 +173,7 @@ def test_many_small_bombs_are_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
 @pytest.mark.parametrize("compression", ["none", "snappy", "zstd"])
-def test_real_files_pass(tmp_path: Path, version: str, compression: str) -> None:
+def test_real_files_pass(tmp_path, version, compression):
     rng = np.random.default_rng(0)
     rows, path = 300_000, tmp_path / "x.parquet"
     state = pa.FixedSizeListArray.from_arrays(pa.array(rng.normal(size=rows * 14).astype(np.float32)), 14)
@@ -185,7 +183,7 @@ def test_real_files_pass(tmp_path: Path, version: str, compression: str) -> None
     check_parquet([path])
 
 
-def test_pictures_of_an_episode_in_one_page_pass(tmp_path: Path) -> None:
+def test_pictures_of_an_episode_in_one_page_pass(tmp_path):
     """Writers look at a page's size only behind a batch of a thousand values."""
     rng = np.random.default_rng(0)
     cells = [{"bytes": rng.bytes(400_000), "path": None} for _ in range(300)]
@@ -200,7 +198,7 @@ def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path
     return tmp_path / "lift"
 
 
-def test_every_reader_refuses_a_dataset_of_billions_of_rows(root: Path, tmp_path: Path) -> None:
+def test_every_reader_refuses_a_dataset_of_billions_of_rows(root, tmp_path):
     names = pq.read_schema(root / DATA).names
     zeros = pa.table({name: np.zeros(4_000_000, np.int64) for name in names})
     pq.write_table(zeros, root / DATA)
@@ -218,7 +216,7 @@ def test_every_reader_refuses_a_dataset_of_billions_of_rows(root: Path, tmp_path
     assert any("unpack to" in line for line in lines(root))
 
 
-def test_every_reader_refuses_two_columns_of_one_name(root: Path, tmp_path: Path) -> None:
+def test_every_reader_refuses_two_columns_of_one_name(root, tmp_path):
     table = pq.read_table(root / DATA)
     pq.write_table(table.append_column(s.STATE, table[s.ACTION]), root / DATA)
     for read in (
@@ -233,14 +231,14 @@ def test_every_reader_refuses_two_columns_of_one_name(root: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", [EPISODES, layout.TASKS])
-def test_what_stands_once_a_dataset_is_checked_too(root: Path, name: str) -> None:
+def test_what_stands_once_a_dataset_is_checked_too(root, name):
     repeated_text(root / name)
     with pytest.raises(ManipError, match=r"cannot read .*unpack to"):
         check_dataset(root)
     assert any("unpack to" in line for line in lines(root))
 
 
-def test_a_camera_is_not_looked_for_in_a_bomb(root: Path) -> None:
+def test_a_camera_is_not_looked_for_in_a_bomb(root):
     feature: dict[str, Any] = {"dtype": "image", "shape": [8, 8, 3], "names": ["height", "width", "channels"]}
     edit_json(root / layout.INFO, lambda info: info["features"].update({"observation.images.front": feature}))
     repeated_text(root / DATA)
@@ -248,7 +246,7 @@ def test_a_camera_is_not_looked_for_in_a_bomb(root: Path) -> None:
         find_frames(root, "observation.images.front")
 
 
-def test_a_row_whose_task_has_no_name_is_told(root: Path, tmp_path: Path) -> None:
+def test_a_row_whose_task_has_no_name_is_told(root, tmp_path):
     pq.write_table(pa.table({"task_index": [5], "task": ["x"]}), root / layout.TASKS)
     with pytest.raises(ManipError, match=r"rows have the task 0, which meta/tasks\.parquet does not hold as text"):
         list(export_dataset(open_source(root), tmp_path))
@@ -266,7 +264,7 @@ print(code, int(status.partition("VmHWM:")[2].split()[0]) // 1024, file=sys.stde
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["doctor", "export"])
-def test_a_bomb_takes_less_than_a_gigabyte(root: Path, tmp_path: Path, command: str) -> None:
+def test_a_bomb_takes_less_than_a_gigabyte(root, tmp_path, command):
     names = pq.read_schema(root / DATA).names
     pq.write_table(pa.table({name: np.zeros(8_000_000, np.int64) for name in names}), root / DATA)
     shutil.copy(root / DATA, (root / DATA).with_name("file-001.parquet"))
@@ -279,7 +277,7 @@ def test_a_bomb_takes_less_than_a_gigabyte(root: Path, tmp_path: Path, command: 
     assert peak < 1024, f"{peak} MiB"
 
 
-def test_a_footer_with_any_changed_byte_raises_and_ends_no_process(tmp_path: Path) -> None:
+def test_a_footer_with_any_changed_byte_raises_and_ends_no_process(tmp_path):
     """Looking at a column's codec or size, pyarrow ends the process for some of them."""
     path = tmp_path / "x.parquet"
     pq.write_table(pa.table({"task_index": [0], "task": ["x"]}), path)

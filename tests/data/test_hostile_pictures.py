@@ -7,19 +7,15 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import ParquetPart
-from manip_il.data.lerobot_io import write_dataset
-from manip_il.data.picture import open_picture
+from manip_il.data.pictures import open_picture
 from manip_il.doctor.cameras import check_pictures
 from manip_il.doctor.dataset import Dataset
 from manip_il.errors import ManipError
@@ -27,7 +23,7 @@ from manip_il.mcap.export import stored_pictures
 from manip_il.mcap.read import decode_picture
 from manip_il.mdp import Episode
 
-from ..damage import edit_json
+from ..pictures import encoded, store_pictures, write
 
 KEY = "observation.images.front"
 EPS = b"""%!PS-Adobe-3.0 EPSF-3.0
@@ -50,12 +46,6 @@ def png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
-def saved(picture: np.ndarray, kind: str) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, kind)
-    return stream.getvalue()
-
-
 @pytest.fixture
 def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """What a Ghostscript on the path would leave behind."""
@@ -73,25 +63,19 @@ def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def pictured(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
     """A dataset with a column of pictures whose first one is not a PNG."""
-    root = tmp_path / "lift"
-    write_dataset(episodes, root, spec, repo_id="a/lift", fingerprint={})
-    path = next(root.glob(layout.DATA_FILES))
-    table = pq.read_table(path)
-    fine = saved(np.zeros((8, 8, 3), np.uint8), "PNG")
-    cells = [{"bytes": EPS if row == 0 else fine, "path": None} for row in range(len(table))]
-    pq.write_table(table.append_column(KEY, pa.array(cells)), path)
-    feature: dict[str, Any] = {"dtype": "image", "shape": [8, 8, 3], "names": ["height", "width", "channels"]}
-    edit_json(root / layout.INFO, lambda info: info["features"].update({KEY: feature}))
+    root = write(episodes, tmp_path / "lift", spec)
+    fine = encoded(np.zeros((8, 8, 3), np.uint8))
+    store_pictures(root, KEY, [EPS, *[fine] * (sum(map(len, episodes)) - 1)], (8, 8))
     return root
 
 
-def test_the_attack_is_one(marker: Path) -> None:
+def test_the_attack_is_one(marker):
     with pytest.raises(Image.UnidentifiedImageError), Image.open(io.BytesIO(EPS)) as picture:  # what the program wrote
         picture.load()
     assert marker.exists()
 
 
-def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) -> None:
+def test_no_reader_hands_a_picture_to_ghostscript(marker, pictured):
     found = [str(finding) for finding in check_pictures(Dataset(pictured))]
     assert any(
         "the picture in row 0 cannot be decoded: it is not a PNG or JPEG (1 row like this)" in one for one in found
@@ -107,19 +91,19 @@ def test_no_reader_hands_a_picture_to_ghostscript(marker: Path, pictured: Path) 
 
 
 @pytest.mark.parametrize("kind", ["GIF", "BMP", "TIFF", "WEBP"])
-def test_other_formats_are_refused(kind: str) -> None:
+def test_other_formats_are_refused(kind):
     with pytest.raises(ValueError, match="not a PNG or JPEG"):
-        open_picture(saved(np.zeros((8, 8, 3), np.uint8), kind))
+        open_picture(encoded(np.zeros((8, 8, 3), np.uint8), kind))
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
-def test_a_picture_of_a_robots_camera_is_read(kind: str) -> None:
+def test_a_picture_of_a_robots_camera_is_read(kind):
     level = np.full((1080, 1920, 3), 90, np.uint8)
-    assert (decode_picture(saved(level, kind)) == 90).all()
+    assert (decode_picture(encoded(level, kind)) == 90).all()
 
 
 @pytest.mark.parametrize(("width", "height"), [(5_000, 5_000), (10_000, 10_000), (60_000, 60_000)])
-def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(width: int, height: int) -> None:
+def test_a_picture_that_would_fill_the_memory_is_refused_before_it_is_decoded(width, height):
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # nor does Pillow's own warning appear
         with pytest.raises(ManipError, match="pixels"):

@@ -60,14 +60,14 @@ def assert_same(left: Episode, right: Episode) -> None:
 
 @settings(max_examples=60)
 @given(any_episode())
-def test_any_columns_come_back_bit_for_bit(episode: Episode) -> None:
+def test_any_columns_come_back_bit_for_bit(episode):
     spec = s.RobotTaskSpec("r", "t", 30, ("a", "b", "%s"), ("ee.x", "ee.y", "ee.z"), 1, "")
     with tempfile.TemporaryDirectory() as folder:
         path = journal.write_episode(Path(folder), episode, spec, {})
         assert_same(journal.read_episode(path), episode)
 
 
-def test_an_episode_comes_back_with_its_header(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+def test_an_episode_comes_back_with_its_header(tmp_path, episodes, spec):
     for episode in episodes:
         path = journal.write_episode(tmp_path / "new" / "folder", episode, spec, FINGERPRINT)
         assert_same(journal.read_episode(path), episode)
@@ -77,9 +77,7 @@ def test_an_episode_comes_back_with_its_header(tmp_path: Path, episodes: list[Ep
         )
 
 
-def test_files_are_listed_in_the_order_of_their_seeds(
-    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_files_are_listed_in_the_order_of_their_seeds(tmp_path, make_episode, spec):
     seeds = [110_000_000_000, 7, 3, 1_000_000]
     paths = {seed: journal.write_episode(tmp_path, make_episode(seed, 2), spec, {}) for seed in seeds}
     assert paths[7].name == "episode-000000000007.mcap"
@@ -87,9 +85,7 @@ def test_files_are_listed_in_the_order_of_their_seeds(
     assert journal.list_episodes(tmp_path / "nothing") == []
 
 
-def test_the_same_episode_gives_the_same_bytes(
-    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_the_same_episode_gives_the_same_bytes(tmp_path, make_episode, spec):
     first = journal.write_episode(tmp_path / "a", make_episode(3), spec, FINGERPRINT).read_bytes()
     assert journal.write_episode(tmp_path / "b", make_episode(3), spec, FINGERPRINT).read_bytes() == first
     assert len(list((tmp_path / "b").iterdir())) == 1
@@ -101,14 +97,14 @@ def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Pa
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused_by_name(path: Path, keep: float) -> None:
+def test_a_truncated_file_is_refused_by_name(path, keep):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * keep)])
     with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
         journal.read_episode(path)
 
 
-def test_a_changed_byte_anywhere_is_refused_by_name(path: Path, tmp_path: Path) -> None:
+def test_a_changed_byte_anywhere_is_refused_by_name(path, tmp_path):
     data = path.read_bytes()
     changed = tmp_path / "episode-000000000018.mcap"
     for place in [*range(0, len(data), 97), *range(len(data) - 60, len(data))]:
@@ -117,7 +113,7 @@ def test_a_changed_byte_anywhere_is_refused_by_name(path: Path, tmp_path: Path) 
             journal.read_episode(changed)
 
 
-def test_another_mcap_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
     other = tmp_path / "episode-000000000001.mcap"
     other.write_bytes(b"something else")
     with pytest.raises(ManipError, match="not a complete episode"):
@@ -126,7 +122,7 @@ def test_another_mcap_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         journal.read_header(tmp_path / "episode-000000000002.mcap")
 
 
-def test_a_column_of_objects_is_refused(tmp_path: Path, spec: s.RobotTaskSpec) -> None:
+def test_a_column_of_objects_is_refused(tmp_path, spec):
     episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
     with pytest.raises(ManipError, match="column 'x' of dtype object"):
         journal.write_episode(tmp_path, episode, spec, {})
@@ -143,9 +139,7 @@ def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
     return found
 
 
-def test_foxglove_sees_joints_frames_and_scalars(
-    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_foxglove_sees_joints_frames_and_scalars(tmp_path, make_episode, spec):
     episode = make_episode(8, 3)
     turned = [0, 1, 0, -1, 0, 0]  # the hand's y axis along world y, its z axis along world -x
     episode.columns[s.ENVIRONMENT_STATE][:, 3:9] = turned
@@ -170,7 +164,7 @@ def test_foxglove_sees_joints_frames_and_scalars(
     assert scalars[s.EXPERT_PHASE] == episode.columns[s.EXPERT_PHASE][2]
 
 
-def test_channels_carry_foxgloves_schemas(path: Path) -> None:
+def test_channels_carry_foxgloves_schemas(path):
     summary = make_reader(io.BytesIO(path.read_bytes())).get_summary()
     assert summary is not None
     schemas = {schema.name: schema for schema in summary.schemas.values()}
@@ -201,7 +195,7 @@ for seed in range(100_000):
 
 
 @pytest.mark.parametrize("delay", [0.001, 0.0017])
-def test_a_killed_recorder_loses_no_finished_episode(tmp_path: Path, delay: float) -> None:
+def test_a_killed_recorder_loses_no_finished_episode(tmp_path, delay):
     command = [sys.executable, "-c", _RECORDER, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
         assert process.stdout is not None
@@ -217,7 +211,7 @@ def test_a_killed_recorder_loses_no_finished_episode(tmp_path: Path, delay: floa
     assert sorted(tmp_path.iterdir()) == found
 
 
-def test_leftovers_are_cleared_and_finished_files_kept(path: Path) -> None:
+def test_leftovers_are_cleared_and_finished_files_kept(path):
     leftover = path.with_name(f".{path.name}.x1y2.partial")
     leftover.write_bytes(b"half")
     assert journal.list_episodes(path.parent) == [path]

@@ -1,4 +1,4 @@
-"""`lerobot-edit-dataset`, as a user calls it, on datasets that we wrote."""
+"""LeRobot's tools on datasets that we wrote: its command to edit them, joining, and recording on."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.lerobot_io import count_frames, read_episodes, video_rows, write_dataset
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_spec
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from .test_lerobot_library import REPO, add_episode, load, write_by_lerobot
 
 pytestmark = pytest.mark.slow
-REPO = "someone/lift"
 
 
 @pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])
-def recorded(
-    request: pytest.FixtureRequest, tmp_path: Path, make_episode: Callable[..., Episode], spec: s.RobotTaskSpec
-) -> tuple[Path, list[Episode]]:
-    spec = with_cameras(spec, *request.param)
-    episodes = numbered_episodes(make_episode, spec, 5)
-    write_dataset(episodes, tmp_path / "lift", spec, repo_id=REPO, fingerprint={})
-    return tmp_path / "lift", episodes
+def seen(request, spec) -> s.RobotTaskSpec:
+    return with_cameras(spec, *request.param)
+
+
+@pytest.fixture
+def recorded(tmp_path, make_episode, seen) -> tuple[Path, list[Episode]]:
+    episodes = numbered_episodes(make_episode, seen, 5)
+    return write(episodes, tmp_path / "lift", seen), episodes
 
 
 @pytest.fixture
@@ -45,8 +46,6 @@ def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def assert_holds(root: Path, episodes: list[Episode]) -> None:
     """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     for mine, yours in zip(read_episodes(root), episodes, strict=True):
         for key, values in yours.columns.items():
             if key.startswith(s.IMAGES):
@@ -55,7 +54,7 @@ def assert_holds(root: Path, episodes: list[Episode]) -> None:
                 np.testing.assert_array_equal(mine.columns[key], values, err_msg=key)
     assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
     assert not has_errors(examine_folder(root))
-    dataset = LeRobotDataset(REPO, root=root)
+    dataset = load(root)
     assert dataset.num_episodes == len(episodes)
     frames = [(episode, t) for episode in episodes for t in range(len(episode))]
     for item, (episode, t) in zip(dataset, frames, strict=True):
@@ -67,18 +66,20 @@ def assert_holds(root: Path, episodes: list[Episode]) -> None:
                 np.testing.assert_array_equal(item[key].numpy(), values[t].astype(item[key].numpy().dtype))
 
 
-def test_episodes_deleted_by_lerobots_command(
-    tmp_path: Path, recorded: tuple[Path, list[Episode]], edit: Callable[..., None]
-) -> None:
+def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
+    from lerobot.datasets import dataset_tools
+
     root, episodes = recorded
+    kept = tmp_path / "kept"
     words = ("--operation.type", "delete_episodes", "--operation.episode_indices", "[1, 2]")
-    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(tmp_path / "kept"), *words)
-    assert_holds(tmp_path / "kept", [episodes[0], *episodes[3:]])
+    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
+    assert_holds(kept, [episodes[0], *episodes[3:]])
+    s.check_same_spec("before", seen, "after", read_spec(kept))  # LeRobot drops our file
+    assert (read_spec(kept).instruction, dataset_info(kept).success) == (seen.instruction, 3)
+    assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
 
 
-def test_a_dataset_split_and_merged_again_by_lerobots_command(
-    tmp_path: Path, recorded: tuple[Path, list[Episode]], edit: Callable[..., None]
-) -> None:
+def test_a_dataset_split_and_merged_again_by_lerobots_command(tmp_path, recorded, edit):
     root, episodes = recorded
     splits = json.dumps({"train": [0, 1, 2], "rest": [3, 4]})
     words = ("--operation.type", "split", "--operation.splits", splits)
@@ -90,3 +91,23 @@ def test_a_dataset_split_and_merged_again_by_lerobots_command(
     new = ("--new_repo_id", "a/all", "--new_root", str(tmp_path / "all"))
     edit(*new, "--operation.type", "merge", *words)
     assert_holds(tmp_path / "all", episodes)
+
+
+def test_lerobot_joins_ours_with_its_own(tmp_path, episodes, spec):
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    roots = [write(episodes, tmp_path / "ours", spec), write_by_lerobot(episodes, tmp_path / "theirs", spec)]
+    aggregate_datasets(["a/ours", "a/theirs"], "a/all", roots=roots, aggr_root=tmp_path / "all")
+    assert_holds(tmp_path / "all", episodes * 2)
+
+
+def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    _, episodes = recorded
+    root = write(episodes[:2], tmp_path / "resumed", seen)
+    dataset = LeRobotDataset.resume(REPO, root=root)
+    add_episode(dataset, episodes[2], seen)
+    dataset.finalize()
+    assert_holds(root, episodes[:3])
+    assert dataset_info(root).episodes == 3

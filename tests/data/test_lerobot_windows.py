@@ -13,12 +13,13 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.image_cache import open_frame_cache
-from manip_il.data.lerobot_io import VideoConfig, camera_keys, new_dataset
+from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.video import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, with_cameras
+from ..pictures import numbered_episodes, numbers_of, write
 
 pytestmark = pytest.mark.slow
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -27,7 +28,7 @@ RECORDED = ("video", "image")
 
 @pytest.fixture(scope="module")
 def roots(
-    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], spec: s.RobotTaskSpec
+    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.RobotTaskSpec
 ) -> dict[str, Path]:
     """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
     from lerobot.datasets.aggregate import aggregate_datasets
@@ -35,13 +36,9 @@ def roots(
     from .record_lerobot import main as record
 
     folder = tmp_path_factory.mktemp("datasets")
-    two = with_cameras(spec, "front", "wrist")
     for codec in ("h264", "libsvtav1"):
-        options: dict[str, Any] = {"video": VideoConfig(codec), "video_files_size_in_mb": 0.001}
-        with new_dataset(folder / codec, two, repo_id="a/b", fingerprint={}, **options) as writer:
-            for episode in numbered_episodes(make_episode, two, 5):
-                writer.add(episode)
-            writer.finish()
+        five = numbered_episodes(make_episode, two, 5)
+        write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
         record(folder / kind, kind, 3, "finalize")
@@ -63,7 +60,7 @@ def cached(root: Path, folder: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["h264", "libsvtav1", *RECORDED, "aggregated"])
-def test_the_cache_is_bit_equal_to_what_lerobot_gives(roots: dict[str, Path], name: str, tmp_path: Path) -> None:
+def test_the_cache_is_bit_equal_to_what_lerobot_gives(roots, name, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     root = roots[name]
@@ -81,7 +78,7 @@ def test_the_cache_is_bit_equal_to_what_lerobot_gives(roots: dict[str, Path], na
             np.testing.assert_array_equal(ours[key].numpy(), values[row], strict=True)
 
 
-def test_windows_of_pictures_stop_at_an_episodes_borders(roots: dict[str, Path], spec: s.RobotTaskSpec) -> None:
+def test_windows_of_pictures_stop_at_an_episodes_borders(roots, spec):
     step = 1 / spec.fps
     dataset = windows(roots["h264"], {FRONT: [-step, 0], s.ACTION: [0, step, 2 * step]})
     sample = dataset[8]  # the first frame of the third episode
@@ -92,13 +89,13 @@ def test_windows_of_pictures_stop_at_an_episodes_borders(roots: dict[str, Path],
     assert numbers_of(dataset[9][FRONT].permute(0, 2, 3, 1).numpy()) == [8, 9]
 
 
-def test_a_selection_of_episodes(roots: dict[str, Path]) -> None:
+def test_a_selection_of_episodes(roots):
     dataset = windows(roots["h264"], episodes=[2])
     assert len(dataset) == 13
     assert numbers_of(dataset[0][FRONT].permute(1, 2, 0).numpy()[None]) == [8]
 
 
-def test_a_loader_with_processes_of_its_own(roots: dict[str, Path], tmp_path: Path) -> None:
+def test_a_loader_with_processes_of_its_own(roots, tmp_path):
     import torch
 
     root = roots["video"]
@@ -109,7 +106,7 @@ def test_a_loader_with_processes_of_its_own(roots: dict[str, Path], tmp_path: Pa
     np.testing.assert_array_equal(pictures.numpy(), cached(root, tmp_path)[WRIST])
 
 
-def test_nothing_is_asked_of_the_hub(roots: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_asked_of_the_hub(roots, tmp_path, monkeypatch):
     import socket
 
     def refuse(*_: object) -> None:

@@ -22,7 +22,7 @@ from manip_il.data import schema as s
 from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
-from manip_il.data.lerobot_io import write_dataset
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine, has_errors, verdict
 from manip_il.doctor.finding import Finding, error

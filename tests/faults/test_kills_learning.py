@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from .child import living
+from .killed import Command
 
 pytestmark = pytest.mark.slow
 
 KILLS = int(os.environ.get("MANIP_IL_KILLS", "2"))  # of each command
-PATIENCE = 300.0  # for a command that is not killed, and for the end of one that is [s]
 SIZES = ("--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--workers=2")
 DAGGER = (
     *("dagger", *SIZES, "--rounds=1", "--demonstrations=3", "--episodes_per_round=4", "--steps=300"),
@@ -29,53 +25,6 @@ UNEQUAL = ("log", "config.yaml", "report.html")  # they name the folder, and whe
 CLOCK = ("seconds", "samples_per_s")
 
 
-@dataclass
-class Command:
-    """Runs into `folder`, is killed, and goes on."""
-
-    start: Callable[..., ForkServerProcess]
-    words: tuple[str, ...]
-    folder: Path
-
-    @property
-    def out(self) -> Path:
-        return self.folder / "out"
-
-    def begin(self) -> ForkServerProcess:
-        self.folder.mkdir(exist_ok=True)
-        resume = ["--resume=true"] if self.out.is_dir() and any(self.out.iterdir()) else []
-        return self.start(*self.words, f"--output_dir={self.out}", *resume, log=self.folder / "log", warm=True)
-
-    def run(self) -> float:
-        """Seconds that it takes when nobody kills it."""
-        started = time.monotonic()
-        process = self.begin()
-        process.join(PATIENCE)
-        assert process.exitcode == 0, (self.folder / "log").read_text()
-        return time.monotonic() - started
-
-    def kill(self, delay: float) -> float | None:
-        """Begin or go on, kill after `delay` [s]; seconds until the last of its processes was gone, None if done."""
-        process = self.begin()
-        process.join(delay)
-        if process.exitcode is not None:
-            assert process.exitcode == 0, (self.folder / "log").read_text()
-            return None
-        assert process.pid is not None
-        os.kill(process.pid, 9)
-        killed = time.monotonic()
-        while living(process.pid):
-            assert time.monotonic() - killed < PATIENCE
-            time.sleep(0.02)
-        process.join(PATIENCE)
-        return time.monotonic() - killed
-
-    def made(self) -> dict[str, object]:
-        """All that must be the same, however often it was killed."""
-        files = {path.relative_to(self.out).as_posix(): path for path in self.out.rglob("*") if path.is_file()}
-        return {name: _content(path) for name, path in files.items() if path.name not in UNEQUAL}
-
-
 @pytest.fixture(scope="module")
 def calm(start, tmp_path_factory) -> Callable[..., Command]:
     """A command that nobody kills."""
@@ -83,33 +32,43 @@ def calm(start, tmp_path_factory) -> Callable[..., Command]:
 
     def run(*words: str) -> Command:
         if words not in done:
-            done[words] = Command(start, words, tmp_path_factory.mktemp("calm") / "run")
+            done[words] = learner(start, words, tmp_path_factory.mktemp("calm") / "run")
             done[words].run()
         return done[words]
 
     return run
 
 
+def learner(start, words: tuple[str, ...], folder: Path) -> Command:
+    return Command(start, (*words, "--output_dir={folder}/out"), folder, kept=folder / "out", warm=True)
+
+
+def made(command: Command) -> dict[str, object]:
+    """All that must be the same, however often it was killed."""
+    files = {path.relative_to(command.kept).as_posix(): path for path in command.kept.rglob("*") if path.is_file()}
+    return {name: _content(path) for name, path in files.items() if path.name not in UNEQUAL}
+
+
 @pytest.mark.parametrize("name", ["eval", "dagger"])
 def test_a_killed_command_takes_its_processes_along_and_goes_on_to_equal_bytes(name, start, calm, tmp_path):
-    command = calm(*DAGGER)
+    words = DAGGER
     if name == "eval":
-        command = calm(*EVAL, f"--policy.path={command.out}/best/pretrained_model")
-    expected = command.made()
-    seconds = Command(start, command.words, tmp_path / "timed").run()  # the first had paid for what is loaded once
+        words = (*EVAL, f"--policy.path={calm(*DAGGER).kept}/best/pretrained_model")
+    expected = made(calm(*words))
+    seconds = learner(start, words, tmp_path / "timed").run()  # the first had paid for what is loaded once
     rng = np.random.default_rng(len(name))
     ends: list[float] = []
     chain = 0
     while len(ends) < KILLS:
         chain += 1
-        again = Command(start, command.words, tmp_path / f"chain_{chain}")
+        again = learner(start, words, tmp_path / f"chain_{chain}")
         while len(ends) < KILLS:
             if (end := again.kill(rng.uniform(0, seconds))) is None:
                 break
             ends.append(end)
         else:
             again.run()
-        assert again.made() == expected
+        assert made(again) == expected
         assert sorted(path.name for path in again.folder.iterdir()) == ["log", "out"]
     print(f"{name}: {KILLS} kills in {chain} runs, the last process gone after {max(ends):.2f} s at most")
 

@@ -9,14 +9,8 @@ from typing import Any
 
 from manip_il.data import journal
 from manip_il.data.build import Recording, build
-from manip_il.data.lerobot_io import (
-    dataset_info,
-    read_episodes,
-    read_fingerprint,
-    read_spec,
-    read_table,
-    write_dataset,
-)
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_fingerprint, read_spec, read_table
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.mcap.importing import features_of, frames_of, list_files, read_import
 from manip_il.mcap.mapping import load_mapping
 from manip_il.store.cards import card_for

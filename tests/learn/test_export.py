@@ -19,7 +19,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
-from manip_il.data.lerobot_io import read_spec, read_table
+from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn import export

@@ -13,8 +13,8 @@ from accelerate.state import AcceleratorState
 from huggingface_hub import ModelCard
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import read_spec, read_table
 from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.fit_config import FitConfig

@@ -12,8 +12,8 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_io import read_spec, read_table, read_tables
 from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.lerobot_read import read_spec, read_table, read_tables
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.fit_policy import PolicyTrainer

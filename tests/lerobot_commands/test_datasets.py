@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder, has_errors
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES
-from manip_il.data.lerobot_io import dataset_info, read_table, write_dataset
+from manip_il.data.lerobot_read import dataset_info, read_table
+from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import ManipError, NotFiniteError
 from manip_il.mcap.export import MAPPING, export_dataset, open_source
 from manip_il.mcap.importing import import_files, list_files, read_import

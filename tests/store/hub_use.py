@@ -67,7 +67,8 @@ def copy_sample(target: Path) -> Path:
 
 def other_version(target: Path) -> Path:
     """A dataset that differs from the sample in every data file: its first seven episodes."""
-    from manip_il.data.lerobot_io import read_episodes, read_fingerprint, read_spec, write_dataset
+    from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_spec
+    from manip_il.data.lerobot_write import write_dataset
 
     episodes = list(read_episodes(SAMPLE))[:7]
     write_dataset(episodes, target, read_spec(SAMPLE), repo_id="local/sample", fingerprint=read_fingerprint(SAMPLE))
@@ -76,6 +77,6 @@ def other_version(target: Path) -> Path:
 
 def make_policy(target: Path) -> Path:
     """A small ACT for the sample, as LeRobot writes it."""
-    from manip_il.data.lerobot_io import read_spec
+    from manip_il.data.lerobot_read import read_spec
 
     return write_checkpoint(target, "act", read_spec(SAMPLE))

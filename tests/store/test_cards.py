@@ -13,7 +13,7 @@ import pytest
 from huggingface_hub import DatasetCard, DatasetCardData, ModelCard, ModelCardData
 from PIL import Image
 
-from manip_il.data.lerobot_io import read_spec
+from manip_il.data.lerobot_read import read_spec
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.store.card_strip import read_paths

@@ -8,7 +8,7 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from manip_il.data.lerobot_io import read_tables
+from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.learn.columns import INDEX, Table, learning_rows, valid_frames
 from manip_il.learn.mlp.configuration_mlp import MLPConfig

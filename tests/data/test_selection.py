@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +9,14 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.build import Builder, Recording, build
-from manip_il.data.episodes import count_labels, first_labels, parts
-from manip_il.data.journal import Header, write_episode
-from manip_il.data.lerobot_io import read_table
+from manip_il.data.build import Recording, build
+from manip_il.data.episodes import Header, count_labels, first_labels, parts
+from manip_il.data.journal import write_episode
+from manip_il.data.lerobot_read import read_table
 from manip_il.errors import NothingToLearnError
 from manip_il.mdp import Episode
+
+from ..damage import digests
 
 
 @pytest.fixture
@@ -37,12 +38,13 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
     """The dataset as it is written while rollouts come; their journals beside it."""
     journals, root = folder / "d.journals", folder / "d"
     recording.write(journals)
+    for episode in rollouts:
+        write_episode(journals, episode, spec, {})
+    selection = recording.selection()
     with recording.open(root, spec, {}) as writer:
-        builder = Builder(writer, recording)
-        for episode in rollouts:
-            write_episode(journals, episode, spec, {})
-            builder.add(Header.of(episode, spec, {}), episode)
-        builder.finish()
+        for episode in selection.take((Header.of(episode, spec, {}), episode) for episode in rollouts):
+            writer.add(episode)
+        writer.finish(recording.provenance | selection.provenance)
     return root
 
 
@@ -50,11 +52,6 @@ def labels(root: Path) -> list[int]:
     """Sound ones of each episode."""
     table = read_table(root, (s.LABEL_VALID, "episode_index"))
     return np.bincount(table["episode_index"], weights=table[s.LABEL_VALID]).astype(int).tolist()
-
-
-def files(root: Path) -> dict[str, str]:
-    paths = sorted(path for path in root.rglob("*") if path.is_file())
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
 def test_parts_are_the_rollout_cut_behind_every_done(rollout):
@@ -94,7 +91,7 @@ def test_a_dataset_has_what_the_recording_says_and_is_built_again_to_the_byte(
     root = recorded([rollout(7), rollout(8)], spec, tmp_path, recording)
     assert labels(root) == expected
     build(tmp_path / "d.journals", tmp_path / "again")
-    assert files(tmp_path / "again") == files(root)
+    assert digests(tmp_path / "again") == digests(root)
 
 
 def test_rollouts_without_a_label_make_no_dataset(make_episode, spec, tmp_path):

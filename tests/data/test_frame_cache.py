@@ -14,21 +14,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 
 from manip_il.data import frame_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
-from manip_il.data.image_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
-from manip_il.data.lerobot_io import new_dataset, read_frames, write_dataset
+from manip_il.data.frame_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
+from manip_il.data.lerobot_read import read_frames
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from ..pictures import numbered_episodes, numbers_of, picture, with_cameras
+from ..damage import edit_json
+from ..pictures import encoded, numbered_episodes, numbers_of, picture, store_pictures, write
 from .test_video import largest_file
 
 MakeEpisode = Callable[..., Episode]
@@ -38,28 +37,18 @@ PLENTY = 10 * BYTES
 
 
 @pytest.fixture(scope="module")
-def two(spec: s.RobotTaskSpec) -> s.RobotTaskSpec:
-    return with_cameras(spec, "front", "wrist")
-
-
-@pytest.fixture(scope="module")
 def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
     return numbered_episodes(make_episode, two)
 
 
 @pytest.fixture
 def root(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
-    return write(tmp_path / "lift", filmed, two)
+    return write(filmed, tmp_path / "lift", two)
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     return tmp_path / "cache"
-
-
-def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
-    write_dataset(episodes, root, spec, repo_id="someone/lift", fingerprint={})
-    return root
 
 
 def opened(root: Path, folder: Path, *keys: str, max_bytes: int = PLENTY, **options: Any) -> dict[str, Any]:
@@ -76,36 +65,23 @@ def entries(folder: Path) -> set[str]:
     return {path.parent.name for path in folder.glob(f"[!.]*/{FRAMES}")}
 
 
-def test_a_row_is_the_frame_of_its_index(root: Path, folder: Path) -> None:
+def test_a_row_is_the_frame_of_its_index_bit_by_bit(root, folder):
     frames = opened(root, folder)
     assert list(frames) == KEYS
     assert shown(frames[FRONT]) == list(range(21))
     assert shown(frames[WRIST]) == list(range(21, 42))
-    for values in frames.values():
+    for key, values in frames.items():
+        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
+        np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
         assert (values.shape, values.dtype) == ((21, 3, 72, 96), np.uint8)
         with pytest.raises(ValueError, match="read-only"):
             values[0] = 0
 
 
-def test_a_row_is_bit_equal_to_the_decoded_frame(root: Path, folder: Path) -> None:
-    for key, values in opened(root, folder).items():
-        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
-        np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
-
-
-def test_pieces_files_and_processes_change_nothing(
-    tmp_path: Path,
-    folder: Path,
-    make_episode: MakeEpisode,
-    two: s.RobotTaskSpec,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pieces_files_and_processes_change_nothing(tmp_path, folder, make_episode, two, monkeypatch):
     episodes = numbered_episodes(make_episode, two, 9)
     root = tmp_path / "small"
-    with new_dataset(root, two, repo_id="a/b", fingerprint={}, video_files_size_in_mb=0.001) as writer:
-        for episode in episodes:
-            writer.add(episode)
-        writer.finish()
+    write(episodes, root, two, video_files_size_in_mb=0.001)
     assert len(list((root / "videos" / FRONT).rglob("*.mp4"))) > 2
     whole = opened(root, folder, FRONT)
     monkeypatch.setattr(frame_source, "_PART_BYTES", 1)
@@ -118,11 +94,9 @@ def test_pieces_files_and_processes_change_nothing(
     np.testing.assert_array_equal(whole[FRONT], in_pieces[FRONT])
 
 
-def test_pictures_in_the_data_files_are_the_stored_bytes(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
-    root = write(tmp_path / "lift", [make_episode(1, 7), make_episode(2, 5)], spec)
-    path = store_pictures(root, [picture(number) for number in range(12)])
+def test_pictures_in_the_data_files_are_the_stored_bytes(tmp_path, folder, make_episode, spec):
+    root = write([make_episode(1, 7), make_episode(2, 5)], tmp_path / "lift", spec)
+    path = store_pictures(root, FRONT, [encoded(picture(number)) for number in range(12)], (72, 96))
     frames = opened(root, folder, FRONT)[FRONT]
     np.testing.assert_array_equal(frames, np.stack([picture(number).transpose(2, 0, 1) for number in range(12)]))
     rows = pq.read_table(path)
@@ -134,24 +108,7 @@ def test_pictures_in_the_data_files_are_the_stored_bytes(
         opened(root, folder, FRONT)
 
 
-def store_pictures(root: Path, pictures: list[np.ndarray]) -> Path:
-    """Give the dataset a camera of LeRobot's dtype `image`."""
-    path = root / layout.DATA_PATH.format(chunk_index=0, file_index=0)
-    files = root.parent / "pictures"
-    files.mkdir()
-    for number, levels in enumerate(pictures):
-        Image.fromarray(levels).save(files / f"{number}.png")
-    stored = [{"bytes": (files / f"{number}.png").read_bytes(), "path": None} for number in range(len(pictures))]
-    kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-    pq.write_table(pq.read_table(path).append_column(FRONT, pa.array(stored, kind)), path, row_group_size=5)
-    info = json.loads((root / layout.INFO).read_text())
-    names = ["height", "width", "channels"]
-    info["features"][FRONT] = {"dtype": "image", "shape": pictures[0].shape, "names": names}
-    (root / layout.INFO).write_text(json.dumps(info))
-    return path
-
-
-def test_what_is_there_is_not_decoded_again(root: Path, folder: Path) -> None:
+def test_what_is_there_is_not_decoded_again(root, folder):
     told: list[int] = []
     opened(root, folder, FRONT, on_frames=told.append)
     assert sum(told) == 21
@@ -164,14 +121,12 @@ def test_what_is_there_is_not_decoded_again(root: Path, folder: Path) -> None:
     assert sum(told) == 42
 
 
-def test_a_changed_dataset_is_decoded_again(
-    root: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
-) -> None:
+def test_a_changed_dataset_is_decoded_again(root, folder, make_episode, two):
     video = next((root / "videos" / FRONT).rglob("*.mp4"))
     before = opened(root, folder, FRONT)
     other = numbered_episodes(make_episode, two, 4)[1:]  # one more number in the wrist's; the front's start at 7
     root.rename(root.with_name("old"))
-    write(root, other, two)
+    write(other, root, two)
     assert video.exists()
     assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(7, 28))
     assert shown(before[FRONT]) == list(range(21))
@@ -181,16 +136,14 @@ def test_a_changed_dataset_is_decoded_again(
     assert sum(told) == 21
 
 
-def test_what_does_not_fit_is_left_to_the_plain_path(root: Path, folder: Path) -> None:
+def test_what_does_not_fit_is_left_to_the_plain_path(root, folder):
     assert open_frame_cache(root, KEYS, max_bytes=2 * BYTES - 1, folder=folder) is None
     assert not folder.exists()
     assert opened(root, folder, max_bytes=2 * BYTES)
 
 
-def test_the_one_not_opened_for_longest_makes_room(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, two: s.RobotTaskSpec
-) -> None:
-    roots = [write(tmp_path / f"{i}", numbered_episodes(make_episode, two, 3 + i)[i:], two) for i in range(3)]
+def test_the_one_not_opened_for_longest_makes_room(tmp_path, folder, make_episode, two):
+    roots = [write(numbered_episodes(make_episode, two, 3 + i)[i:], tmp_path / f"{i}", two) for i in range(3)]
     names: list[str] = []
     for root in roots[:2]:
         opened(root, folder, FRONT)
@@ -204,11 +157,9 @@ def test_the_one_not_opened_for_longest_makes_room(
     assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 2.5 * BYTES
 
 
-def test_what_is_in_use_stays(
-    tmp_path: Path, folder: Path, make_episode: MakeEpisode, filmed: list[Episode], two: s.RobotTaskSpec
-) -> None:
-    first = write(tmp_path / "first", filmed, two)
-    second = write(tmp_path / "second", numbered_episodes(make_episode, two, 4)[1:], two)
+def test_what_is_in_use_stays(tmp_path, folder, make_episode, filmed, two):
+    first = write(filmed, tmp_path / "first", two)
+    second = write(numbered_episodes(make_episode, two, 4)[1:], tmp_path / "second", two)
     held = opened(first, folder, FRONT)[FRONT][3:5]  # any part of it counts
     (name,) = entries(folder)
     limit = int(1.5 * BYTES)
@@ -220,7 +171,7 @@ def test_what_is_in_use_stays(
     assert name not in entries(folder)
 
 
-def test_of_two_at_once_one_decodes(root: Path, folder: Path) -> None:
+def test_of_two_at_once_one_decodes(root, folder):
     told: list[int] = []
     results: list[dict[str, Any]] = []
 
@@ -244,7 +195,7 @@ KILLED = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
 from manip_il.data import frame_source
-from manip_il.data.image_cache import open_frame_cache
+from manip_il.data.frame_cache import open_frame_cache
 
 def die(count):
     print(*[child.pid for child in multiprocessing.active_children()], flush=True)
@@ -264,7 +215,7 @@ def kill_while_decoding(root: Path, folder: Path, workers: int) -> list[int]:
     return [int(word) for word in done.stdout.split()]
 
 
-def test_what_a_kill_leaves_is_neither_used_nor_kept(root: Path, folder: Path) -> None:
+def test_what_a_kill_leaves_is_neither_used_nor_kept(root, folder):
     kill_while_decoding(root, folder, 1)
     assert entries(folder) == set()
     assert len(list(folder.glob(f".*{PARTIAL}/{FRAMES}"))) == 1
@@ -274,7 +225,7 @@ def test_what_a_kill_leaves_is_neither_used_nor_kept(root: Path, folder: Path) -
 
 
 @pytest.mark.slow  # starting them
-def test_processes_that_decode_end_with_the_one_that_started_them(root: Path, folder: Path) -> None:
+def test_processes_that_decode_end_with_the_one_that_started_them(root, folder):
     started = kill_while_decoding(root, folder, 2)
     assert started
     patience = time.monotonic() + 120
@@ -291,22 +242,18 @@ def is_running(process: int) -> bool:
     return state != "Z"
 
 
-def test_an_entry_cut_short_is_decoded_again(root: Path, folder: Path) -> None:
-    opened(root, folder, FRONT)
-    (path,) = folder.glob(f"*/{FRAMES}")
-    os.truncate(path, BYTES // 2)
-    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
-
-
-def test_an_entry_tells_of_itself_and_numpy_reads_it(root: Path, folder: Path) -> None:
+def test_an_entry_tells_of_itself_numpy_reads_it_and_cut_short_it_is_decoded_again(root, folder):
     frames = opened(root, folder, FRONT)[FRONT]
     (path,) = folder.glob(f"*/{FRAMES}")
     np.testing.assert_array_equal(np.load(path), frames)
     about = json.loads(path.with_name(ABOUT).read_text())
     assert about == {"dataset": str(root), "camera": FRONT, "shape": [21, 3, 72, 96]}
+    del frames
+    os.truncate(path, BYTES // 2)
+    assert shown(opened(root, folder, FRONT)[FRONT]) == list(range(21))
 
 
-def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root: Path, folder: Path) -> None:
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root, folder):
     told: list[int] = []
     with largest_file(BYTES // 2), pytest.raises(ManipError, match=r"cannot keep decoded .*File too large; make room"):
         opened(root, folder, FRONT, on_frames=told.append)
@@ -314,7 +261,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(root: Path, folder: P
     assert [path.name for path in folder.iterdir()] == [".lock"]
 
 
-def test_a_folder_that_cannot_be_is_one_clear_error(root: Path, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_is_one_clear_error(root, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ManipError, match="cannot keep decoded pictures in"):
         opened(root, tmp_path / "file" / "cache")
@@ -323,7 +270,7 @@ def test_a_folder_that_cannot_be_is_one_clear_error(root: Path, tmp_path: Path) 
     assert not (root / "cache").exists()
 
 
-def test_a_damaged_dataset_is_named_and_leaves_nothing(root: Path, folder: Path) -> None:
+def test_a_damaged_dataset_is_named_and_leaves_nothing(root, folder):
     video = next((root / "videos" / FRONT).rglob("*.mp4"))
     content = video.read_bytes()
     video.write_bytes(content[: len(content) // 2])
@@ -336,30 +283,27 @@ def test_a_damaged_dataset_is_named_and_leaves_nothing(root: Path, folder: Path)
         opened(root, folder, FRONT)
 
 
-def test_what_is_no_picture_is_refused(root: Path, folder: Path, tmp_path: Path) -> None:
+def test_what_is_no_picture_is_refused(root, folder, tmp_path):
     with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
         opened(root, folder, "observation.images.fron")
     with pytest.raises(UnknownName, match="unknown camera"):
         opened(root, folder, s.STATE)
     with pytest.raises(ManipError, match="not a LeRobot dataset"):
         opened(tmp_path / "nothing", folder)
-    path = root / layout.INFO
-    info = json.loads(path.read_text())
-    info["features"][FRONT]["shape"] = [72, 90, 3]
-    path.write_text(json.dumps(info))
-    with pytest.raises(MismatchError, match=r"shape of observation\.images\.front differs"):
-        opened(root, folder, FRONT)
-    info["features"][FRONT]["shape"] = [72, 96, 1]
-    path.write_text(json.dumps(info))
-    with pytest.raises(ManipError, match="expected RGB pictures"):
-        opened(root, folder, FRONT)
-    info["features"][FRONT]["shape"] = [72, 96, 3]
-    path.write_text(json.dumps({**info, "total_frames": 22}))
+    for changes, error, message in (
+        ({"shape": [72, 90, 3]}, MismatchError, r"shape of observation\.images\.front differs"),
+        ({"shape": [72, 96, 1]}, ManipError, "expected RGB pictures"),
+    ):
+        edit_json(root / layout.INFO, lambda info, changes=changes: info["features"][FRONT].update(changes))
+        with pytest.raises(error, match=message):
+            opened(root, folder, FRONT)
+    edit_json(root / layout.INFO, lambda info: info["features"][FRONT].update(shape=[72, 96, 3]))
+    edit_json(root / layout.INFO, lambda info: info.update(total_frames=22))
     with pytest.raises(ManipError, match="counts 22 frames, its episodes 21"):
         opened(root, folder, FRONT)
 
 
-def test_the_folder_is_in_the_users_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_folder_is_in_the_users_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache_folder() == tmp_path / "xdg" / "manip_il" / "frames"

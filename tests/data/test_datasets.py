@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import os
-import signal
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,30 +19,25 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import lerobot_stats
 from manip_il.data import schema as s
-from manip_il.data.atomic import PARTIAL
-from manip_il.data.lerobot_io import (
+from manip_il.data.build import merge_datasets
+from manip_il.data.lerobot_read import (
     dataset_info,
-    merge_datasets,
-    new_dataset,
     read_episodes,
     read_fingerprint,
     read_provenance,
     read_spec,
     read_table,
-    write_dataset,
 )
-from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
+from manip_il.data.lerobot_write import new_dataset, write_dataset
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.mdp import Episode
+
+from ..damage import digests
 
 MakeEpisode = Callable[..., Episode]
 FINGERPRINT = {"mujoco": "3.11.0"}
 HERE = Path(__file__).parent
 OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": FINGERPRINT}
-
-
-def digests(root: Path) -> dict[str, str]:
-    files = sorted(path for path in root.rglob("*") if path.is_file())
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 @pytest.fixture
@@ -53,7 +46,7 @@ def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path
     return tmp_path / "lift"
 
 
-def test_episodes_come_back_bit_for_bit(root: Path, episodes: list[Episode]) -> None:
+def test_episodes_come_back_bit_for_bit(root, episodes):
     for mine, yours in zip(read_episodes(root), episodes, strict=True):
         assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
         assert list(mine.columns) == list(yours.columns)
@@ -62,7 +55,7 @@ def test_episodes_come_back_bit_for_bit(root: Path, episodes: list[Episode]) -> 
             np.testing.assert_array_equal(mine.columns[key], values)
 
 
-def test_a_table_holds_whole_columns(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+def test_a_table_holds_whole_columns(root, episodes, spec):
     table = read_table(root)
     assert list(table) == list(layout.all_features(spec))
     assert table[s.SIM_STATE].shape == (20, spec.sim_state_size)
@@ -73,16 +66,14 @@ def test_a_table_holds_whole_columns(root: Path, episodes: list[Episode], spec: 
     np.testing.assert_array_equal(table["timestamp"], (table["frame_index"] / spec.fps).astype(np.float32))
 
 
-def test_a_table_can_be_of_some_columns_and_episodes(root: Path, episodes: list[Episode]) -> None:
+def test_a_table_can_be_of_some_columns_and_episodes(root, episodes):
     table = read_table(root, [s.ACTION, s.SUCCESS], episodes=[2, 0])
     assert list(table) == [s.ACTION, s.SUCCESS]
     expected = np.concatenate([episodes[0].columns[s.ACTION], episodes[2].columns[s.ACTION]])
     np.testing.assert_array_equal(table[s.ACTION], expected)
 
 
-def test_scalars_may_be_columns_without_width(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
+def test_scalars_may_be_columns_without_width(root, tmp_path, episodes, spec):
     flat = [
         dataclasses.replace(
             episode, columns={key: v[:, 0] if v.shape[1] == 1 else v for key, v in episode.columns.items()}
@@ -93,7 +84,7 @@ def test_scalars_may_be_columns_without_width(
     assert digests(tmp_path / "flat") == digests(root)
 
 
-def test_what_a_dataset_says_of_itself(root: Path, spec: s.RobotTaskSpec) -> None:
+def test_what_a_dataset_says_of_itself(root, spec):
     assert read_spec(root) == spec
     assert read_fingerprint(root) == FINGERPRINT
     assert read_provenance(root) == {"recorded": 3, "failed": 1}
@@ -102,9 +93,7 @@ def test_what_a_dataset_says_of_itself(root: Path, spec: s.RobotTaskSpec) -> Non
     assert (info.success, info.success_at_end) == (2, 2)
 
 
-def test_success_at_some_time_and_at_the_end_are_told_apart(
-    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_success_at_some_time_and_at_the_end_are_told_apart(tmp_path, make_episode, spec):
     lost = make_episode(3, success=False)
     lost.columns[s.SUCCESS][4] = True
     lost = dataclasses.replace(lost, success=True)
@@ -113,17 +102,13 @@ def test_success_at_some_time_and_at_the_end_are_told_apart(
     assert [episode.success_at_end for episode in read_episodes(tmp_path / "lift")] == [False, True]
 
 
-def test_the_same_episodes_give_the_same_bytes(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
+def test_the_same_episodes_give_the_same_bytes(root, tmp_path, episodes, spec):
     again = tmp_path / "elsewhere" / "again"
     write_dataset(iter(episodes), again, spec, provenance={"recorded": 3, "failed": 1}, **OPTIONS)
     assert digests(again) == digests(root)
 
 
-def test_episodes_may_come_one_by_one_and_nothing_is_there_before_the_last(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
+def test_episodes_may_come_one_by_one_and_nothing_is_there_before_the_last(root, tmp_path, episodes, spec):
     again = tmp_path / "again"
     with new_dataset(again, spec, **OPTIONS) as writer:
         for episode in episodes:
@@ -138,13 +123,7 @@ def test_episodes_may_come_one_by_one_and_nothing_is_there_before_the_last(
 
 
 @pytest.mark.parametrize(("end", "error"), [(None, ManipError), (KeyboardInterrupt(), KeyboardInterrupt)])
-def test_a_writer_that_was_not_finished_leaves_nothing(
-    tmp_path: Path,
-    episodes: list[Episode],
-    spec: s.RobotTaskSpec,
-    end: BaseException | None,
-    error: type[BaseException],
-) -> None:
+def test_a_writer_that_was_not_finished_leaves_nothing(tmp_path, episodes, spec, end, error):
     def leave_early() -> None:
         with new_dataset(tmp_path / "lift", spec, **OPTIONS) as writer:
             writer.add(episodes[0])
@@ -156,9 +135,7 @@ def test_a_writer_that_was_not_finished_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_statistics_do_not_depend_on_how_much_memory_they_may_use(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_statistics_do_not_depend_on_how_much_memory_they_may_use(root, tmp_path, episodes, spec, monkeypatch):
     monkeypatch.setattr(lerobot_stats, "_BLOCK_BYTES", 1)
     write_dataset(episodes, tmp_path / "frugal", spec, **OPTIONS)
     assert (tmp_path / "frugal" / layout.STATS).read_bytes() == (root / layout.STATS).read_bytes()
@@ -171,7 +148,7 @@ def test_statistics_do_not_depend_on_how_much_memory_they_may_use(
         np.testing.assert_array_equal(stats["q90"], np.atleast_1d(expected))
 
 
-def test_a_merge_equals_writing_all_episodes(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> None:
+def test_a_merge_equals_writing_all_episodes(tmp_path, make_episode, spec):
     episodes = [make_episode(seed, length=5 + seed) for seed in range(6)]
     write_dataset(episodes[:4], tmp_path / "a", spec, provenance={"recorded": 4}, **OPTIONS)
     write_dataset(episodes[4:], tmp_path / "b", spec, **OPTIONS)
@@ -185,44 +162,35 @@ def test_a_merge_equals_writing_all_episodes(tmp_path: Path, make_episode: MakeE
     assert read_provenance(tmp_path / "merged") == {"merged": sources}
 
 
-def test_a_merge_of_different_robots_is_refused_naming_both(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
-    other = dataclasses.replace(spec, robot="fetch")
-    write_dataset(episodes, tmp_path / "fetch", other, **OPTIONS)
-    with pytest.raises(MismatchError, match=r"robot differs: .*lift has panda, .*fetch has fetch"):
-        merge_datasets([root, tmp_path / "fetch"], tmp_path / "merged", repo_id="x/y")
+@pytest.mark.parametrize("change", [{"robot": "fetch"}, {"task": "reach"}, {"instruction": "Reach."}])
+def test_a_merge_of_different_robots_or_tasks_is_refused_naming_both(root, tmp_path, episodes, spec, change):
+    write_dataset(episodes, tmp_path / "other", dataclasses.replace(spec, **change), **OPTIONS)
+    ((what, value),) = change.items()
+    with pytest.raises(
+        MismatchError, match=rf"{what} differs: .*lift has {re.escape(getattr(spec, what))}, .*other has {value}"
+    ):
+        merge_datasets([root, tmp_path / "other"], tmp_path / "merged", repo_id="x/y")
     assert not (tmp_path / "merged").exists()
 
 
-@pytest.mark.parametrize("change", [{"task": "reach"}, {"instruction": "Reach."}])
-def test_a_merge_of_different_tasks_is_refused(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, change: dict[str, str]
-) -> None:
-    write_dataset(episodes, tmp_path / "other", dataclasses.replace(spec, **change), **OPTIONS)
-    with pytest.raises(MismatchError, match=f"{next(iter(change))} differs"):
-        merge_datasets([root, tmp_path / "other"], tmp_path / "merged", repo_id="x/y")
-
-
-def test_a_merge_warns_of_different_environments(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_merge_warns_of_different_environments(root, tmp_path, episodes, spec, caplog):
     write_dataset(episodes, tmp_path / "old", spec, repo_id="x/y", fingerprint={"mujoco": "3.10.0"})
     merge_datasets([root, tmp_path / "old"], tmp_path / "merged", repo_id="x/y")
     assert "mujoco differs" in caplog.text
     assert "3.10.0" in caplog.text
 
 
-def test_a_new_file_starts_where_one_is_full(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+def test_a_new_file_starts_where_one_is_full_and_a_missing_one_is_noticed(tmp_path, episodes, spec):
     write_dataset(episodes * 4, tmp_path / "small", spec, data_files_size_in_mb=0.01, **OPTIONS)
     files = sorted((tmp_path / "small").glob(layout.DATA_FILES))
     assert len(files) > 1
     assert read_table(tmp_path / "small", ["index"])["index"].tolist() == list(range(80))
+    files[-1].unlink()
+    with pytest.raises(ManipError, match="counts 80 frames"):
+        read_table(tmp_path / "small")
 
 
-def test_nan_is_refused_with_episode_and_frame(
-    tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_nan_is_refused_with_episode_and_frame(tmp_path, make_episode, spec):
     bad = make_episode(41)
     bad.columns[s.ACTION][3, 1] = np.nan  # after the episode looked at itself
     with pytest.raises(NotFiniteError, match=r"seed 41, action: .* at frame 3"):
@@ -250,60 +218,37 @@ def with_column(episode: Episode, key: str, values: np.ndarray) -> Episode:
         (lambda e: dataclasses.replace(e, success_at_end=False), MismatchError, "success_at_end differs"),
     ],
 )
-def test_an_episode_that_does_not_fit_is_refused(
-    tmp_path: Path,
-    make_episode: MakeEpisode,
-    spec: s.RobotTaskSpec,
-    change: Callable[[Episode], Episode],
-    error: type[ManipError],
-    message: str,
-) -> None:
+def test_an_episode_that_does_not_fit_is_refused(tmp_path, make_episode, spec, change, error, message):
     with pytest.raises(error, match=message):
         write_dataset([change(make_episode(9))], tmp_path / "lift", spec, **OPTIONS)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_written_of_no_episodes(tmp_path: Path, spec: s.RobotTaskSpec) -> None:
+def test_nothing_is_written_of_no_episodes(tmp_path, spec):
     with pytest.raises(ManipError, match="no episodes"):
         write_dataset([], tmp_path / "lift", spec, **OPTIONS)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_holds_something_is_never_written_over(
-    root: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
-    before = digests(root)
-    with pytest.raises(FolderExistsError):
-        write_dataset(episodes[:1], root, spec, **OPTIONS)
-    assert digests(root) == before
-
-
-def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ManipError, match="is not a LeRobot dataset"):
-        read_table(tmp_path)
-    with pytest.raises(ManipError, match="is not a LeRobot dataset"):
-        read_spec(tmp_path / "nothing")
-
-
-def test_a_missing_column_names_the_nearest(root: Path) -> None:
+def test_what_is_not_there_is_named(root, tmp_path):
+    for read, folder in ((read_table, tmp_path), (read_spec, tmp_path / "nothing")):
+        with pytest.raises(ManipError, match="is not a LeRobot dataset"):
+            read(folder)
     with pytest.raises(UnknownName, match=r"did you mean 'observation\.state'"):
         read_table(root, ["observation.stat"])
-
-
-def test_a_missing_episode_is_refused(root: Path) -> None:
     with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
         read_table(root, episodes=[3])
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
-def test_a_truncated_data_file_is_named(root: Path, keep: float) -> None:
+def test_a_truncated_data_file_is_named(root, keep):
     path = next(root.glob(layout.DATA_FILES))
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
     with pytest.raises(ManipError, match=path.name):
         read_table(root)
 
 
-def test_broken_json_and_other_versions_are_named(root: Path) -> None:
+def test_broken_json_and_other_versions_are_named(root):
     info = json.loads((root / layout.INFO).read_text())
     (root / layout.INFO).write_text(json.dumps(info | {"codebase_version": "v2.1"}))
     with pytest.raises(ManipError, match=r"version v2\.1"):
@@ -313,53 +258,10 @@ def test_broken_json_and_other_versions_are_named(root: Path) -> None:
         read_table(root)
 
 
-def test_frames_that_are_missing_are_counted(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
-    write_dataset(episodes * 4, tmp_path / "small", spec, data_files_size_in_mb=0.01, **OPTIONS)
-    sorted((tmp_path / "small").glob(layout.DATA_FILES))[-1].unlink()
-    with pytest.raises(ManipError, match="counts 80 frames"):
-        read_table(tmp_path / "small")
-
-
-_WRITER = """
-import sys
-from pathlib import Path
-from typing import Any
-from manip_il.data import lerobot_io as io
-source, folder = Path(sys.argv[1]), Path(sys.argv[2])
-spec, episodes = io.read_spec(source), list(io.read_episodes(source))
-for number in range(10_000):
-    io.write_dataset(episodes, folder / str(number), spec, repo_id="x/y", fingerprint={})
-    print(number, flush=True)
-"""
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.006, 0.013])
-def test_a_killed_writer_leaves_whole_datasets_only(
-    root: Path, tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec, delay: float
-) -> None:
-    folder = tmp_path / "out"
-    command = [sys.executable, "-c", _WRITER, str(root), str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[1]) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "0\n"
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(delay)
-        os.kill(process.pid, signal.SIGKILL)
-    visible = [path for path in folder.iterdir() if not path.name.endswith(PARTIAL)]
-    assert visible
-    for path in visible:
-        assert dataset_info(path).frames == 20
-        assert len(list(read_episodes(path))) == 3
-    for path in folder.glob(f".*{PARTIAL}"):  # the next writer of the same dataset clears it away
-        name = path.name.split(".")[1]
-        write_dataset(episodes, folder / name, spec, **OPTIONS)
-        assert not path.exists()
-
-
-def test_importing_costs_no_torch() -> None:
+def test_importing_costs_no_torch():
     code = """
 import sys
-import manip_il.data.journal, manip_il.data.lerobot_io, manip_il.data.fingerprint, manip_il.data.schema
+import manip_il.data.build, manip_il.data.frame_cache
 heavy = {"torch", "lerobot", "datasets", "pandas", "mujoco", "mink"}
 sys.exit(", ".join(heavy & set(sys.modules)))
 """
@@ -382,7 +284,7 @@ sys.exit(", ".join(heavy & set(sys.modules)))
         (s.SUCCESS, [{"a": 1}] * 20),
     ],
 )
-def test_a_column_of_another_kind_or_with_gaps_is_named(root: Path, key: str, column: list[Any]) -> None:
+def test_a_column_of_another_kind_or_with_gaps_is_named(root, key, column):
     path = next(root.glob(layout.DATA_FILES))
     table = pq.read_table(path)
     pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), path)
