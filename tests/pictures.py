@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from manip_il.data import schema as s
-from manip_il.data.frame_source import episode_clips
+from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.lerobot_layout import INFO, VIDEO_PATH
 from manip_il.data.lerobot_read import camera_keys
 from manip_il.data.lerobot_write import new_dataset
@@ -96,8 +96,9 @@ def video_rows(root: Path) -> dict[Path, int]:
     """Every video file of a dataset -> the frames that the rows of `meta/episodes` put into it."""
     rows: Counter[Path] = Counter()
     for key in camera_keys(root):
-        for clip in episode_clips(root, key, 1, VIDEO_PATH):
-            rows[root / clip.path] += clip.count
+        for clip in find_clips(root, key, 1):
+            part = to_part(clip, key, VIDEO_PATH)
+            rows[root / part.path] += part.count
     return dict(rows)
 
 

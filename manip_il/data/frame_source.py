@@ -149,8 +149,10 @@ def _video_runs(root: Path, info: Info, key: str) -> Iterator[VideoPart]:
     """Consecutive frames of a file that are consecutive frames of the dataset: mostly the whole file."""
     last: VideoPart | None = None
     expected = 0
-    clips = [clip for clip in episode_clips(root, key, info.fps, info.video_path) if clip.count]
-    for part in sorted(clips, key=lambda clip: clip.row):
+    clips = find_clips(root, key, info.fps)
+    clips = clips[clips[:, 0] != 0]
+    for clip in clips[np.argsort(clips[:, 1], kind="stable")]:
+        part = to_part(clip, key, info.video_path)
         if part.row != expected:
             raise ManipError(f"{root}: its episodes hold no frame {expected}, or hold it twice; {_SEE_DOCTOR}")
         expected += part.count
@@ -165,24 +167,27 @@ def _video_runs(root: Path, info: Info, key: str) -> Iterator[VideoPart]:
     yield last
 
 
-def episode_clips(root: Path, key: str, fps: float, video_path: str) -> list[VideoPart]:
-    """Find every episode's frames of one camera. video_path: the template of `info.json`.
+def find_clips(root: Path, key: str, fps: float) -> NDArray[np.int64]:
+    """Find every episode's frames of one camera, (E, 5): their number and first row, chunk, file, first frame in it.
 
     Raises `ManipError` for files that cannot be read.
     """
     names = [*_PLACES, *(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp"))]
-    parts: list[VideoPart] = []
+    found: list[NDArray[np.int64]] = [np.empty((0, 5), np.int64)]
     for shard in _whole_shards(root, layout.EPISODES_FILES):
         try:
             for table in shard.tables(names):
-                length, row, chunk, file = (integers(table, name) for name in names[:4])
                 first = np.round(floats(table, names[4]) * fps).astype(np.int64)
-                for count, start, *place, number in zip(length, row, chunk, file, first, strict=True):
-                    path = video_path.format(video_key=key, chunk_index=int(place[0]), file_index=int(place[1]))
-                    parts.append(VideoPart(path, int(number), int(count), int(start)))
+                found.append(np.stack([*(integers(table, name) for name in names[:4]), first], axis=1))
         except UNREADABLE as error:
             raise ManipError(f"cannot read {shard.path}: {error}; {_SEE_DOCTOR}") from error
-    return parts
+    return np.concatenate(found)
+
+
+def to_part(clip: NDArray[np.int64], key: str, video_path: str) -> VideoPart:
+    """Return a row (5,) of `find_clips` as a part. video_path: the template of `info.json`."""
+    count, row, chunk, file, first = map(int, clip)
+    return VideoPart(video_path.format(video_key=key, chunk_index=chunk, file_index=file), first, count, row)
 
 
 def _whole_shards(root: Path, pattern: str) -> Iterator[Shard]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.frame_source import VideoPart, episode_clips
+from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.info import LARGEST_META, info_problems
 from manip_il.data.parquet_files import check_files, read_column, read_file
 from manip_il.data.pictures import VideoReader
@@ -93,7 +93,8 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
     stored = [key for key in shapes if key not in cameras]
     _check_rows(root, sum(len(read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
-    clips = {key: _clips(root, key) for key in cameras}
+    info = _read_info(root)
+    clips = {key: find_clips(root, key, info["fps"]) for key in cameras}
     with ExitStack() as stack:
         readers = {key: stack.enter_context(closing(VideoReader())) for key in cameras}
         for path in _data_files(root):
@@ -103,7 +104,7 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
-                own |= {key: _decode(root, readers[key], clips[key], int(index[start]), spec.fps) for key in cameras}
+                own |= {key: _decode(root, info, readers[key], clips[key], key, int(index[start])) for key in cameras}
                 yield _episode({key: own[key] for key in shapes})
 
 
@@ -116,7 +117,8 @@ def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
     if key not in (known := camera_keys(root)):
         raise UnknownName(f"camera in {root}", key, known)
     with closing(VideoReader()) as reader:
-        return _decode(root, reader, _clips(root, key), episode, int(_read_info(root)["fps"]))
+        info = _read_info(root)
+        return _decode(root, info, reader, find_clips(root, key, info["fps"]), key, episode)
 
 
 def read_spec(root: Path) -> s.RobotTaskSpec:
@@ -199,16 +201,13 @@ def check_dataset(root: Path) -> None:
         check_files(root, sorted(root.glob(pattern)), None)
 
 
-def _clips(root: Path, key: str) -> list[VideoPart]:
-    info = _read_info(root)
-    return episode_clips(root, key, info["fps"], info.get("video_path") or layout.VIDEO_PATH)
-
-
-def _decode(root: Path, reader: VideoReader, clips: list[VideoPart], episode: int, fps: int) -> NDArray[np.uint8]:
+def _decode(
+    root: Path, info: dict[str, Any], reader: VideoReader, clips: NDArray[np.int64], key: str, episode: int
+) -> NDArray[np.uint8]:
     if not 0 <= episode < len(clips):
         raise UsageError(f"{root} has no episode {episode}; it has 0 to {len(clips) - 1}")
-    clip = clips[episode]
-    return reader.read(root / clip.path, clip.first, clip.count, fps)
+    part = to_part(clips[episode], key, info.get("video_path") or layout.VIDEO_PATH)
+    return reader.read(root / part.path, part.first, part.count, int(info["fps"]))
 
 
 def _episode(columns: dict[str, NDArray[Any]]) -> Episode:
