@@ -8,10 +8,13 @@ from pathlib import Path
 import boto3
 import pytest
 
+from ..synthetic import make_episode, offline, spec
 from .hub_server import Hub
 from .hub_use import a_hub, make_policy
 from .s3 import KEY, SECRET, Proxy, running_moto, running_proxy, variables
 from .sshd import Sshd, running_sshd
+
+__all__ = ["make_episode", "offline", "spec"]
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from manip_il.store.cards import card_for
 from manip_il.store.hub import HubRemote
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl, open_remote
 
 PRELOADED = (card_for, HubRemote)  # so that no fork has to import them
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
+from manip_il.store.errors import Retry
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
-from manip_il.store.remote import Published
-from manip_il.store.retry import Retry
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import Published, RemoteUrl, open_remote
 
 from ..learn.tiny_policies import write_checkpoint
 from .hub_server import Hub, hub_server

@@ -13,10 +13,10 @@ import sys
 import time
 from pathlib import Path
 
-from manip_il.store import file_store, s3_store, sftp_lock, sftp_store
+from manip_il.store import file_store, s3_store, sftp_store
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl, open_remote
 
 IMPORTED = (file_store, s3_store, sftp_store)  # before the fork, so that a kill meets work and not imports
 
@@ -32,7 +32,7 @@ def work(do: str, url: RemoteUrl, folder: Path) -> None:
 
 
 def main() -> None:
-    sftp_lock.LOCK_STALE, sftp_lock.LOCK_REFRESH = 1.5, 0.3  # many locks are left here
+    sftp_store.LOCK_STALE, sftp_store.LOCK_REFRESH = 1.5, 0.3  # many locks are left here
     for line in sys.stdin:
         command = json.loads(line)
         start = time.monotonic()

@@ -12,19 +12,20 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.store import file_store, sftp_lock
+from manip_il.store import file_store, sftp_store
 from manip_il.store.errors import (
     AuthError,
     HashError,
     NoSpaceError,
     NotFoundError,
     RemoteError,
+    Retry,
     TransientError,
     redact,
+    retry_after,
 )
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.retry import Retry, retry_after
 from manip_il.store.sftp_store import SftpBlobs
 
 from .s3 import KEY, SECRET, Fault, Proxy
@@ -188,7 +189,7 @@ def test_an_object_that_is_gone_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from manip_il.store.scan import scan
+    from manip_il.store.push import scan
 
     run = make_run(tmp_path / "run", 1)
     _, remote = impatient(place)
@@ -291,33 +292,33 @@ def test_sftp_without_a_shell_reads_back(sshd: Sshd, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.slow
-def test_an_sftp_lock_that_a_dead_push_left_is_broken(
+def test_an_sftp_store_that_a_dead_push_left_is_broken(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(sshd.home))
-    monkeypatch.setattr(sftp_lock, "LOCK_STALE", 0.3)
+    monkeypatch.setattr(sftp_store, "LOCK_STALE", 0.3)
     (tmp_path / "store").mkdir()
-    (tmp_path / "store" / sftp_lock.LOCK).write_text("dead")
+    (tmp_path / "store" / sftp_store.LOCK).write_text("dead")
     url, remote = impatient(sshd.url(tmp_path / "store"))
     push(make_run(tmp_path / "run", 1), url, remote, unwatched)
-    assert not (tmp_path / "store" / sftp_lock.LOCK).exists()
+    assert not (tmp_path / "store" / sftp_store.LOCK).exists()
 
 
 @pytest.mark.slow
-def test_an_sftp_lock_of_a_living_push_is_respected(
+def test_an_sftp_store_of_a_living_push_is_respected(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(sshd.home))
     for name, seconds in {"LOCK_REFRESH": 0.3, "LOCK_STALE": 1.5, "LOCK_WAIT": 2.5}.items():
-        monkeypatch.setattr(sftp_lock, name, seconds)
+        monkeypatch.setattr(sftp_store, name, seconds)
     run, (url, remote) = make_run(tmp_path / "run", 1), impatient(sshd.url(tmp_path / "store"))
     blobs = remote.blobs
     assert isinstance(blobs, SftpBlobs)
     blobs.prepare(0)
-    with blobs._sftp("x") as sftp, blobs._locked(sftp) as is_ours:
+    with blobs._sftp("x") as sftp, blobs._locked(sftp) as lock:
         with pytest.raises(RemoteError, match=r"another push is updating .*; wait, and push again"):
             push(run, url, impatient(str(url))[1], unwatched)
-        assert is_ours()
+        assert lock.is_ours()
     push(run, url, remote, unwatched)
 
 
@@ -336,7 +337,7 @@ def test_a_wrong_sftp_password_is_never_shown(sshd: Sshd, tmp_path: Path, monkey
     url, remote = impatient(f"sftp://me:hunter2@127.0.0.1:{sshd.port}/x")
     with pytest.raises(AuthError, match="rejected this user's login") as caught:
         remote.read()
-    for text in (str(caught.value), str(url), repr(url), remote.describe(), repr(remote)):
+    for text in (str(caught.value), str(url), repr(url), remote.name, repr(remote)):
         assert "hunter2" not in text
 
 

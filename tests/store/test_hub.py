@@ -13,13 +13,11 @@ from huggingface_hub import HfApi, constants
 from huggingface_hub.utils import logging as hub_logging
 
 from manip_il.errors import UsageError
-from manip_il.store.cards import CARD, STRIP
+from manip_il.store.cards import CARD, PICTURE
 from manip_il.store.errors import ConflictError
-from manip_il.store.hub_talk import quiet
-from manip_il.store.push import check_source, push
-from manip_il.store.remote import MANIFEST_FILE
-from manip_il.store.scan import scan
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.hub_session import hub_session
+from manip_il.store.push import check_source, push, scan
+from manip_il.store.remote import MANIFEST_FILE, RemoteUrl, open_remote
 
 from .hub_server import Hub
 from .hub_use import (
@@ -46,7 +44,7 @@ def test_a_dataset_comes_back_byte_equal(hub: Hub, tmp_path: Path):
     do_pull(tmp_path / "back")
     back, sent = contents(tmp_path / "back"), contents(SAMPLE)
     assert {path: back[path] for path in sent} == sent
-    assert set(back) - set(sent) == {CARD, STRIP}
+    assert set(back) - set(sent) == {CARD, PICTURE}
     assert published.uploaded == len(back)
 
 
@@ -119,7 +117,7 @@ def test_a_reader_of_the_old_commit_finishes_while_a_new_one_is_pushed(hub: Hub,
     for entry in old.manifest.files:
         with (tmp_path / "part").open("wb") as file:
             remote.fetch(old, entry, file, 0)
-        if entry.path not in (CARD, STRIP):
+        if entry.path not in (CARD, PICTURE):
             assert (tmp_path / "part").read_bytes() == (SAMPLE / entry.path).read_bytes()
 
 
@@ -165,7 +163,7 @@ def test_of_two_pushers_one_wins_and_the_other_is_told(hub: Hub, other: Path):
 def test_settings_of_the_client_hold_until_the_last_thread_is_done(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", False)
     level = hub_logging.get_verbosity()
-    first, second = quiet("http://127.0.0.1:1"), quiet("http://127.0.0.1:1")
+    first, second = (hub_session("a repository", "http://127.0.0.1:1") for _ in range(2))
     first.__enter__()
     with second:
         first.__exit__(None, None, None)

@@ -15,12 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.store import hub_client
-from manip_il.store.errors import ConflictError, HashError, RemoteError
+from manip_il.store import hub_http
+from manip_il.store.errors import ConflictError, HashError, RemoteError, Retry
 from manip_il.store.hub import HubRemote
-from manip_il.store.remote import MANIFEST_FILE
-from manip_il.store.retry import Retry
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import MANIFEST_FILE, RemoteUrl, open_remote
 
 from .hub_server import Hub, clean_environment
 from .hub_use import DATASET, SAMPLE, TOKEN, a_hub, contents, copy_sample, do_pull, do_push, other_version
@@ -105,7 +103,7 @@ def test_bytes_that_stay_wrong_are_never_taken(hub: Hub, tmp_path: Path):
 
 
 def test_a_server_that_keeps_silent_is_given_up(hub: Hub, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(hub_client, "PATIENCE", 0.2)
+    monkeypatch.setattr(hub_http, "PATIENCE", 0.2)
     hub.faults.append(Fault("GET /api/datasets", 100, pause=1.0))
     remote = HubRemote(RemoteUrl.parse(DATASET), retry=Retry(tries=2, first=0.01))
     with pytest.raises(RemoteError, match="gave no answer in time; tried 2 times"):
@@ -120,7 +118,7 @@ def test_a_commit_that_somebody_else_made_meanwhile_is_a_conflict_even_when_the_
     before = remote.read()
     repo.commit("refs/heads/main", head, {"notes.txt": b"theirs"}, {}, [], "theirs")
     hub.faults.append(Fault("/commit/", cut=10))
-    from manip_il.store.scan import scan
+    from manip_il.store.push import scan
 
     scanned = scan(SAMPLE, "dataset")
     with pytest.raises(ConflictError):

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.store.cards import CARD
-from manip_il.store.front import policy_folder, with_front, without_front
 from manip_il.store.manifest import FileEntry, Manifest
-from manip_il.store.scan import Scanned, scan
+from manip_il.store.push import Scanned, policy_folder, scan, with_root_copies, without_root_copies
 
 from .hub_server import Hub
 from .hub_use import POLICY, contents, do_pull, do_push
@@ -31,7 +30,7 @@ def manifest(files: dict[str, bytes]) -> Manifest:
 
 
 def fronted(files: dict[str, bytes]) -> Scanned:
-    return with_front(Scanned(manifest(files), {path: Path(path) for path in files}))
+    return with_root_copies(Scanned(manifest(files), {path: Path(path) for path in files}))
 
 
 @pytest.fixture
@@ -69,24 +68,24 @@ def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
     new = scanned.manifest.by_path.keys() - RUN.keys()
     assert new == {"config.json", "model.safetensors"}
     assert scanned.local["config.json"] == Path("checkpoints/001000/pretrained_model/config.json")
-    assert without_front(scanned.manifest) == manifest(RUN)
+    assert without_root_copies(scanned.manifest) == manifest(RUN)
 
 
 @pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
 def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
     files = {**RUN, there: b"its own"}
-    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+    assert fronted(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 @pytest.mark.parametrize("changed", ["config.json", "model.safetensors"])
 def test_a_front_that_is_not_the_policy_any_more_comes_along(changed: str):
     files = {**RUN, "config.json": b"{}", "model.safetensors": b"weights", changed: b"edited on the website"}
-    assert without_front(manifest(files)) == manifest(files)
+    assert without_root_copies(manifest(files)) == manifest(files)
 
 
 def test_a_policy_that_lies_at_the_root_stays_as_it_is():
     files = {"config.json": b"{}", "model.safetensors": b"weights"}
-    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+    assert fronted(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):

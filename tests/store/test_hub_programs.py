@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.store.cards import CARD, STRIP
+from manip_il.store.cards import CARD, PICTURE
 
 from .hub_server import clean_environment
 from .hub_use import SAMPLE, TOKEN, a_hub, contents
@@ -77,4 +77,4 @@ def test_what_is_pushed_is_trained_on_loaded_and_pulled(program: Program, tmp_pa
     back, demos = contents(tmp_path / "back"), contents(tmp_path / "demos")
     assert b"lerobot-eval --policy.path=user/run" in back.pop(CARD)
     assert back == contents(run)
-    assert {path: demos[path] for path in demos if path not in (CARD, STRIP)} == contents(SAMPLE)
+    assert {path: demos[path] for path in demos if path not in (CARD, PICTURE)} == contents(SAMPLE)

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.store import pace, s3_session
+from manip_il.store import errors, s3_client
 from manip_il.store.errors import RemoteError
+from manip_il.store.remote import RemoteUrl
 from manip_il.store.s3_store import S3Blobs
-from manip_il.store.url import RemoteUrl
 
 from .liar import Liar, a_liar, answer, head
 from .trees import wait_little
@@ -70,10 +70,10 @@ ENDLESS = {
 
 @pytest.mark.parametrize(("script", "says"), ENDLESS.values(), ids=ENDLESS)
 def test_what_has_no_end_ends_in_one_line(script, says, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(s3_session, "LARGEST_ANSWER", 200_000)
-    monkeypatch.setattr(pace, "WINDOW", 0.2)
+    monkeypatch.setattr(s3_client, "LARGEST_ANSWER", 200_000)
+    monkeypatch.setattr(errors, "WINDOW", 0.2)
     if script is silent:
-        monkeypatch.setattr(s3_session, "LONGEST_ANSWER", 1.0)
+        monkeypatch.setattr(s3_client, "LONGEST_ANSWER", 1.0)
     with a_liar(script) as store:
         assert says in pulled(store, tmp_path, monkeypatch, capsys)
 
@@ -111,7 +111,7 @@ WRONG_LISTS = {
 
 @pytest.mark.parametrize(("script", "says"), WRONG_LISTS.values(), ids=WRONG_LISTS)
 def test_a_wrong_list_is_one_line(script, says, monkeypatch) -> None:
-    monkeypatch.setattr(s3_session, "MOST_PAGES", 20)
+    monkeypatch.setattr(s3_client, "MOST_PAGES", 20)
     numbers = itertools.count()
     with a_liar(lambda _: script(next(numbers))) as store:
         monkeypatch.setenv("AWS_ENDPOINT_URL", store.url)
@@ -127,7 +127,7 @@ def test_a_store_that_does_not_say_what_it_stored_is_one_line(monkeypatch) -> No
             return {}
 
     blobs = S3Blobs(RemoteUrl.parse("s3://bucket/demos"))
-    monkeypatch.setattr(blobs, "_honours", True)  # conditions, as a push has found out by then
+    monkeypatch.setattr(blobs, "_honours_conditions", True)  # conditions, as a push has found out by then
     monkeypatch.setattr(blobs, "_run", lambda work, _: asyncio.run(work(Client())))
     with pytest.raises(RemoteError, match="answer has no ETag"):
         blobs.swap(b"{}", None, {})

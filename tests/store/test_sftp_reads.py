@@ -13,10 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from paramiko.sftp import CMD_DATA, CMD_STATUS
 
-from manip_il.store import sftp_reads
-from manip_il.store.sftp_connection import Connection
-from manip_il.store.sftp_reads import REQUEST, UNDER_WAY, read_ahead
-from manip_il.store.url import RemoteUrl
+from manip_il.store import sftp_connection
+from manip_il.store.remote import RemoteUrl
+from manip_il.store.sftp_connection import PENDING, REQUEST, Connection, read_ahead
 
 from .sshd import Sshd
 
@@ -63,18 +62,18 @@ def test_any_part_of_any_file_comes_whole(data: st.DataObject, order: random.Ran
     offset, size = data.draw(st.integers(0, len(content))), data.draw(st.integers(0, 3500))
     server = Server(content, data.draw(st.integers(1, 200)), order)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sftp_reads, "REQUEST", 100)
-        patch.setattr(sftp_reads, "SMALLEST", 25)
-        patch.setattr(sftp_reads, "UNDER_WAY", 700)
+        patch.setattr(sftp_connection, "REQUEST", 100)
+        patch.setattr(sftp_connection, "SMALLEST", 25)
+        patch.setattr(sftp_connection, "PENDING", 700)
         assert read(server, offset, size) == content[offset:size]
     assert server.most_under_way <= 700 + 100
 
 
 def test_each_byte_is_asked_for_once() -> None:
-    server = Server(bytes(3 * UNDER_WAY + 5))
+    server = Server(bytes(3 * PENDING + 5))
     assert len(read(server, 0, len(server.content))) == len(server.content)
     assert sum(length for _, length in server.asked) == len(server.content)
-    assert UNDER_WAY <= server.most_under_way <= UNDER_WAY + REQUEST
+    assert PENDING <= server.most_under_way <= PENDING + REQUEST
 
 
 def test_a_server_that_sends_less_is_asked_for_less() -> None:
@@ -86,7 +85,7 @@ def test_a_server_that_sends_less_is_asked_for_less() -> None:
 def test_a_server_that_trickles_is_not_asked_for_crumbs() -> None:
     server = Server(bytes(2**19), most=1000)
     assert read(server, 0, 2**19) == server.content
-    assert server.most_under_way <= UNDER_WAY + REQUEST
+    assert server.most_under_way <= PENDING + REQUEST
     assert len(server.asked) < 2 * 2**19 / 1000
 
 
@@ -101,7 +100,7 @@ def test_a_channel_is_of_use_after_reads_that_were_given_up(
     sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(sshd.home))
-    content = random.Random(0).randbytes(3 * UNDER_WAY)
+    content = random.Random(0).randbytes(3 * PENDING)
     (tmp_path / "file").write_bytes(content)
     connection = Connection(RemoteUrl.parse(sshd.url(tmp_path)))
     with connection.sftp("read it") as sftp:
