@@ -25,13 +25,13 @@ from .hub_use import (
     POLICY,
     SAMPLE,
     TOKEN,
-    contents,
     copy_sample,
     do_pull,
     do_push,
     other_version,
 )
 from .hub_wire import Fault
+from .trees import content
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_dataset_comes_back_byte_equal(hub: Hub, tmp_path: Path):
     published = do_push(SAMPLE)
     do_pull(tmp_path / "back")
-    back, sent = contents(tmp_path / "back"), contents(SAMPLE)
+    back, sent = content(tmp_path / "back"), content(SAMPLE)
     assert {path: back[path] for path in sent} == sent
     assert set(back) - set(sent) == {CARD, PICTURE}
     assert published.uploaded == len(back)
@@ -51,7 +51,7 @@ def test_a_dataset_comes_back_byte_equal(hub: Hub, tmp_path: Path):
 def test_a_policy_comes_back_byte_equal(hub: Hub, tmp_path: Path, tiny_policy: Path):
     do_push(tiny_policy, POLICY)
     do_pull(tmp_path / "back", POLICY)
-    back, sent = contents(tmp_path / "back"), contents(tiny_policy)
+    back, sent = content(tmp_path / "back"), content(tiny_policy)
     assert {path: back[path] for path in sent} == sent
     assert set(back) - set(sent) == {CARD}
     assert hub.repo("models/user/policy").refs("tags") == {}
@@ -127,7 +127,7 @@ def test_readers_see_one_version_or_the_other(hub: Hub, tmp_path: Path, other: P
     for source in (SAMPLE, other):
         do_push(source)
         do_pull(tmp_path / source.name)
-        versions.append(contents(tmp_path / source.name))
+        versions.append(content(tmp_path / source.name))
     stop, seen = threading.Event(), []
 
     def read() -> None:
@@ -218,7 +218,7 @@ def test_what_another_program_pushed_can_be_pulled_and_replaced(hub: Hub, tmp_pa
         patch.setattr(constants, "HF_HUB_DISABLE_XET", True)
         api.upload_folder(repo_id="user/demos", repo_type="dataset", folder_path=SAMPLE)
     do_pull(tmp_path / "back")
-    assert contents(tmp_path / "back") == contents(SAMPLE)
+    assert content(tmp_path / "back") == content(SAMPLE)
     published = do_push(SAMPLE)
     assert published.uploaded == 2  # the card and its picture
 

@@ -18,7 +18,7 @@ from manip_il.store.errors import Retry
 from manip_il.store.hub_repo import HubRepo
 
 from .hub_use import DATASET, TOKEN
-from .liar import Liar, a_liar, answer, head
+from .liar import Liar, a_liar, answer, drip, drip_headers, endless, error_of_pull, head
 from .trees import wait_little
 
 COMMIT = "c" * 40
@@ -50,12 +50,7 @@ def honest(line: str) -> list[bytes]:
 def pulled(hub: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     """The one line that a pull ends in; it is an error."""
     monkeypatch.setattr(constants, "ENDPOINT", hub.url)
-    assert main(["pull", DATASET, str(folder / "got"), "--quiet"]) == 1
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert TOKEN not in captured.err
-    assert not (folder / "got").exists()
-    return captured.err
+    return error_of_pull(DATASET, folder, capsys, TOKEN)
 
 
 def authorized(liar: Liar) -> list[bool]:
@@ -136,30 +131,8 @@ def test_an_origin_is_scheme_host_and_port() -> None:
     assert not same_origin("https://hub.co@evil.com", "https://hub.co")
 
 
-def forever(piece: bytes) -> Iterator[bytes]:
-    yield head()
-    yield from itertools.repeat(piece)
-
-
-def drip(line: str) -> Iterator[bytes]:
-    """A byte at a time, without an end; the event is never set."""
-    from threading import Event
-
-    yield head(Content_Length="100000000")
-    while not Event().wait(0.01):
-        yield b" "
-
-
-def drip_headers(line: str) -> Iterator[bytes]:
-    from threading import Event
-
-    yield b"HTTP/1.1 200 OK\r\nX-Slow: "
-    while not Event().wait(0.01):
-        yield b"x"
-
-
 ENDLESS = {
-    "JSON": (lambda _: forever(b"[" * 65536), "answered more than 200,000 bytes"),
+    "JSON": (lambda _: endless(b"[" * 65536), "answered more than 200,000 bytes"),
     "a body, bit by bit": (drip, "expected at least 1,000 bytes a second"),
     "headers, bit by bit": (drip_headers, "expected at least 1,000 bytes a second"),
     "headers": (lambda _: itertools.chain([b"HTTP/1.1 200 OK\r\n"], itertools.repeat(b"X-A: b\r\n" * 999)), "cut"),

@@ -6,18 +6,16 @@ import asyncio
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import pytest
 
-from manip_il.cli.main import main
 from manip_il.store import errors, s3_client
 from manip_il.store.errors import RemoteError
 from manip_il.store.remote import RemoteUrl
 from manip_il.store.s3_store import S3Blobs
 
-from .liar import Liar, a_liar, answer, head
+from .liar import Liar, a_liar, answer, drip, drip_headers, endless, error_of_pull
 from .trees import wait_little
 
 TOKEN = "TheTokenOfASessionIsASecretToo"
@@ -33,38 +31,22 @@ def _somebody(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pulled(store: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a pull ends in."""
+    """The one line that a pull ends in; it is an error."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", store.url)
-    assert main(["pull", "s3://bucket/demos", str(folder / "got"), "--quiet"]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert len(error) < 1000
-    assert TOKEN not in error
-    assert not (folder / "got").exists()
-    return error
-
-
-def drip(line: str) -> Iterator[bytes]:
-    yield head(Content_Length="1000000", ETag='"1"')
-    while not Event().wait(0.01):
-        yield b" "
+    return error_of_pull("s3://bucket/demos", folder, capsys, TOKEN)
 
 
 def endless_error(line: str) -> Iterator[bytes]:
-    yield head("500 Never", Content_Type="application/xml")
-    yield from itertools.repeat(b"<a>" * 10_000)
-
-
-def silent(line: str) -> Iterator[bytes]:
-    yield b"HTTP/1.1 200 OK\r\nX-Slow: "
-    while not Event().wait(0.01):
-        yield b"x"
+    return endless(b"<a>" * 10_000, "500 Never", Content_Type="application/xml")
 
 
 ENDLESS = {
     "an object, bit by bit": (drip, "expected at least 1,000 bytes a second"),
-    "an error": (endless_error, "answered more than 200,000 bytes"),
-    "headers, bit by bit": (silent, "took more than 1 s for an answer"),
+    "an error": (
+        lambda _: endless(b"<a>" * 10_000, "500 Never", Content_Type="application/xml"),
+        "answered more than 200,000 bytes",
+    ),
+    "headers, bit by bit": (drip_headers, "took more than 1 s for an answer"),
 }
 
 
@@ -72,7 +54,7 @@ ENDLESS = {
 def test_what_has_no_end_ends_in_one_line(script, says, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(s3_client, "LARGEST_ANSWER", 200_000)
     monkeypatch.setattr(errors, "WINDOW", 0.2)
-    if script is silent:
+    if script is drip_headers:
         monkeypatch.setattr(s3_client, "LONGEST_ANSWER", 1.0)
     with a_liar(script) as store:
         assert says in pulled(store, tmp_path, monkeypatch, capsys)

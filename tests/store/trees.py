@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def make_run(folder: Path, seed: int, files: int = 12, size: int = 20_000) -> Pa
     return folder
 
 
-def content(folder: Path) -> dict[str, bytes | str]:
+def content(folder: Path) -> dict[str, Any]:
     """Everything below: bytes of files, targets of links."""
     return {
         path.relative_to(folder).as_posix(): os.readlink(path) if path.is_symlink() else path.read_bytes()
