@@ -1,4 +1,4 @@
-"""Cards for the Hub: `README.md` of a dataset or policy, and a dataset's picture, made from what lies in the folder.
+"""Cards for the Hub: `README.md` of a dataset or policy, and a dataset's picture, made from its folder.
 
 The texts are the templates `card_dataset.md.jinja` and `card_policy.md.jinja`, filled from the modules of those names.
 No card holds an absolute path, a token or a date: the same folder gives the same bytes.
@@ -38,7 +38,7 @@ _LARGEST_CONFIG = 100_000  # [bytes]
 def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
     """Return path in the repository -> content. url: of the repository, for the commands that the card shows.
 
-    A `README.md` that somebody else wrote is kept: then there is none among these. Raises `ManipError` for a folder
+    A `README.md` that another program or a person wrote is kept: then there is none here. Raises `ManipError` for a folder
     that cannot be read.
     """
     own = root / CARD

@@ -82,7 +82,7 @@ def a_liar(script: Script) -> Iterator[Liar]:
 
 
 def answer(value: Any = b"", status: str = "200 OK", **headers: str) -> list[bytes]:
-    """A whole answer; what is no bytes goes as JSON."""
+    """A whole answer; anything but bytes goes as JSON."""
     body = value if isinstance(value, bytes) else json.dumps(value).encode()
     return [head(status, **{"Content-Length": str(len(body)), **headers}), body]
 

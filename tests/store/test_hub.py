@@ -39,28 +39,23 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return other_version(tmp_path_factory.mktemp("other") / "demos")
 
 
-def test_a_dataset_comes_back_byte_equal(hub: Hub, tmp_path: Path):
-    published = do_push(SAMPLE)
-    do_pull(tmp_path / "back")
-    back, sent = content(tmp_path / "back"), content(SAMPLE)
+@pytest.mark.parametrize("kind", ["dataset", "policy"])
+def test_what_is_pushed_comes_back_byte_equal_and_a_datasets_tag_names_its_commit(
+    kind: str, hub: Hub, tmp_path: Path, tiny_policy: Path
+):
+    source, url, made, name = {
+        "dataset": (SAMPLE, DATASET, {CARD, PICTURE}, "datasets/user/demos"),
+        "policy": (tiny_policy, POLICY, {CARD}, "models/user/policy"),
+    }[kind]
+    published = do_push(source, url)
+    do_pull(tmp_path / "back", url)
+    back, sent = content(tmp_path / "back"), content(source)
     assert {path: back[path] for path in sent} == sent
-    assert set(back) - set(sent) == {CARD, PICTURE}
+    assert set(back) - set(sent) == made
     assert published.uploaded == len(back)
-
-
-def test_a_policy_comes_back_byte_equal(hub: Hub, tmp_path: Path, tiny_policy: Path):
-    do_push(tiny_policy, POLICY)
-    do_pull(tmp_path / "back", POLICY)
-    back, sent = content(tmp_path / "back"), content(tiny_policy)
-    assert {path: back[path] for path in sent} == sent
-    assert set(back) - set(sent) == {CARD}
-    assert hub.repo("models/user/policy").refs("tags") == {}
-
-
-def test_the_tag_names_the_commit(hub: Hub):
-    published = do_push(SAMPLE)
-    repo = hub.repo("datasets/user/demos")
-    assert repo.refs("tags") == {"v3.0": published.token} == {"v3.0": repo.refs("heads")["main"]}
+    repo = hub.repo(name)
+    assert repo.refs("heads")["main"] == published.token
+    assert repo.refs("tags") == ({"v3.0": published.token} if kind == "dataset" else {})
 
 
 def test_an_unchanged_dataset_makes_no_commit(hub: Hub):

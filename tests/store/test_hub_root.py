@@ -30,7 +30,7 @@ def manifest(files: dict[str, bytes]) -> Manifest:
     return Manifest("policy", tuple(entries))
 
 
-def fronted(files: dict[str, bytes]) -> Scanned:
+def copied(files: dict[str, bytes]) -> Scanned:
     return with_root_copies(Scanned(manifest(files), {path: Path(path) for path in files}))
 
 
@@ -60,12 +60,12 @@ def run(tmp_path: Path, tiny_policy: Path) -> Path:
         (["best/pretrained_model/model.safetensors"], None),
     ],
 )
-def test_where_the_policy_of_a_run_lies(paths: list[str], folder: str | None):
+def test_the_folder_of_a_runs_policy(paths: list[str], folder: str | None):
     assert policy_folder(paths) == folder
 
 
 def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
-    scanned = fronted(RUN)
+    scanned = copied(RUN)
     new = scanned.manifest.by_path.keys() - RUN.keys()
     assert new == {"config.json", "model.safetensors"}
     assert scanned.local["config.json"] == Path("checkpoints/001000/pretrained_model/config.json")
@@ -75,18 +75,18 @@ def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
 @pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
 def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
     files = {**RUN, there: b"its own"}
-    assert fronted(files).manifest == manifest(files) == without_root_copies(manifest(files))
+    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 @pytest.mark.parametrize("changed", ["config.json", "model.safetensors"])
-def test_a_front_that_is_not_the_policy_any_more_comes_along(changed: str):
+def test_root_copies_that_are_not_the_policy_any_more_come_along(changed: str):
     files = {**RUN, "config.json": b"{}", "model.safetensors": b"weights", changed: b"edited on the website"}
     assert without_root_copies(manifest(files)) == manifest(files)
 
 
 def test_a_policy_that_lies_at_the_root_stays_as_it_is():
     files = {"config.json": b"{}", "model.safetensors": b"weights"}
-    assert fronted(files).manifest == manifest(files) == without_root_copies(manifest(files))
+    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):
@@ -116,11 +116,11 @@ def test_a_run_comes_back_as_it_was_however_often_it_goes_there(hub: Hub, run: P
     ) + len(card)
 
 
-def test_a_better_policy_takes_the_place_of_the_one_in_front(hub: Hub, run: Path, tmp_path: Path):
+def test_a_better_policy_replaces_the_copy_at_the_root(hub: Hub, run: Path, tmp_path: Path):
     do_push(run, POLICY)
     better = run / "best" / "pretrained_model" / "config.json"
     better.write_bytes(better.read_bytes() + b"\n")
-    assert do_push(run, POLICY).uploaded == 2  # where it lies, and in front
+    assert do_push(run, POLICY).uploaded == 2  # where it lies, and at the root
     repo = hub.repo("models/user/policy")
     assert repo.read(repo.tree(repo.refs("heads")["main"])["config.json"]) == better.read_bytes()
     do_pull(tmp_path / "back", POLICY)
