@@ -38,8 +38,8 @@ _LARGEST_CONFIG = 100_000  # [bytes]
 def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
     """Return path in the repository -> content. url: of the repository, for the commands that the card shows.
 
-    A `README.md` that another program or a person wrote is kept: then there is none here. Raises `ManipError` for a folder
-    that cannot be read.
+    A `README.md` of another origin is kept: then the result holds none. Raises `ManipError` for a folder that cannot be
+    read.
     """
     own = root / CARD
     is_kept = own.is_file() and _MADE_BY not in own.read_text(encoding="utf-8", errors="replace")

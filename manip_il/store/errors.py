@@ -129,16 +129,16 @@ class Retry:
 
     def __call__[T](self, work: Callable[[], T]) -> T:
         """Return what `work` returns; raise `RemoteError` with the last reason if every try fails."""
-        for number in range(1, self.tries + 1):
+        number = 0
+        while True:
+            number += 1
             try:
                 return work()
             except TransientError as error:
                 if number == self.tries:
-                    raise RemoteError(
-                        f"{error}; tried {number} times, try again later: what has been transferred is kept"
-                    ) from None
+                    text = f"{error}; tried {number} times, try again later: what has been transferred is kept"
+                    raise RemoteError(text) from None
                 self.sleep(self._wait(number, error))
-        raise RemoteError("no attempts are allowed; expected at least one")
 
     def _wait(self, number: int, error: TransientError) -> float:
         """Wait after the `number`-th try [s]: what the server asked for and a little more, or a drawn one."""

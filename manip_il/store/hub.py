@@ -45,6 +45,8 @@ class HubRemote:
         self.endpoint = str(constants.ENDPOINT)
         self.kind: Kind = self.url.kind or "policy"
         self.branch = self.url.revision or MAIN
+        # A repository of the other kind may have the name.
+        self._other = RemoteUrl("hf", self.url.place, "policy" if self.kind == "dataset" else "dataset")
         self._absence = ""
         shown = f"{self.url}" if self.endpoint == HF else f"{self.url} at {host(self.endpoint)}"
         self._repo = HubRepo(self.endpoint, _TYPES[self.kind], self.url.place, shown, self.retry)
@@ -104,9 +106,8 @@ class HubRemote:
     def _why_not(self, found: str) -> str:
         """Say what `HubRepo.find` did not find; nothing if it found the commit."""
         if found == "no repo":
-            other: Kind = "policy" if self.kind == "dataset" else "dataset"
-            if self._repo.exists_as(_TYPES[other]):
-                return f" (there is only a {other} of that name, {_url(other, self.url.place)})"
+            if self._exists(self._other):
+                return f" (there is only a {self._other.kind} of that name, {self._other})"
             hidden = " that this token cannot access" if get_token() else f", for which you {LOGIN}"
             return f" (no such {self.kind}, or a private one{hidden})"
         if found == "no revision":
@@ -114,11 +115,13 @@ class HubRemote:
             return f" (no revision {self.branch}; there are: {', '.join([*branches, *tags]) or 'none'})"
         return ""
 
+    def _exists(self, url: RemoteUrl) -> bool:
+        return self._repo.exists_as(_TYPES[url.kind or self.kind])
+
     def _begin(self) -> str:
         """Make the repository and the branch if they are missing; return the commit to begin from."""
-        other: Kind = "policy" if self.kind == "dataset" else "dataset"
-        if not self._repo.exists_as(_TYPES[self.kind]) and self._repo.exists_as(_TYPES[other]):
-            text = f"{self.url.place} is taken by a {other}, {_url(other, self.url.place)}"
+        if not self._exists(self.url) and self._exists(self._other):
+            text = f"{self.url.place} is taken by a {self._other.kind}, {self._other}"
             raise UsageError(f"{text}; choose another name for the {self.kind}")
         if COMMIT.fullmatch(self.branch):
             raise UsageError(f"{self.url}: a commit cannot be pushed to; name a branch, or none for main")
@@ -187,10 +190,6 @@ class HubRemote:
             if tags.get(VERSION) == commit:
                 return
         raise RemoteError(f"{self.name} is there, but other pushes keep moving its tag {VERSION}; push again")
-
-
-def _url(kind: Kind, place: str) -> str:
-    return f"hf://{'datasets/' if kind == 'dataset' else ''}{place}"
 
 
 def _addition(entry: FileEntry, path: Path) -> CommitOperationAdd:

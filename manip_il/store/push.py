@@ -81,7 +81,7 @@ def check_source(source: Path, url: RemoteUrl) -> Kind:
     """Return what `source` holds, if it may be pushed to `url`. Raises as `push` does."""
     kind = _kind_of(source)
     if url.kind not in (None, kind):
-        right = f"hf://datasets/{url.place}" if kind == "dataset" else f"hf://{url.place}"
+        right = RemoteUrl("hf", url.place, kind)
         raise UsageError(f"{source} is a {kind}, {url} is for a {url.kind}; push it to {right}")
     for dataset in _datasets(source):
         findings = examine_folder(dataset)

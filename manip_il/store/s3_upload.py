@@ -170,17 +170,18 @@ async def _abort(client: Any, place: Mapping[str, str]) -> None:
 
 
 async def _send(client: Any, place: Mapping[str, str], number: int, data: bytes, md5: str) -> tuple[bool | None, str]:
-    for left in reversed(range(TRIES)):
+    tries = 0
+    while True:
+        tries += 1
         try:
             answer = await client.upload_part(**place, PartNumber=number, Body=data)
             if (verified := is_as_sent(answer, md5)) is False:
                 raise TransientError("the store did not receive the bytes that were sent")
             return verified, answer["ETag"]
         except Exception as error:
-            if not left or code_of(error) == GONE:
+            if tries == TRIES or code_of(error) == GONE:
                 raise
-            await asyncio.sleep(0.5 * (TRIES - left))
-    raise TransientError("no attempts are allowed; expected at least one")
+            await asyncio.sleep(0.5 * tries)
 
 
 def _read(file: BinaryIO, length: int, digest: Any) -> bytes:
