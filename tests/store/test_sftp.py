@@ -96,7 +96,7 @@ def test_sftp_without_a_shell_reads_back(
 
 
 @pytest.mark.slow
-def test_an_sftp_store_that_a_dead_push_left_is_broken(
+def test_an_sftp_lock_that_a_dead_push_left_is_broken(
     at_home: None, sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sftp_store, "LOCK_STALE", 0.3)
@@ -108,7 +108,7 @@ def test_an_sftp_store_that_a_dead_push_left_is_broken(
 
 
 @pytest.mark.slow
-def test_an_sftp_store_of_a_living_push_is_respected(
+def test_an_sftp_lock_of_a_living_push_is_respected(
     at_home: None, sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, seconds in {"LOCK_REFRESH": 0.3, "LOCK_STALE": 1.5, "LOCK_WAIT": 2.5}.items():
