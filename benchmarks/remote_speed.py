@@ -37,16 +37,16 @@ from huggingface_hub import constants
 from huggingface_hub.utils import disable_progress_bars
 from s3fs import S3FileSystem
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "data"))
-from remote.hub_server import Hub, hub_server  # pyright: ignore[reportMissingImports]
-from remote.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
-from remote.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from store.hub_server import Hub, hub_server  # pyright: ignore[reportMissingImports]
+from store.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
+from store.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
 
 from manip_il.store.disk import sync_disk
 from manip_il.store.pull import pull
 from manip_il.store.push import push
+from manip_il.store.remote import RemoteUrl, open_remote
 from manip_il.store.sftp_connection import quick_transport
-from manip_il.store.url import RemoteUrl, open_remote
 
 BUCKET = "benchmark"
 TOKEN = "hf_OfTheBenchmark"

@@ -51,7 +51,6 @@ LONG = (
     "lerobot_commands/test_policies.py",
     "store/test_round_trip.py",
     "store/test_hub_programs.py",
-    "store/test_hub_faults.py",
     "doctor/test_doctor_lerobot.py",
     "cli/test_commands.py",
     "faults/test_kills.py",

@@ -198,7 +198,7 @@ def _clean(text: str, words: list[str]) -> str:
     from manip_il.store.errors import mask, redact
 
     if any(":" in word or "@" in word for word in words):
-        from manip_il.store.url import secrets_in
+        from manip_il.store.remote import secrets_in
 
         for secret in (one for word in words for one in secrets_in(word)):
             text = mask(text, secret)

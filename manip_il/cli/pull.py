@@ -13,7 +13,7 @@ from manip_il.cli.transfer import going_on, moved
 from manip_il.errors import FolderExistsError, UsageError
 
 if TYPE_CHECKING:
-    from manip_il.store.url import RemoteUrl
+    from manip_il.store.remote import RemoteUrl
 
 
 @dataclass
@@ -40,7 +40,7 @@ class PullOptions:
     def run(self) -> None:
         """Fetch, verify, rename; say what is there now."""
         from manip_il.store.pull import pull
-        from manip_il.store.url import open_remote
+        from manip_il.store.remote import open_remote
 
         url = self._url()
         remote = open_remote(url)
@@ -65,7 +65,7 @@ class PullOptions:
             say(f"next: manip-il doctor {self.target}")
 
     def _url(self) -> RemoteUrl:
-        from manip_il.store.url import RemoteUrl
+        from manip_il.store.remote import RemoteUrl
 
         url = RemoteUrl.parse(self.remote)
         if self.revision is None:

@@ -39,7 +39,7 @@ class PushOptions:
 
     def check(self) -> None:
         """Refuse an address that is none, and what is no folder."""
-        from manip_il.store.url import RemoteUrl
+        from manip_il.store.remote import RemoteUrl
 
         RemoteUrl.parse(self.remote)
         require_folder(self.source, "the folder of a dataset, a run or a policy")
@@ -47,7 +47,7 @@ class PushOptions:
     def run(self) -> None:
         """Examine, list, upload, switch over; say what was done."""
         from manip_il.store.push import push
-        from manip_il.store.url import RemoteUrl, open_remote
+        from manip_il.store.remote import RemoteUrl, open_remote
 
         url = RemoteUrl.parse(self.remote)
         remote = open_remote(url, private=self.private)

@@ -1,4 +1,4 @@
-"""A folder of this machine, or one mounted from another: `file:///mnt/store/demos`."""
+"""Objects in a folder of this machine, or one mounted from another: `file:///mnt/store/demos`."""
 
 from __future__ import annotations
 
@@ -13,44 +13,32 @@ import shutil
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 from manip_il.data.atomic import PARTIAL, exclusive, write_file
 from manip_il.errors import FolderBusyError, UsageError
-from manip_il.store.blobs import OBJECTS, STALE, Stored
 from manip_il.store.disk import copy_file, hash_file, sync_disk
 from manip_il.store.errors import AuthError, NoSpaceError, NotFoundError, RemoteError, TransientError
 from manip_il.store.manifest import LONGEST_TEXT
-from manip_il.store.object_store import ObjectRemote, in_threads
-from manip_il.store.remote import MANIFEST_FILE, Advance
-from manip_il.store.url import RemoteUrl
+from manip_il.store.object_store import OBJECTS, STALE, Stored, in_threads
+from manip_il.store.remote import MANIFEST_FILE, Advance, RemoteUrl, Sink
 
 CHUNK = 2**20  # of what is copied at a time [bytes]
 LOCK_WAIT = 30.0  # how long another push may take to switch over [s]
 
 
-def open_file(url: RemoteUrl) -> ObjectRemote:
-    """Return the remote of a `file://` URL."""
-    return ObjectRemote(FileBlobs(Path(url.place).expanduser(), str(url)))
-
-
 class FileBlobs:
-    """`Blobs` in a folder; the kernel's locks keep two pushes apart, and let go of what a killed one held."""
+    """`Blobs` in a folder. The kernel's locks keep two pushes apart; a killed process keeps none."""
 
     threads = 2  # more of them only wait for Python's lock
 
-    def __init__(self, root: Path, name: str):
-        self.root, self._name = root, name
+    def __init__(self, url: RemoteUrl):
+        self.root, self.name = Path(url.place).expanduser(), str(url)
         self._folders: set[str] = set()
         self.warnings: tuple[str, ...] = ()
 
-    def describe(self) -> str:
-        """Return the URL."""
-        return self._name
-
     def manifest(self) -> tuple[bytes, str] | None:
         """Return content and its hash."""
-        with self._explained(f"read {self._name}"):
+        with self._translated(f"read {self.name}"):
             try:
                 with (self.root / MANIFEST_FILE).open("rb") as file:
                     data = file.read(LONGEST_TEXT + 1)
@@ -59,46 +47,46 @@ class FileBlobs:
             return data, hashlib.sha256(data).hexdigest()
 
     def prepare(self, size: int) -> None:
-        """Make the folder; refuse one that holds something else, or too little space."""
-        with self._explained(f"write to {self._name}"):
+        """Make the folder; refuse one that holds something else or lacks space."""
+        with self._translated(f"write to {self.name}"):
             if self.root.exists() and not self.root.is_dir():
-                raise UsageError(f"{self._name} is a file; expected a folder, or a name that is free")
+                raise UsageError(f"{self.name} is a file; expected a folder, or a name that is free")
             self.root.mkdir(parents=True, exist_ok=True)
             names = {name for name in os.listdir(self.root) if not name.startswith(".")}
             if names and not names & {MANIFEST_FILE, OBJECTS}:
-                raise UsageError(f"{self._name} holds other files; name an empty or a new folder to push to")
+                raise UsageError(f"{self.name} holds other files; name an empty or a new folder to push to")
             (self.root / OBJECTS).mkdir(exist_ok=True)
             free = shutil.disk_usage(self.root).free
         if size > free:
-            text = f"{self._name} has {free:,} bytes left, {size:,} are to be uploaded"
+            text = f"{self.name} has {free:,} bytes left, {size:,} are to be uploaded"
             raise NoSpaceError(f"{text}; make room there, or push to another place")
         self._check_locks()
 
     def swap(self, data: bytes, before: str | None, needed: Mapping[str, int]) -> str | None:
-        """Replace the manifest where it still has the token `before`; None where it has not."""
-        with self._explained(f"write to {self._name}"), self._locked():
+        """Replace the manifest if it still has the token `before`, and return its own; else None."""
+        with self._translated(f"write to {self.name}"), self._locked():
             found = self.manifest()
             if (found[1] if found else None) != before:
                 return None
             for key, size in needed.items():
                 if self._size(key) != size:
-                    raise TransientError(f"{self._name} has lost the object {key[:12]}")
-            sync_disk(self.root)  # what the manifest names lies on the disk before it does
+                    raise TransientError(f"{self.name} has lost the object {key[:12]}")
+            sync_disk(self.root)  # the objects reach the disk before the manifest that names them
             write_file(self.root / MANIFEST_FILE, data)
         return hashlib.sha256(data).hexdigest()
 
-    def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
+    def fetch(self, key: str, target: Sink, offset: int) -> None:
         """Copy an object from `offset` on."""
-        with self._explained(f"read {self._name}"):
+        with self._translated(f"read {self.name}"):
             try:
                 handle = os.open(self._path(key), os.O_RDONLY | os.O_NOFOLLOW)
             except FileNotFoundError:
-                raise NotFoundError(f"{self._name} has no object {key[:12]}") from None
+                raise NotFoundError(f"{self.name} has no object {key[:12]}") from None
             with os.fdopen(handle, "rb", buffering=0) as file:
                 file.seek(offset)
                 size = min(CHUNK, os.fstat(handle).st_size)
                 rooms = itertools.cycle([memoryview(bytearray(size)), memoryview(bytearray(size))])
-                # Two by turns: the target still hashes the one before.
+                # Two in turn, as the target may still use the last one.
                 while count := file.readinto(room := next(rooms)):
                     target.write(room[:count])
 
@@ -106,13 +94,13 @@ class FileBlobs:
         """Copy, read back, rename."""
         folder = f"{self.root}/{OBJECTS}/{key[:2]}"
         partial = f"{folder}/.{key[:12]}.{secrets.token_hex(6)}{PARTIAL}"
-        with self._explained(f"write to {self._name}"):
+        with self._translated(f"write to {self.name}"):
             if folder not in self._folders:
                 os.makedirs(folder, exist_ok=True)
                 self._folders.add(folder)
             try:
                 if copy_file(source, partial) != key:
-                    text = f"{source} changed while it was being pushed, or {self._name} did not store it intact"
+                    text = f"{source} changed while it was being pushed, or {self.name} did not store it intact"
                     raise TransientError(text)
                 os.replace(partial, f"{folder}/{key}")
             except BaseException:
@@ -123,7 +111,7 @@ class FileBlobs:
         return True
 
     def find(self, keys: Iterable[str]) -> dict[str, Stored]:
-        """Those of `keys` that are there."""
+        """Return those of `keys` that are there."""
         now, found = time.time(), dict[str, Stored]()
         for key in keys:
             with contextlib.suppress(OSError):
@@ -136,14 +124,14 @@ class FileBlobs:
         return self.find(path.name for path in self._all() if not path.name.startswith("."))
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
-        """Those that are missing, or are not what their name says."""
-        with self._explained(f"read {self._name}"):
+        """Return those that are missing or have other bytes."""
+        with self._translated(f"read {self.name}"):
             digests = in_threads(self.threads, lambda key: _digest(self._path(key)), sizes)
         return {key for key, digest in digests.items() if digest != key}
 
     def remove(self, keys: Iterable[str], token: str) -> None:
         """Remove objects, and what killed pushes left, unless another push has been."""
-        with self._explained(f"write to {self._name}"), self._locked():
+        with self._translated(f"write to {self.name}"), self._locked():
             found = self.manifest()
             if found is None or found[1] != token:
                 return
@@ -175,7 +163,7 @@ class FileBlobs:
                 break
             except FolderBusyError:
                 if time.monotonic() > last:
-                    raise RemoteError(f"another push is updating {self._name}; wait, and push again") from None
+                    raise RemoteError(f"another push is updating {self.name}; wait, and push again") from None
                 time.sleep(0.05)
         with stack:
             yield
@@ -185,13 +173,13 @@ class FileBlobs:
         try:
             fcntl.flock(handle, fcntl.LOCK_SH)
         except OSError:
-            text = f"{self._name} is on a file system without locks: two pushes at once can overwrite each other"
+            text = f"{self.name} is on a file system without locks: two pushes at once can overwrite each other"
             self.warnings = (*self.warnings, text)
         finally:
             os.close(handle)
 
     @contextlib.contextmanager
-    def _explained(self, what: str) -> Generator[None]:
+    def _translated(self, what: str) -> Generator[None]:
         try:
             yield
         except OSError as error:

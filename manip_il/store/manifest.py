@@ -1,34 +1,45 @@
-"""The list of files of a dataset or policy, with sizes and hashes: what one version of it is.
+"""The list of files of one version of a dataset or policy, with sizes and hashes.
 
-It comes from outside, so it refuses itself on construction where it names anything but plain files inside a folder.
+It comes from outside: on construction it refuses everything but plain files inside a folder, on any system, and code.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+import unicodedata
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, cast
 
 from manip_il.store.errors import ManifestError
-from manip_il.store.paths import check_path, check_together
 
 VERSION = 1
 MOST_FILES = 200_000
-LARGEST = 10**12  # of all files together, unless the caller says otherwise [bytes]
+LARGEST = 10**12  # of all files together [bytes]
 LONGEST_TEXT = 2**26  # of a manifest [bytes]
 _KINDS = ("dataset", "policy")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _SHA1 = re.compile(r"[0-9a-f]{40}")
+
+LONGEST_PATH = 1024  # [bytes]
+LONGEST_NAME = 255  # [bytes]
+DEEPEST = 32  # folders
+_BAD_CATEGORIES = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")  # control, invisible and half characters, line ends
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".bin", ".ckpt", ".joblib", ".dill", ".msgpack")
+_CODE = (
+    *(".py", ".pyc", ".pyo", ".pyd", ".pyw", ".pyz", ".so", ".dll", ".dylib", ".exe", ".com", ".msi", ".jar", ".class"),
+    *(".sh", ".bash", ".zsh", ".fish", ".bat", ".cmd", ".ps1", ".vbs", ".rb", ".pl", ".whl", ".egg", ".ipynb"),
+)
+_DEVICES = {"con", "prn", "aux", "nul", *(f"{name}{n}" for name in ("com", "lpt") for n in range(1, 10))}
 
 Kind = Literal["dataset", "policy"]
 
 
 @dataclass(frozen=True)
 class FileEntry:
-    """One file. path: relative, with `/`. size [bytes]. git_sha1: git's blob id, where a Hub knows no sha256."""
+    """One file. path: relative, with `/`. size [bytes]. git_sha1: git's blob id, if a Hub knows no sha256."""
 
     path: str
     size: int
@@ -36,7 +47,7 @@ class FileEntry:
     git_sha1: str = ""
 
     def __post_init__(self) -> None:
-        """Raise `ManifestError` for a path that leaves the folder or names code, a size or a hash that is none."""
+        """Raise `ManifestError` for a path that leaves the folder or names code, a wrong size or a wrong hash."""
         check_path(self.path)
         if type(self.size) is not int or self.size < 0:
             raise ManifestError(f"{self.path!r:.200} has size {self.size!r:.40}; expected a number of bytes")
@@ -47,7 +58,7 @@ class FileEntry:
 
     @property
     def key(self) -> str:
-        """What its bytes are known by."""
+        """Identity of its bytes."""
         return self.sha256 or f"git-{self.git_sha1}"
 
 
@@ -55,77 +66,66 @@ class FileEntry:
 class Manifest:
     """All files of one version, sorted by path.
 
-    replaced: hashes that only the version before names; a store removes them with the next push. largest: more bytes
-    in all are refused.
+    replaced: hashes that only the version before has; a store removes their objects with the next push.
     """
 
     kind: Kind
     files: tuple[FileEntry, ...]
-    version: int = VERSION
     replaced: tuple[str, ...] = ()
-    largest: int = LARGEST
 
     def __post_init__(self) -> None:
-        """Raise `ManifestError` for anything that no push of ours writes."""
-        if self.version != VERSION or type(self.version) is not int:
-            text = f"the manifest has version {self.version!r:.40}, this program reads {VERSION}; use a newer manip-il"
-            raise ManifestError(text)
+        """Raise `ManifestError` for anything that no push writes."""
         if self.kind not in _KINDS:
             raise ManifestError(f"the manifest is of a {self.kind!r:.40}; expected dataset or policy")
         if len(self.files) > MOST_FILES:
             raise ManifestError(f"the manifest names {len(self.files):,} files; at most {MOST_FILES:,} are accepted")
         object.__setattr__(self, "files", tuple(sorted(self.files, key=lambda entry: entry.path)))
         check_together([entry.path for entry in self.files])
-        if self.size > self.largest:
-            text = f"the manifest names {self.size:,} bytes; at most {self.largest:,} are accepted"
-            raise ManifestError(text)
+        if self.size > LARGEST:
+            raise ManifestError(f"the manifest names {self.size:,} bytes; at most {LARGEST:,} are accepted")
         for sha256 in self.replaced:
             _check_hash("replaced", "sha256", sha256, _SHA256)
 
     @cached_property
     def size(self) -> int:
-        """Of all files together [bytes]."""
+        """Size of all files together [bytes]."""
         return sum(entry.size for entry in self.files)
 
     @cached_property
     def by_path(self) -> Mapping[str, FileEntry]:
-        """The entries by path."""
+        """Entries by path."""
         return {entry.path: entry for entry in self.files}
 
     @cached_property
     def keys(self) -> frozenset[str]:
-        """What the files' bytes are known by."""
+        """Identities of all files' bytes."""
         return frozenset(entry.key for entry in self.files)
 
     def to_json(self) -> bytes:
-        """As it is kept beside the files."""
-        files = [_plain(entry) for entry in self.files]
+        """Return the text that a store keeps."""
+        files = [{name: value for name, value in vars(entry).items() if value != ""} for entry in self.files]
         replaced = {"replaced": list(self.replaced)} if self.replaced else {}
-        return json.dumps({"version": self.version, "kind": self.kind, "files": files, **replaced}, indent=1).encode()
+        return json.dumps({"version": VERSION, "kind": self.kind, "files": files, **replaced}, indent=1).encode()
 
     @classmethod
-    def from_json(cls, data: bytes, largest: int = LARGEST) -> Manifest:
-        """Raises `ManifestError` for anything that `to_json` does not write."""
+    def from_json(cls, data: bytes) -> Manifest:
+        """Read a manifest. Raises `ManifestError` for anything that `to_json` does not write."""
         if len(data) > LONGEST_TEXT:
             raise ManifestError(f"the manifest is {len(data):,} bytes long; at most {LONGEST_TEXT:,} are read")
         try:
-            tree = json.loads(data, object_pairs_hook=_no_twins, parse_constant=_no_number)
+            tree = json.loads(data, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
             raise ManifestError(f"the manifest is not valid JSON: {str(error)[:200]}") from None
         table = _object(tree, "the manifest", {"version", "kind", "files"}, {"replaced"})
-        files = _list(table["files"], "files", MOST_FILES)
-        replaced = _list(table.get("replaced", []), "replaced", MOST_FILES)
-        return cls(table["kind"], tuple(map(_entry, files)), table["version"], tuple(replaced), largest)
-
-
-def _entry(value: Any) -> FileEntry:
-    table = _object(value, "a file of the manifest", {"path", "size"}, {"sha256", "git_sha1"})
-    return FileEntry(**table)
-
-
-def _plain(entry: FileEntry) -> dict[str, Any]:
-    hashes = {"sha256": entry.sha256, "git_sha1": entry.git_sha1}
-    return {"path": entry.path, "size": entry.size, **{name: value for name, value in hashes.items() if value}}
+        if table["version"] != VERSION or type(table["version"]) is not int:
+            text = f"the manifest has version {table['version']!r:.40}, this program reads {VERSION}"
+            raise ManifestError(f"{text}; use a newer manip-il")
+        tables = [
+            _object(file, "a file of the manifest", {"path", "size"}, {"sha256", "git_sha1"})
+            for file in _list(table["files"], "files")
+        ]
+        replaced = _list(table.get("replaced", []), "replaced")
+        return cls(table["kind"], tuple(FileEntry(**one) for one in tables), tuple(replaced))
 
 
 def _object(value: Any, what: str, needed: set[str], allowed: set[str]) -> dict[str, Any]:
@@ -137,11 +137,11 @@ def _object(value: Any, what: str, needed: set[str], allowed: set[str]) -> dict[
     return table
 
 
-def _list(value: Any, what: str, most: int) -> list[Any]:
+def _list(value: Any, what: str) -> list[Any]:
     if not isinstance(value, list):
         raise ManifestError(f"{what} of the manifest is {type(value).__name__}; expected a list")
-    if len(value) > most:
-        raise ManifestError(f"the manifest names {len(value):,} files; at most {most:,} are accepted")
+    if len(value) > MOST_FILES:
+        raise ManifestError(f"the manifest names {len(value):,} files; at most {MOST_FILES:,} are accepted")
     return value
 
 
@@ -150,12 +150,82 @@ def _check_hash(path: str, what: str, value: object, pattern: re.Pattern[str]) -
         raise ManifestError(f"{path!r:.200} has {what} {value!r:.80}; expected hexadecimal digits")
 
 
-def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) != len(pairs):
         raise ValueError("a key appears twice")
     return table
 
 
-def _no_number(text: str) -> None:
+def _refuse_constant(text: str) -> None:
     raise ValueError(f"{text} is not a number")
+
+
+def check_path(path: object) -> str:
+    """Return `path` if it is allowed. Raises `ManifestError` with the reason."""
+    if not isinstance(path, str):
+        raise ManifestError(f"a manifest names a file {path!r:.80}; expected a string")
+    if reason := _reason(path):
+        raise ManifestError(f"the file {path!r:.200} is refused: {reason}")
+    return path
+
+
+def check_together(paths: Iterable[str]) -> None:
+    """Raise `ManifestError` if two paths are equal on some system, or one is both file and folder."""
+    spelled: dict[str, str] = {}  # folded path of a file or folder -> as it was written
+    files: set[str] = set()
+    for path in paths:
+        folded = fold(path)
+        if folded in files:
+            raise ManifestError(f"the file {path!r:.200} appears twice, also as {spelled[folded]!r:.200}: refused")
+        files.add(folded)
+        parts = path.split("/")
+        for count in range(1, len(parts) + 1):
+            part = "/".join(parts[:count])
+            if spelled.setdefault(fold(part), part) != part:
+                both = f"{part!r:.200} and {spelled[fold(part)]!r:.200}"
+                raise ManifestError(f"{both} differ only in case or in how letters are encoded: refused")
+    for path in paths:
+        parts = path.split("/")
+        for count in range(1, len(parts)):
+            if fold(folder := "/".join(parts[:count])) in files:
+                raise ManifestError(f"{folder!r:.200} is both a file and a folder: refused")
+
+
+def fold(path: str) -> str:
+    """Return the spelling that paths share which a file system may take for one: of any case, of any Unicode form."""
+    return unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", path).casefold())
+
+
+def is_hidden(path: str) -> bool:
+    """Return whether a name in the path begins with a dot: such files are neither pushed nor pulled."""
+    return any(part.startswith(".") for part in path.split("/"))
+
+
+def _reason(path: str) -> str:
+    if not path or path.startswith("/") or path.endswith("/"):
+        return "it is not a relative path of a file"
+    if any(unicodedata.category(letter) in _BAD_CATEGORIES for letter in path):
+        return "it has invisible characters"
+    if any(letter in path for letter in '\\:*?"<>|'):
+        return "it has a character that file names cannot have on every system"
+    if len(path.encode()) > LONGEST_PATH or path.count("/") > DEEPEST:
+        return f"it is longer than {LONGEST_PATH} bytes or deeper than {DEEPEST} folders"
+    for part in path.split("/"):
+        if part in ("", ".", ".."):
+            return "it leads, or could lead, outside the folder"
+        if part.startswith("."):
+            return "it is hidden"
+        if part.endswith((".", " ")) or part.startswith(" ") or part.split(".")[0].casefold() in _DEVICES:
+            return "a name in it means something else on other systems"
+        if len(part.encode()) > LONGEST_NAME:
+            return f"a name in it is longer than {LONGEST_NAME} bytes"
+    return _code_reason(fold(path))
+
+
+def _code_reason(folded: str) -> str:
+    if folded.endswith(_PICKLES):
+        return "a pickle runs code when it is read; weights are kept as .safetensors"
+    if folded.endswith(_CODE):
+        return "it is code, and nothing from a remote is ever run"
+    return ""

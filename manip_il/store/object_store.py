@@ -1,9 +1,9 @@
-"""A dataset or policy on a store of plain files: objects named by their hash, and one manifest that says what is seen.
+"""A `Remote` on any store of plain files: objects named by their hash, and one manifest.
 
-    PLACE/manip_il_manifest.json       replaced last, in one step: readers see the old version or the new
+    PLACE/manip_il_manifest.json       replaced last, in one step: readers see the old version or the new one
          /objects/3f/3f9a...           every file's bytes, by their sha256; never changed
 
-What the replaced version alone names stays until the next push, so that who is reading it can finish.
+Objects of the replaced version stay until the next push, so that whoever is reading it can finish.
 """
 
 from __future__ import annotations
@@ -14,16 +14,75 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Protocol, cast
 
-from manip_il.store.blobs import STALE, Blobs, Stored
-from manip_il.store.errors import ConflictError, HashError, ManifestError, NotFoundError, RemoteError
+from manip_il.store.errors import ConflictError, HashError, ManifestError, NotFoundError, RemoteError, Retry
 from manip_il.store.manifest import FileEntry, Manifest
-from manip_il.store.remote import Advance, Published, Snapshot
-from manip_il.store.retry import Retry
+from manip_il.store.remote import Advance, Published, Sink, Snapshot
 
+OBJECTS = "objects"  # folder of the objects
+STALE = 24 * 3600.0  # an object that no version names is removed from this age on: no push takes so long [s]
 FRESH = 12 * 3600.0  # an object that no version names is used again up to this age [s]
-FEW = 32  # objects that are asked for one by one; more are listed
+FEW = 32  # up to so many objects are queried one by one; more are listed
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An object on the store. size [bytes]. age: since it was written, by the store's clock [s]."""
+
+    size: int
+    age: float
+
+
+class Blobs(Protocol):
+    """A store of objects, named by the sha256 of their bytes (their key), and of one manifest.
+
+    The manifest's token is opaque; another content has another one. Methods raise errors of `manip_il.store.errors`:
+    `TransientError` if another try may help.
+    """
+
+    name: str  # of the place, for messages
+    threads: int  # that may use it at a time
+    warnings: tuple[str, ...]  # for the user
+
+    def manifest(self) -> tuple[bytes, str] | None:
+        """Return content and token; None if there is none."""
+        ...
+
+    def prepare(self, size: int) -> None:
+        """Check, before `size` bytes are uploaded, that the place holds nothing else and has room."""
+        ...
+
+    def swap(self, data: bytes, before: str | None, needed: Mapping[str, int]) -> str | None:
+        """Replace the manifest in one step if its token is still `before`; return the new token, else None.
+
+        needed: keys and sizes of the objects that must be there.
+        """
+        ...
+
+    def fetch(self, key: str, target: Sink, offset: int) -> None:
+        """Write an object's bytes from `offset` on to `target`. Raises `NotFoundError` if it is gone."""
+        ...
+
+    def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
+        """Store an object, whole or not at all; return whether it was verified."""
+        ...
+
+    def find(self, keys: Iterable[str]) -> dict[str, Stored]:
+        """Return those of `keys` that are there."""
+        ...
+
+    def list(self) -> dict[str, Stored]:
+        """Return every object."""
+        ...
+
+    def wrong(self, sizes: Mapping[str, int]) -> set[str]:
+        """Return those of the keys whose objects are missing or have other bytes."""
+        ...
+
+    def remove(self, keys: Iterable[str], token: str) -> None:
+        """Remove objects, and what killed pushes left, unless the manifest's token is no longer `token`."""
+        ...
 
 
 @dataclass
@@ -35,37 +94,42 @@ class ObjectRemote:
 
     @property
     def threads(self) -> int:
-        """That may fetch at a time."""
+        """Largest number of threads that may fetch at the same time."""
         return self.blobs.threads
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the store has shown that it cannot do."""
+        """Warnings about this store, as far as they are known by now."""
         return self.blobs.warnings
 
-    def describe(self) -> str:
-        """Return the URL, without a password."""
-        return self.blobs.describe()
+    @property
+    def name(self) -> str:
+        """URL without a password."""
+        return self.blobs.name
 
     def read(self) -> Snapshot | None:
-        """Return the manifest that is there; None where there is none."""
+        """Return the version that is there; None if there is none."""
         found = self.retry(self.blobs.manifest)
         if found is None:
             return None
         data, token = found
         try:
-            return Snapshot(_with_sha256(Manifest.from_json(data)), token)
+            manifest = Manifest.from_json(data)
+            for entry in manifest.files:
+                if not entry.sha256:
+                    raise ManifestError(f"{entry.path!r:.200} has no sha256")
         except ManifestError as error:
-            raise ManifestError(f"{self.describe()}: {error}") from None
+            raise ManifestError(f"{self.name}: {error}") from None
+        return Snapshot(manifest, token)
 
-    def fetch(self, snapshot: Snapshot, entry: FileEntry, target: BinaryIO, offset: int) -> None:
-        """Once: who calls knows how many bytes came, and goes on from there."""
+    def fetch(self, snapshot: Snapshot, entry: FileEntry, target: Sink, offset: int) -> None:
+        """Write the bytes of one file from `offset` on to `target`, in one try."""
         self.blobs.fetch(entry.sha256, target, offset)
 
     def publish(
         self, local: Mapping[str, Path], manifest: Manifest, before: Snapshot | None, progress: Advance
     ) -> Published:
-        """Upload, verify, switch, clear away; what the store has lost of the version before is uploaded again."""
+        """Upload, verify, switch, remove old objects; objects that the store has lost are uploaded again."""
         known = before.manifest.keys if before else frozenset[str]()
         is_same = bool(before) and (before.manifest.kind, before.manifest.files) == (manifest.kind, manifest.files)
         sizes = {entry.sha256: entry.size for entry in manifest.files}
@@ -74,7 +138,10 @@ class ObjectRemote:
         if not is_same:
             self.retry(lambda: self.blobs.prepare(sum(new.values())))
         stored = self._stored(sizes)
-        missing = {key: size for key, size in sizes.items() if not _is_usable(stored.get(key), size, key in known)}
+        usable = {
+            key for key, one in stored.items() if one.size == sizes.get(key) and (key in known or one.age < FRESH)
+        }
+        missing = {key: size for key, size in sizes.items() if key not in usable}
         to_send = {key: size for key, size in new.items() if key in missing}
         progress(sum(entry.size for entry in manifest.files if entry.sha256 in new) - sum(to_send.values()))
         verified = self._upload(to_send, sources, progress)
@@ -93,18 +160,18 @@ class ObjectRemote:
         return self.retry(lambda: self.blobs.find(sizes) if len(sizes) <= FEW else self.blobs.list())
 
     def _upload(self, sizes: Mapping[str, int], sources: Mapping[str, Path], progress: Advance) -> set[str]:
-        """Bring objects there; return those that the store has verified."""
+        """Put objects; return those that the store has verified."""
 
         def one(key: str) -> bool:
-            sent = _Sent(progress)
-            return self.retry(lambda: self.blobs.put(key, sources[key], sizes[key], sent.again()))
+            counter = _Counter(progress)
+            return self.retry(lambda: self.blobs.put(key, sources[key], sizes[key], counter.restart()))
 
         largest_first = sorted(sizes, key=lambda key: -sizes[key])  # else the last one runs alone
         done = in_threads(self.blobs.threads, one, largest_first)
         return {key for key, verified in done.items() if verified}
 
     def _verify(self, sizes: Mapping[str, int], sources: Mapping[str, Path]) -> None:
-        """Every object is what its name says, or is brought once more."""
+        """Have the store check the objects' bytes; put wrong ones once more. Raises `HashError` for a second time."""
         wrong = self.retry(lambda: self.blobs.wrong(sizes)) if sizes else set[str]()
         if not wrong:
             return
@@ -112,12 +179,13 @@ class ObjectRemote:
         verified = self._upload(again, sources, lambda _: None)
         left = {key: size for key, size in again.items() if key not in verified}
         if left and self.retry(lambda: self.blobs.wrong(left)):
-            text = f"{self.describe()} twice did not keep the bytes that were sent; nothing was published"
+            text = f"{self.name} twice did not keep the bytes that were sent; nothing was published"
             raise HashError(f"{text}: check its disk and the network")
 
     def _switch(
         self, manifest: Manifest, before: Snapshot | None, sizes: Mapping[str, int], sources: Mapping[str, Path]
     ) -> str:
+        """Replace the manifest; return its token."""
         replaced = sorted(before.manifest.keys - manifest.keys) if before else []
         data = replace(manifest, replaced=tuple(replaced)).to_json()
         tries = 0
@@ -131,12 +199,12 @@ class ObjectRemote:
             found = self.blobs.manifest() if tries > 1 else None
             if found and found[0] == data:
                 return found[1]  # an earlier try had worked, only its answer was lost
-            raise ConflictError(self.describe())
+            raise ConflictError(self.name)
 
         token = self.retry(swap)
-        if before is None:  # then nobody had a version either, to clear away after
+        if before is None:  # then no other push can have removed anything
             return token
-        # A store without locks may have let another push clear an object away that this one found there.
+        # A store without locks may have let another push remove an object that this one found there.
         lost = set(sizes) - self._stored(sizes).keys()
         if lost:
             self._upload({key: sizes[key] for key in lost}, sources, lambda _: None)
@@ -154,13 +222,13 @@ class ObjectRemote:
             self.blobs.warnings += (f"old files could not be removed ({error}); the next push tries again",)
 
 
-class _Sent:
-    """Counts the bytes of one object, each once, however often it is sent."""
+class _Counter:
+    """Count of one object's bytes: each once, however often it is sent."""
 
     def __init__(self, progress: Advance):
         self._progress, self._most, self._now = progress, 0, 0
 
-    def again(self) -> Advance:
+    def restart(self) -> Advance:
         self._now = 0
         return self._advance
 
@@ -172,11 +240,11 @@ class _Sent:
 
 
 def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) -> dict[K, R]:
-    """`work` of every key; the first error ends all, and is raised when what runs already has ended.
+    """Run `work` on every key; raise its first error when what runs already has ended.
 
     Ctrl-C waits for nothing: a large file may take minutes yet.
     """
-    stop, is_cut = threading.Event(), False
+    stop, is_interrupted = threading.Event(), False
 
     def one(key: K) -> R | None:
         return None if stop.is_set() else work(key)
@@ -191,19 +259,19 @@ def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) ->
         return {key: cast("R", future.result()) for key, future in futures.items()}
     except BaseException as error:
         stop.set()
-        is_cut = isinstance(error, KeyboardInterrupt)
+        is_interrupted = isinstance(error, KeyboardInterrupt)
         raise
     finally:
-        pool.shutdown(wait=not is_cut, cancel_futures=True)
+        pool.shutdown(wait=not is_interrupted, cancel_futures=True)
 
 
 def wrong_when_read(blobs: Blobs, keys: Iterable[str]) -> set[str]:
-    """Those of the keys whose objects are gone, or are not what their name says when all of them is read back."""
+    """Read objects back; return the keys of those that are gone or have other bytes."""
 
     def one(key: str) -> bool:
         digest = _Digest()
         try:
-            blobs.fetch(key, cast("BinaryIO", digest), 0)
+            blobs.fetch(key, digest, 0)
         except NotFoundError:
             return True
         return digest.sha256.hexdigest() != key
@@ -215,16 +283,5 @@ class _Digest:
     def __init__(self) -> None:
         self.sha256 = hashlib.sha256()
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes | memoryview, /) -> None:
         self.sha256.update(data)
-
-
-def _is_usable(stored: Stored | None, size: int, is_known: bool) -> bool:
-    return stored is not None and stored.size == size and (is_known or stored.age < FRESH)
-
-
-def _with_sha256(manifest: Manifest) -> Manifest:
-    for entry in manifest.files:
-        if not entry.sha256:
-            raise ManifestError(f"{entry.path!r:.200} has no sha256")
-    return manifest

@@ -1,36 +1,30 @@
 """A remote to a folder: fetched beside it, verified, and then renamed in one step.
 
-What has come is kept in the hidden folder `.<name>.pulling` between tries, so that the next one goes on from there.
+What has arrived stays in the hidden folder `.<name>.pulling` between tries, so that the next one continues there.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manip_il.data import atomic
 from manip_il.errors import FolderExistsError, UsageError
-from manip_il.store.disk import sync_disk
-from manip_il.store.errors import NoSpaceError, NotFoundError
-from manip_il.store.front import without_front
-from manip_il.store.landing import Landing, is_whole
+from manip_il.store.disk import Download, is_whole, sync_disk
+from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
 from manip_il.store.manifest import FileEntry, Manifest
 from manip_il.store.object_store import in_threads
-from manip_il.store.push import Progress
-from manip_il.store.remote import Advance, Remote, Snapshot
-from manip_il.store.retry import Retry
-from manip_il.store.scan import CHECKPOINTS, HASHERS, JOURNALS, LAST, newest
-from manip_il.store.url import RemoteUrl
+from manip_il.store.push import CHECKPOINTS, HASHERS, JOURNALS, LAST, Progress, newest, without_root_copies
+from manip_il.store.remote import Advance, Remote, RemoteUrl, Snapshot
 
 RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
 
 
 @dataclass(frozen=True)
 class Pulled:
-    """What a pull did, or would do. kept: bytes that an earlier try had brought."""
+    """Result of a pull. kept: bytes that an earlier try had fetched."""
 
     manifest: Manifest
     kept: int = 0
@@ -46,10 +40,10 @@ def pull(
     dry_run: bool = False,
     retry: Retry | None = None,
 ) -> Pulled:
-    """Have `target` hold what readers of the remote see now, whole, or leave it as it is.
+    """Fetch what readers of the remote see now into `target`, whole, or leave `target` as it is.
 
-    overwrite: what is there is replaced, in one step. Raises `FolderExistsError` where something is there otherwise,
-    `NotFoundError` where the remote holds nothing, and the errors of `manip_il.store.errors`.
+    overwrite: replace what is there, in one step. Raises `FolderExistsError` if something is there and may not be
+    replaced, `NotFoundError` if the remote holds nothing, and the errors of `manip_il.store.errors`.
     """
     target = target.absolute()
     snapshot = _read(url, remote)
@@ -67,53 +61,47 @@ def pull(
                 now = _read(url, remote)
                 if now.token == snapshot.token:
                     raise
-                snapshot = now  # pushed to twice meanwhile: what of it is the same stays
+                snapshot = now  # pushed to twice meanwhile: files that are the same stay
         else:
             raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
-        _land(stage.tree, target, snapshot.manifest, overwrite)
+        _move_to(stage.tree, target, snapshot.manifest, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
     return Pulled(snapshot.manifest, kept)
 
 
-@dataclass
 class _Stage:
-    """The folder beside the target. parts: by hash, unfinished. tree: verified, as it will be."""
+    """The folder beside the target. parts: unfinished files, by hash. tree: verified files, as they will be."""
 
-    remote: Remote
-    snapshot: Snapshot
-    folder: Path
-    retry: Retry
-    tree: Path = field(init=False)
-    parts: Path = field(init=False)
-    _folders: set[Path] = field(default_factory=set[Path])
-
-    def __post_init__(self) -> None:
-        self.tree, self.parts = self.folder / "tree", self.folder / "parts"
+    def __init__(self, remote: Remote, snapshot: Snapshot, folder: Path, retry: Retry):
+        self._remote, self._snapshot, self._folder, self._retry = remote, snapshot, folder, retry
+        self.tree, self._parts = folder / "tree", folder / "parts"
 
     def fill(self, progress: Progress) -> int:
-        """Bring and verify every file; return how many bytes were there already."""
-        manifest = self.snapshot.manifest
-        if self.folder.is_symlink():
-            self.folder.unlink()
-        for folder in (self.tree, self.parts):
+        """Fetch and verify every file; return the number of bytes that were there already."""
+        manifest = self._snapshot.manifest
+        if self._folder.is_symlink():
+            self._folder.unlink()
+        for folder in (self.tree, self._parts):
             folder.mkdir(parents=True, exist_ok=True)
         missing = self._missing()
-        self._clear_parts(set(missing))
+        for path in self._parts.iterdir():
+            if path.name not in missing or path.is_symlink():
+                path.unlink()
         wanted = sum(entries[0].size * len(entries) for entries in missing.values())
-        had = sum(path.stat().st_size for path in self.parts.iterdir())
-        _check_space(self.folder, wanted - had)
+        had = sum(path.stat().st_size for path in self._parts.iterdir())
+        _check_space(self._folder, wanted - had)
         whole = manifest.size - wanted
         with progress(manifest.size, "pull") as advance:
             advance(whole)
             # The largest first, else the last one runs alone.
             order = sorted(missing, key=lambda key: -missing[key][0].size)
-            in_threads(self.remote.threads, lambda key: self._bring(missing[key], advance), order)
-        sync_disk(self.folder)
+            in_threads(self._remote.threads, lambda key: self._fetch(missing[key], advance), order)
+        sync_disk(self._folder)
         return whole + had
 
     def _missing(self) -> dict[str, list[FileEntry]]:
-        """Entries by hash that the tree has not; what else it holds is removed."""
-        by_path = self.snapshot.manifest.by_path
+        """Return the entries, by hash, that the tree lacks; remove what else it holds."""
+        by_path = self._snapshot.manifest.by_path
         there = {path.relative_to(self.tree).as_posix(): path for path in _leaves(self.tree)}
         known = [path for path in there if path in by_path]
         whole = in_threads(HASHERS, lambda path: is_whole(by_path[path], there[path]), known)
@@ -124,43 +112,33 @@ class _Stage:
             if not any(folder.iterdir()):  # else a file of the new version may want the name
                 folder.rmdir()
         missing: dict[str, list[FileEntry]] = defaultdict(list)
-        for entry in self.snapshot.manifest.files:
+        for entry in self._snapshot.manifest.files:
             if not whole.get(entry.path):
                 missing[entry.key].append(entry)
         return missing
 
-    def _clear_parts(self, wanted: set[str]) -> None:
-        for path in self.parts.iterdir():
-            if path.name not in wanted or path.is_symlink():
-                path.unlink()
-
-    def _bring(self, entries: list[FileEntry], advance: Advance) -> None:
-        """One file's bytes, to all places that have them."""
+    def _fetch(self, entries: list[FileEntry], advance: Advance) -> None:
+        """Fetch one file's bytes to all places that have them."""
         first, *others = entries
-        part = self.parts / first.key
-        landing = Landing(first, part, advance)
-        self.retry(lambda: landing.once(lambda file, offset: self.remote.fetch(self.snapshot, first, file, offset)))
+        part = self._parts / first.key
+        download = Download(first, part, advance)
+        self._retry(lambda: download.attempt(lambda to, offset: self._remote.fetch(self._snapshot, first, to, offset)))
+        for entry in entries:
+            (self.tree / entry.path).parent.mkdir(parents=True, exist_ok=True)
         for entry in others:
-            shutil.copyfile(part, self._place(entry))
+            shutil.copyfile(part, self.tree / entry.path)
             advance(entry.size)
-        part.replace(self._place(first))
-
-    def _place(self, entry: FileEntry) -> Path:
-        path = self.tree / entry.path
-        if path.parent not in self._folders:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._folders.add(path.parent)
-        return path
+        part.replace(self.tree / first.path)
 
 
 def _read(url: RemoteUrl, remote: Remote) -> Snapshot:
     snapshot = remote.read()
     if snapshot is None:
-        text = f"{remote.describe()} holds nothing that can be pulled"
+        text = f"{remote.name} holds nothing that can be pulled"
         raise NotFoundError(f"{text}: check the name, or push there first")
     if url.kind not in (None, snapshot.manifest.kind):
-        raise UsageError(f"{remote.describe()} holds a {snapshot.manifest.kind}, not a {url.kind}; check the name")
-    return replace(snapshot, manifest=without_front(snapshot.manifest)) if url.scheme == "hf" else snapshot
+        raise UsageError(f"{remote.name} holds a {snapshot.manifest.kind}, not a {url.kind}; check the name")
+    return replace(snapshot, manifest=without_root_copies(snapshot.manifest)) if url.scheme == "hf" else snapshot
 
 
 def _check_target(target: Path, manifest: Manifest, overwrite: bool) -> None:
@@ -183,8 +161,8 @@ def _check_space(folder: Path, size: int) -> None:
         raise NoSpaceError(f"{text}; make room there, or pull to another disk: what has been transferred is kept")
 
 
-def _land(tree: Path, target: Path, manifest: Manifest, overwrite: bool) -> None:
-    """Give the finished folder its name; a dataset's journals first, as the dataset's name says that all is there."""
+def _move_to(tree: Path, target: Path, manifest: Manifest, overwrite: bool) -> None:
+    """Rename the finished folder to the target; a dataset's journals first, as the dataset is the sign of success."""
     for checkpoints in [path for path in tree.rglob(CHECKPOINTS) if path.is_dir()]:
         name = newest(checkpoints)
         if name and not (checkpoints / LAST).exists():
@@ -215,7 +193,7 @@ def _has_journals(manifest: Manifest) -> bool:
 
 
 def _holds(beside: Path, manifest: Manifest) -> bool:
-    """Whether a folder holds exactly the manifest's journals."""
+    """Return whether a folder holds exactly the manifest's journals."""
     if not beside.is_dir():
         return False
     wanted = {path: entry for path, entry in manifest.by_path.items() if path.startswith(f"{JOURNALS}/")}
@@ -226,9 +204,5 @@ def _holds(beside: Path, manifest: Manifest) -> bool:
 
 
 def _leaves(folder: Path) -> list[Path]:
-    """Everything below that is not a folder; links are not followed."""
-    return [Path(base) / name for base, folders, names in os.walk(folder) for name in _names(base, folders, names)]
-
-
-def _names(base: str, folders: list[str], names: list[str]) -> list[str]:
-    return names + [name for name in folders if os.path.islink(os.path.join(base, name))]
+    """Return everything below that is not a folder, links included; links are not followed."""
+    return [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]

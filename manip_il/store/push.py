@@ -1,31 +1,51 @@
-"""A folder to a remote: checked, listed, uploaded, and only then seen."""
+"""A folder to a remote: checked, listed, uploaded, and only then visible."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.doctor.finding import NotWhole, Severity
 from manip_il.errors import UsageError
-from manip_il.store.front import with_front
-from manip_il.store.landing import is_whole
-from manip_il.store.manifest import Kind, Manifest
-from manip_il.store.remote import Advance, Published, Remote, Snapshot
-from manip_il.store.scan import Scanned, is_left_out, kind_of, scan
-from manip_il.store.url import RemoteUrl
+from manip_il.store.disk import hash_file, is_whole
+from manip_il.store.errors import ManifestError
+from manip_il.store.manifest import FileEntry, Kind, Manifest, check_path, fold
+from manip_il.store.remote import MANIFEST_FILE, Advance, Published, Remote, RemoteUrl, Snapshot
+
+CONFIG = "config.json"  # of every policy
+CARD = "README.md"
+JOURNALS = "journals"  # folder of a pushed dataset's journals; in a run every folder of that name holds some
+CHECKPOINTS = "checkpoints"
+LAST = "last"  # the link in `checkpoints` to the newest one: a pull makes it again
+HASHERS = 4  # threads: hashlib lets go of Python's lock
+_LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
+_POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS, "best")
+_POLICY_FOLDERS = ("", "pretrained_model", "best/pretrained_model")
+_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 
 Progress = Callable[[int, str], AbstractContextManager[Advance]]  # total [bytes] and what it is of
 
 
 @dataclass(frozen=True)
+class Scanned:
+    """A folder's manifest, and its files by their paths in the manifest."""
+
+    manifest: Manifest
+    local: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
 class Plan:
-    """What a push will do. upload: files of which the remote lacks the bytes; size: of those [bytes]."""
+    """Difference between a folder and the remote. upload: files that the remote lacks; size: of those [bytes]."""
 
     manifest: Manifest
     before: Snapshot | None
@@ -37,19 +57,20 @@ class Plan:
 def push(
     source: Path, url: RemoteUrl, remote: Remote, progress: Progress, *, journals: bool = False, dry_run: bool = False
 ) -> tuple[Plan, Published | None]:
-    """What was to be done, and what was; nothing with `dry_run`.
+    """Push a folder; return the plan and, without `dry_run`, the result.
 
-    A dataset that the doctor finds errors in is refused (`NotWhole`), in a run too; one kind over the other is not
-    pushed either (`UsageError`).
+    Raises `NotWhole` for a dataset in which the doctor finds errors, in a run too, and `UsageError` for a dataset in
+    place of a policy or the other way round.
     """
     kind = check_source(source, url)
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
-        extra = _cards(source, kind, url, Path(folder))
-        scanned = scan(source, kind, journals=journals, extra=extra)
-        if url.scheme == "hf":
-            scanned = with_front(scanned)
+        is_hub = url.scheme == "hf"  # other stores keep the folder byte for byte, without a card
+        cards = _write_cards(source, kind, url, Path(folder)) if is_hub else {}
+        scanned = scan(source, kind, journals=journals, extra=cards)
+        if is_hub:
+            scanned = with_root_copies(scanned)
         before = remote.read()
-        plan = make_plan(scanned, before, remote.describe())
+        plan = make_plan(scanned, before, remote.name)
         if dry_run:
             return plan, None
         with progress(plan.size, "push") as advance:
@@ -57,11 +78,10 @@ def push(
 
 
 def check_source(source: Path, url: RemoteUrl) -> Kind:
-    """What `source` holds, where it may be pushed to `url`."""
-    kind = kind_of(source)
+    """Return what `source` holds, if it may be pushed to `url`. Raises as `push` does."""
+    kind = _kind_of(source)
     if url.kind not in (None, kind):
-        place = url.place
-        right = f"hf://datasets/{place}" if kind == "dataset" else f"hf://{place}"
+        right = RemoteUrl("hf", url.place, kind)
         raise UsageError(f"{source} is a {kind}, {url} is for a {url.kind}; push it to {right}")
     for dataset in _datasets(source):
         findings = examine_folder(dataset)
@@ -72,40 +92,28 @@ def check_source(source: Path, url: RemoteUrl) -> Kind:
     return kind
 
 
+def _kind_of(root: Path) -> Kind:
+    if not root.is_dir():
+        raise UsageError(f"{root} is not a folder; expected the folder of a dataset or of a run")
+    if (root / INFO).is_file():
+        return "dataset"
+    if any((root / name).exists() for name in _POLICY_FILES):
+        return "policy"
+    text = f"{root} is neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_POLICY_FILES)})"
+    raise UsageError(f"{text}; name the folder that holds one")
+
+
 def _datasets(source: Path) -> Iterator[Path]:
-    """Folders of datasets: `source` itself, or those of a run's rounds."""
+    """Yield the folders of datasets: `source` itself, or those of a run's rounds."""
     for folder, names, _ in os.walk(source):
-        names[:] = sorted(name for name in names if not is_left_out(name))
+        names[:] = sorted(name for name in names if not _LEFT_OUT.fullmatch(name))
         if (Path(folder) / INFO).is_file():
             names.clear()
             yield Path(folder)
 
 
-def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
-    """Return the difference between a folder and what is there. Raises `UsageError` where another kind is there."""
-    manifest = scanned.manifest
-    if before and before.manifest.kind != manifest.kind:
-        there, here = before.manifest.kind, manifest.kind
-        raise UsageError(f"{place} holds a {there}; a {here} cannot replace it: choose another name")
-    old = before.manifest.by_path if before else {}
-    known = before.manifest.keys if before else frozenset[str]()
-    new = [entry for entry in manifest.files if not _is_known(entry.path, entry.key, known, before, scanned)]
-    gone = tuple(path for path in old if path not in manifest.by_path)
-    return Plan(manifest, before, tuple(entry.path for entry in new), sum(entry.size for entry in new), gone)
-
-
-def _is_known(path: str, key: str, known: frozenset[str], before: Snapshot | None, scanned: Scanned) -> bool:
-    """Whether the remote has these bytes; where it says only git's hash of a file, the same is computed here."""
-    if key in known:
-        return True
-    there = before.manifest.by_path.get(path) if before else None
-    return there is not None and not there.sha256 and is_whole(there, scanned.local[path])
-
-
-def _cards(source: Path, kind: Kind, url: RemoteUrl, folder: Path) -> dict[str, Path]:
-    """Files that the Hub shows a visitor; other stores show none, and keep the folder byte for byte."""
-    if url.scheme != "hf":
-        return {}
+def _write_cards(source: Path, kind: Kind, url: RemoteUrl, folder: Path) -> dict[str, Path]:
+    """Write the files that the Hub shows to a visitor into `folder`; return them by their paths in the repository."""
     from manip_il.store.cards import card_for
 
     paths: dict[str, Path] = {}
@@ -113,3 +121,130 @@ def _cards(source: Path, kind: Kind, url: RemoteUrl, folder: Path) -> dict[str, 
         paths[name] = folder / str(number)
         paths[name].write_bytes(data)
     return paths
+
+
+def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
+    """Compare a folder with the version on the remote. Raises `UsageError` if another kind is there."""
+    manifest = scanned.manifest
+    if before and before.manifest.kind != manifest.kind:
+        there, here = before.manifest.kind, manifest.kind
+        raise UsageError(f"{place} holds a {there}; a {here} cannot replace it: choose another name")
+    old = before.manifest.by_path if before else {}
+    known = before.manifest.keys if before else frozenset[str]()
+
+    def is_known(entry: FileEntry) -> bool:
+        """Return whether the remote has these bytes; if it says only git's hash of a file, this computes it here."""
+        there = old.get(entry.path)
+        return entry.key in known or bool(there and not there.sha256 and is_whole(there, scanned.local[entry.path]))
+
+    new = [entry for entry in manifest.files if not is_known(entry)]
+    gone = tuple(path for path in old if path not in manifest.by_path)
+    return Plan(manifest, before, tuple(entry.path for entry in new), sum(entry.size for entry in new), gone)
+
+
+def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None) -> Scanned:
+    """Return every file of a dataset or of a run, hashed.
+
+    journals: include a dataset's folder `<root>.journals` as `journals/`, and those inside a run. extra: files that
+    replace the folder's own, by path. Hidden files and what a killed writer left are skipped. Raises `ManifestError`
+    for links, and for what `FileEntry` refuses.
+    """
+    local = _files_below(root, journals)
+    if journals and kind == "dataset":
+        beside = root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
+        if beside.is_dir():
+            local |= {f"{JOURNALS}/{name}": path for name, path in _files_below(beside, journals).items()}
+    local |= extra or {}
+    if not local:
+        raise ManifestError(f"{root} holds no file to push; expected a dataset or a run")
+    for path in local:
+        check_path(path)
+
+    def hashed(item: tuple[str, Path]) -> FileEntry:
+        digest = hashlib.sha256()
+        size = hash_file(item[1], digest)
+        return FileEntry(item[0], size, digest.hexdigest())
+
+    with ThreadPoolExecutor(HASHERS) as pool:
+        entries = tuple(pool.map(hashed, sorted(local.items())))
+    return Scanned(Manifest(kind, entries), local)
+
+
+def _files_below(folder: Path, journals: bool) -> dict[str, Path]:
+    """Return files by their paths inside a folder."""
+    folder = folder.absolute()
+    start = len(f"{folder}/")  # a slice is ten times as quick as `relative_to`
+    return {str(path)[start:]: path for path in _walk(folder, journals)}
+
+
+def _walk(folder: Path, journals: bool) -> Iterator[Path]:
+    with os.scandir(folder) as found:
+        entries = sorted(found, key=lambda entry: entry.name)
+    for entry in entries:
+        path = Path(entry.path)
+        if _LEFT_OUT.fullmatch(entry.name) or (entry.name == JOURNALS and not journals and entry.is_dir()):
+            continue
+        if entry.is_symlink():
+            is_last = (path.parent.name, path.name) == (CHECKPOINTS, LAST)
+            if not is_last or os.readlink(path) != newest(path.parent):
+                raise ManifestError(f"{path} is a link; links are not pushed: replace it with the file itself")
+        elif entry.is_dir():
+            yield from _walk(path, journals)
+        elif entry.is_file():
+            yield path
+        else:
+            raise ManifestError(f"{path} is not a regular file; move it out of the folder")
+
+
+def newest(checkpoints: Path) -> str | None:
+    """Return the name of the checkpoint with the highest step."""
+    steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
+    return max(steps, key=int, default=None)
+
+
+def policy_folder(paths: Iterable[str]) -> str | None:
+    """Return the folder of a run's policy among its files' `paths`: empty for the root, None without a policy.
+
+    The best one, if the run has chosen it; else that of the newest checkpoint.
+    """
+    folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
+    for folder in _POLICY_FOLDERS:
+        if folder in folders:
+            return folder
+    steps = {folder: int(found[1]) for folder in folders if (found := _CHECKPOINT.fullmatch(folder))}
+    return max(steps, key=lambda folder: steps[folder], default=None)
+
+
+def with_root_copies(scanned: Scanned) -> Scanned:
+    """Return a run with copies of its policy's files at the root, where LeRobot looks for them on the Hub.
+
+    The Hub stores equal bytes once. A run that has any file of such a name at its root is left as it is.
+    """
+    manifest = scanned.manifest
+    inside = _policy_files(manifest)
+    taken = {fold(path.partition("/")[0]) for path in manifest.by_path}
+    if not inside or any(fold(name) in taken for name in inside):
+        return scanned
+    copies = tuple(replace(entry, path=name) for name, entry in inside.items())
+    local = {**scanned.local, **{name: scanned.local[entry.path] for name, entry in inside.items()}}
+    return Scanned(replace(manifest, files=manifest.files + copies), local)
+
+
+def without_root_copies(manifest: Manifest) -> Manifest:
+    """Return a run without the copies at its root, if all are there with the same bytes."""
+    inside, there = _policy_files(manifest), manifest.by_path
+    if any(name not in there or there[name].key != entry.key for name, entry in inside.items()):
+        return manifest
+    return replace(manifest, files=tuple(entry for entry in manifest.files if entry.path not in inside))
+
+
+def _policy_files(manifest: Manifest) -> Mapping[str, FileEntry]:
+    """Return name -> file of a run's policy; empty for a dataset, and for a policy that is at the root alone."""
+    if manifest.kind != "policy":
+        return {}
+    folder = policy_folder(path for path in manifest.by_path if path != CONFIG)
+    if folder is None:
+        return {}
+    start = f"{folder}/"
+    inside = {path.removeprefix(start): entry for path, entry in manifest.by_path.items() if path.startswith(start)}
+    return {name: entry for name, entry in inside.items() if "/" not in name and name != CARD}

@@ -1,4 +1,4 @@
-"""A bucket of any store that speaks S3: `s3://bucket/demos`. Endpoint and keys are those of every other S3 program."""
+"""Objects in a bucket of any S3 store: `s3://bucket/demos`, with the endpoint and keys of every other S3 program."""
 
 from __future__ import annotations
 
@@ -10,23 +10,19 @@ import secrets
 from collections.abc import Awaitable, Callable, Generator, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from fsspec.asyn import sync
 from s3fs import S3FileSystem
 
 from manip_il.errors import UsageError
-from manip_il.store import s3_session
-from manip_il.store.blobs import OBJECTS, STALE, Stored
-from manip_il.store.errors import AuthError, NotFoundError, RemoteError, TransientError
+from manip_il.store import s3_client
+from manip_il.store.errors import AuthError, NotFoundError, Pace, RemoteError, TransientError
 from manip_il.store.manifest import LONGEST_TEXT
-from manip_il.store.object_store import ObjectRemote, in_threads, wrong_when_read
-from manip_il.store.pace import Pace
-from manip_il.store.remote import MANIFEST_FILE, Advance
-from manip_il.store.s3_errors import code_of, explained, status_of
-from manip_il.store.s3_session import read_paced
-from manip_il.store.s3_upload import Part, abort_old, is_as_sent, send_parts
-from manip_il.store.url import RemoteUrl
+from manip_il.store.object_store import OBJECTS, STALE, Stored, in_threads, wrong_when_read
+from manip_il.store.remote import MANIFEST_FILE, Advance, RemoteUrl, Sink
+from manip_il.store.s3_client import code_of, read_paced, status_of, translate
+from manip_il.store.s3_upload import abort_old, is_as_sent, md5_of, send_parts
 
 CHUNK = 2**20  # of what is read at a time, at most [bytes]
 MULTIPART = 2**26  # from this size on a file goes in parts [bytes]
@@ -37,36 +33,27 @@ _IGNORED = "ignores conditional writes: two pushes at once can overwrite each ot
 Call = Callable[..., Awaitable[Any]]
 
 
-def open_s3(url: RemoteUrl) -> ObjectRemote:
-    """Return the remote of an `s3://` URL."""
-    return ObjectRemote(S3Blobs(url))
-
-
 class S3Blobs:
-    """`Blobs` in a bucket. Two pushes are kept apart by If-Match and If-None-Match, where the store knows them."""
+    """`Blobs` in a bucket. Two pushes are kept apart by If-Match and If-None-Match, if the store honours them."""
 
     threads = 8
 
     def __init__(self, url: RemoteUrl):
-        self._name = str(url)
+        self.name = str(url)
         self._bucket, _, self._prefix = url.place.partition("/")
         self.warnings: tuple[str, ...] = ()
-        self._honours: bool | None = None  # conditions; None until it was tried
-        self._left: list[str] = []  # what killed pushes left
-        # Botocore's and s3fs' own tries are switched off: `Retry` knows what the server asked for.
+        self._honours_conditions: bool | None = None  # None until it was tried
+        self._left: list[str] = []  # keys that killed pushes left
+        # Botocore's and s3fs' own retries are switched off: `Retry` waits as the server asks.
         config: dict[str, Any] = {**TIMEOUTS, "retries": {"total_max_attempts": 1}, "max_pool_connections": 32}
-        config["http_session_cls"] = s3_session.BoundedSession
+        config["http_session_cls"] = s3_client.BoundedSession
         config |= {"request_checksum_calculation": "when_required", "response_checksum_validation": "when_required"}
         self._fs = S3FileSystem(config_kwargs=config, skip_instance_cache=True, use_listings_cache=False)
-
-    def describe(self) -> str:
-        """Return the URL."""
-        return self._name
 
     def manifest(self) -> tuple[bytes, str] | None:
         """Return content and ETag."""
         try:
-            return self._run(self._get_manifest, f"read {self._name}")
+            return self._run(self._get_manifest, f"read {self.name}")
         except NotFoundError as error:
             if "no bucket" in str(error):
                 raise
@@ -76,16 +63,16 @@ class S3Blobs:
         """Refuse a place that holds something else; find out whether conditions are honoured."""
         names = self._names()
         if names and not names & {MANIFEST_FILE, f"{OBJECTS}/"}:
-            raise UsageError(f"{self._name} holds other files; name an empty folder of the bucket to push to")
-        if self._honours is None:
-            self._honours = self._try_conditions()
-            if not self._honours:
-                self.warnings = (*self.warnings, f"the store of {self._name} {_IGNORED}")
+            raise UsageError(f"{self.name} holds other files; name an empty folder of the bucket to push to")
+        if self._honours_conditions is None:
+            self._honours_conditions = self._try_conditions()
+            if not self._honours_conditions:
+                self.warnings = (*self.warnings, f"the store of {self.name} {_IGNORED}")
 
     def swap(self, data: bytes, before: str | None, needed: Mapping[str, int]) -> str | None:
-        """Replace the manifest where it still has the ETag `before`; None where it has not."""
+        """Replace the manifest if it still has the ETag `before`, and return its own; else None."""
         condition = {"IfMatch": before} if before else {"IfNoneMatch": "*"}
-        if not self._honours:
+        if not self._honours_conditions:
             found = self.manifest()
             if (found[1] if found else None) != before:
                 return None
@@ -100,62 +87,58 @@ class S3Blobs:
                     return None
                 raise
             if "ETag" not in answer:
-                raise RemoteError(f"{self._name}: the store's answer has no ETag; what it stored cannot be told")
+                raise RemoteError(f"{self.name}: the store's answer has no ETag; what it stored cannot be told")
             return str(answer["ETag"])
 
-        return self._run(put, f"write to {self._name}")
+        return self._run(put, f"write to {self.name}")
 
-    def fetch(self, key: str, target: BinaryIO, offset: int) -> None:
-        """One GET, from `offset` on."""
+    def fetch(self, key: str, target: Sink, offset: int) -> None:
+        """Read an object from `offset` on, by one GET."""
         span = {"Range": f"bytes={offset}-"} if offset else {}
 
         async def copy(client: Any) -> None:
-            answer = await client.get_object(**self._at_key(key), **span)
+            answer = await client.get_object(**self._object(key), **span)
             body = answer["Body"]
             try:
                 if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
-                    text = f"{self._name}: the store supports no byte ranges; remove the .pulling folder and pull again"
+                    text = f"{self.name}: the store supports no byte ranges; remove the .pulling folder and pull again"
                     raise RemoteError(text)
-                pace = Pace(self._name)
+                pace = Pace(self.name)
                 while chunk := await read_paced(body, CHUNK, pace):
                     target.write(chunk)
             finally:
                 body.close()
 
-        self._run(copy, f"read {self._name}")
+        self._run(copy, f"read {self.name}")
 
     def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
-        """Send, and compare what the store says it got; False where it says nothing that can be compared."""
-        what = f"write to {self._name}"
+        """Send a file and compare what the store says it received; return False if it says nothing comparable."""
+        what, place = f"write to {self.name}", self._object(key)
         if size >= MULTIPART:
-            verified, digest = self._run(lambda client: send_parts(client, self._at_key(key), source, advance), what)
+            verified, digest = self._run(lambda client: send_parts(client, place, source, advance), what)
         else:
             data = source.read_bytes()
-            part, digest = Part.of(data), hashlib.sha256(data).hexdigest()
+            verified, digest = False, hashlib.sha256(data).hexdigest()
             if digest == key:
                 checksum = base64.b64encode(bytes.fromhex(key)).decode()
-                answer = self._run(
-                    lambda client: client.put_object(**self._at_key(key), Body=data, ChecksumSHA256=checksum), what
-                )
-                verified = is_as_sent(answer, part, checksum)
+                answer = self._run(lambda client: client.put_object(**place, Body=data, ChecksumSHA256=checksum), what)
+                verified = is_as_sent(answer, md5_of(data), checksum)
                 advance(size)
-            else:
-                verified = False
         if digest != key:
             raise RemoteError(f"{source} changed while it was being pushed; push again when nobody writes to it")
         if verified is False:
-            raise TransientError(f"{self._name} did not receive the bytes that were sent")
+            raise TransientError(f"{self.name} did not receive the bytes that were sent")
         return verified is True
 
     def find(self, keys: Iterable[str]) -> dict[str, Stored]:
-        """Those of `keys` that are there."""
+        """Return those of `keys` that are there."""
 
         def one(key: str) -> Stored | None:
             try:
-                answer = self._run(lambda client: client.head_object(**self._at_key(key)), f"read {self._name}")
+                answer = self._run(lambda client: client.head_object(**self._object(key)), f"read {self.name}")
             except NotFoundError:
                 return None
-            with self._speaking_s3():
+            with self._checked():
                 return Stored(int(answer["ContentLength"]), _age(answer["LastModified"], answer))
 
         return {key: stored for key, stored in in_threads(self.threads, one, keys).items() if stored}
@@ -164,7 +147,7 @@ class S3Blobs:
         """Return every object."""
         found: dict[str, Stored] = {}
         self._left = []
-        with self._speaking_s3():
+        with self._checked():
             for answer in self._pages(f"{self._prefix}/{OBJECTS}/"):
                 for item in answer.get("Contents", ()):
                     key, age = item["Key"].rpartition("/")[2], _age(item["LastModified"], answer)
@@ -175,7 +158,7 @@ class S3Blobs:
         return found
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
-        """Those that are not what their name says: read back, as no store tells a sha256 that can be relied on."""
+        """Return those that have other bytes: read back, as no store reports a reliable sha256."""
         return wrong_when_read(self, sizes)
 
     def remove(self, keys: Iterable[str], token: str) -> None:
@@ -183,51 +166,51 @@ class S3Blobs:
         found = self.manifest()
         if found is None or found[1] != token:
             return
-        doomed, what = [self._at_key(key)["Key"] for key in keys] + self._left, f"remove old files from {self._name}"
+        doomed, what = [self._object(key)["Key"] for key in keys] + self._left, f"remove old files from {self.name}"
 
         def one(key: str) -> None:
             self._run(lambda client: client.delete_object(Bucket=self._bucket, Key=key), what)
 
         in_threads(self.threads, one, doomed)
         place = f"{self._prefix}/{OBJECTS}/"
-        self._run(lambda client: abort_old(client, self._bucket, place, _is_stale), what)
+        self._run(lambda client: abort_old(client, self._bucket, place, lambda *began: _age(*began) > STALE), what)
 
     def _names(self) -> set[str]:
         try:
             answer = next(iter(self._pages(f"{self._prefix}/", Delimiter="/", MaxKeys=20)))
         except AuthError:
             return set()  # a key may write without seeing what is there
-        with self._speaking_s3():
+        with self._checked():
             names = [item["Key"] for item in answer.get("Contents", ())]
             names += [item["Prefix"] for item in answer.get("CommonPrefixes", ())]
             return {name.removeprefix(f"{self._prefix}/") for name in names}
 
     @contextlib.contextmanager
-    def _speaking_s3(self) -> Generator[None]:
-        """What an answer lacks, or has of the wrong type, is the store's fault."""
+    def _checked(self) -> Generator[None]:
+        """Raise `RemoteError` if an answer lacks something or has it of the wrong type."""
         try:
             yield
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            text = f"{self._name}: the store answered something that S3 does not ({type(error).__name__})"
+            text = f"{self.name}: the store answered something that S3 does not ({type(error).__name__})"
             raise RemoteError(f"{text}; check AWS_ENDPOINT_URL") from error
 
     def _pages(self, prefix: str, **more: Any) -> Iterable[Mapping[str, Any]]:
         token: dict[str, str] = {}
-        for _ in range(s3_session.MOST_PAGES):
+        for _ in range(s3_client.MOST_PAGES):
             answer = self._run(
                 lambda client, token=token: client.list_objects_v2(Bucket=self._bucket, Prefix=prefix, **more, **token),
-                f"list {self._name}",
+                f"list {self.name}",
             )
             yield answer
             if not answer.get("IsTruncated"):
                 return
             before, token = token, {"ContinuationToken": answer["NextContinuationToken"]}
             if token == before:
-                raise RemoteError(f"cannot list {self._name}: the store goes on from where it was; does it speak S3?")
-        raise RemoteError(f"cannot list {self._name}: it has more than {s3_session.MOST_PAGES:,} pages")
+                raise RemoteError(f"cannot list {self.name}: the store goes on from where it was; does it speak S3?")
+        raise RemoteError(f"cannot list {self.name}: it has more than {s3_client.MOST_PAGES:,} pages")
 
     def _try_conditions(self) -> bool:
-        """Whether writes that must be refused are: on an object that nobody else knows."""
+        """Return whether conditional writes are refused when they must be, by trying them on an object of our own."""
         place = self._at(f"{OBJECTS}/probe-{secrets.token_hex(8)}")
 
         async def refused(client: Any, condition: Mapping[str, str]) -> bool:
@@ -249,12 +232,12 @@ class S3Blobs:
             finally:
                 await client.delete_object(**place)
 
-        return self._run(probe, f"write to {self._name}")
+        return self._run(probe, f"write to {self.name}")
 
     async def _get_manifest(self, client: Any) -> tuple[bytes, str]:
         answer = await client.get_object(**self._at(MANIFEST_FILE))
         data = bytearray()
-        pace = Pace(self._name)
+        pace = Pace(self.name)
         while len(data) <= LONGEST_TEXT and (piece := await read_paced(answer["Body"], CHUNK, pace)):
             data += piece
         return bytes(data), str(answer["ETag"])
@@ -262,11 +245,11 @@ class S3Blobs:
     def _at(self, name: str) -> dict[str, str]:
         return {"Bucket": self._bucket, "Key": f"{self._prefix}/{name}"}
 
-    def _at_key(self, key: str) -> dict[str, str]:
+    def _object(self, key: str) -> dict[str, str]:
         return self._at(f"{OBJECTS}/{key[:2]}/{key}")
 
     def _run(self, work: Call, what: str) -> Any:
-        """The result of a coroutine that is given the client; its errors explained."""
+        """Return the result of a coroutine that gets the client; raise its errors as ours."""
 
         async def run() -> Any:
             await self._fs.set_session()
@@ -277,19 +260,15 @@ class S3Blobs:
         except RemoteError:
             raise
         except Exception as error:
-            raise explained(error, what, self._bucket) from None
+            raise translate(error, what, self._bucket) from None
 
 
 def _is_refused(error: Exception) -> bool:
     return status_of(error) == 412 or code_of(error) == "PreconditionFailed"
 
 
-def _is_stale(began: datetime, answer: Mapping[str, Any]) -> bool:
-    return _age(began, answer) > STALE
-
-
 def _age(modified: datetime, answer: Mapping[str, Any]) -> float:
-    """Seconds since, by the store's own clock where it tells it."""
+    """Return the time since `modified` [s], by the store's own clock if it sends it."""
     from email.utils import parsedate_to_datetime
 
     try:

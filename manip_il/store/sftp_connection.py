@@ -1,7 +1,8 @@
-"""One ssh connection with as many sftp channels as threads; cut ones are made again.
+"""One ssh connection with an sftp channel for each thread, made again when it is cut, and pipelined reads.
 
-paramiko itself and not fsspec's wrapper, which takes any host key for the right one and cannot make a file only where
-there is none.
+It uses paramiko itself: fsspec's wrapper trusts any host key and cannot make a file only where there is none. Reads are
+our own, as paramiko's `prefetch` would not do: it asks from a second thread, and when the reader overtakes that one,
+the rest of the file is read one request at a time and everything is sent twice.
 """
 
 from __future__ import annotations
@@ -11,24 +12,30 @@ import errno
 import logging
 import socket
 import threading
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import paramiko
+from paramiko.sftp import CMD_DATA, CMD_READ, CMD_STATUS, SFTPError, int64
 from paramiko.ssh_exception import NoValidConnectionsError
 
 from manip_il.store.errors import AuthError, NoSpaceError, NotFoundError, RemoteError, TransientError, redact
-from manip_il.store.url import RemoteUrl
+from manip_il.store.remote import RemoteUrl
 
 Sftp = paramiko.SFTPClient
 TIMEOUT = 30.0  # of connecting, and of any one answer [s]
-PACKET = 2**16  # that is taken; the default splits an answer of 32 kB [bytes]
-_ASK = "ssh-add your key, name it in ~/.ssh/config, or put the user name into the URL"
+PACKET = 2**16  # largest that is accepted; the default splits an answer of 32 kB [bytes]
+_LOGIN = "ssh-add your key, name it in ~/.ssh/config, or put the user name into the URL"
+_CUT = (errno.ECONNRESET, errno.EPIPE, errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ECONNABORTED)
+REQUEST = 2**17  # of one read, if the server sends as much [bytes]
+SMALLEST = 2**15  # of one read, which every server must send [bytes]
+PENDING = 2**22  # of all reads without an answer: twice the window of ssh [bytes]
 
 
 class Connection:
-    """Made when it is first needed."""
+    """Connection to one host, made when it is first needed."""
 
     def __init__(self, url: RemoteUrl):
         self._url = url
@@ -38,24 +45,24 @@ class Connection:
 
     @contextlib.contextmanager
     def sftp(self, what: str) -> Generator[Sftp]:
-        """A channel for one thread; errors inside are explained, and a cut connection is forgotten."""
+        """Give a channel to one thread; translate errors inside, and forget a cut connection."""
         channel: Sftp | None = None
         client: paramiko.SSHClient | None = None
         try:
             client, channel = self._take()
             yield channel
         except (RemoteError, OSError, EOFError, paramiko.SSHException) as error:
-            explained = error if isinstance(error, RemoteError) else self._explained(error, what)
-            if isinstance(explained, TransientError):
+            ours = error if isinstance(error, RemoteError) else self._translate(error, what)
+            if isinstance(ours, TransientError):
                 self._forget(client)
             else:
-                self._give(client, channel)
-            raise explained from None
+                self._give_back(client, channel)
+            raise ours from None
         else:
-            self._give(client, channel)
+            self._give_back(client, channel)
 
-    def answer(self, command: str, data: bytes, seconds: float) -> str:
-        """What a command prints that is given `data`; nothing where the other side runs no commands."""
+    def run(self, command: str, data: bytes, seconds: float) -> str:
+        """Return what a command prints that reads `data`; nothing if the other side runs no commands."""
         try:
             with self._lock:
                 client = self._connected()
@@ -75,13 +82,13 @@ class Connection:
         channel.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
         return client, channel
 
-    def _give(self, client: paramiko.SSHClient | None, channel: Sftp | None) -> None:
+    def _give_back(self, client: paramiko.SSHClient | None, channel: Sftp | None) -> None:
         with self._lock:
             if channel is not None and client is self._client:
                 self._idle.append(channel)
 
     def _forget(self, client: paramiko.SSHClient | None) -> None:
-        """Close the connection that failed; not the new one that another thread may have made meanwhile."""
+        """Close the connection that failed, but not a new one that another thread has made meanwhile."""
         with self._lock:
             transport = self._client.get_transport() if self._client else None
             if client is not self._client and transport is not None and transport.is_active():
@@ -116,14 +123,14 @@ class Connection:
         self._client = client
         return client
 
-    def _explained(self, error: Exception, what: str) -> RemoteError:
+    def _translate(self, error: Exception, what: str) -> RemoteError:
         host, what = self._url.host, f"cannot {what}"
         if isinstance(error, paramiko.BadHostKeyException):
             return AuthError(
                 f"{what}: {host} has a different key than in ~/.ssh/known_hosts; make sure that it is {host}"
             )
         if isinstance(error, paramiko.AuthenticationException) or "No authentication methods" in str(error):
-            return AuthError(f"{what}: {host} rejected this user's login; {_ASK}")
+            return AuthError(f"{what}: {host} rejected this user's login; {_LOGIN}")
         if "not found in known_hosts" in str(error):
             return AuthError(f"{what}: {host} is not in ~/.ssh/known_hosts; run ssh {host} once, and check its key")
         if isinstance(error, socket.gaierror):
@@ -147,11 +154,8 @@ class Connection:
         return RemoteError(f"{what}: {text or type(error).__name__}")
 
 
-_CUT = (errno.ECONNRESET, errno.EPIPE, errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ECONNABORTED)
-
-
 def quick_transport(sock: Any, /, **more: Any) -> paramiko.Transport:
-    """Return the quickest ciphers first, and answers to a read in one packet each."""
+    """Return a transport with the quickest ciphers first, and with one packet for each answer to a read."""
     transport = paramiko.Transport(sock, default_max_packet_size=PACKET, **more)
     options = transport.get_security_options()
     options.ciphers = sorted(options.ciphers, key=lambda name: "gcm" not in name)
@@ -168,3 +172,66 @@ def _feed(stdin: paramiko.ChannelFile, data: bytes) -> None:
     with contextlib.suppress(OSError, EOFError):
         stdin.write(data)
         stdin.channel.shutdown_write()
+
+
+def read_ahead(sftp: Sftp, file: paramiko.SFTPFile, offset: int, size: int) -> Iterator[bytes]:
+    """Yield the bytes of an open file from `offset` up to `size`, in order; fewer if it ends before.
+
+    One thread sends all requests and takes all answers. Raises what paramiko does.
+    """
+    reads = _Reads(sftp, file)
+    first = reads.wait(reads.request(offset, min(REQUEST, size - offset))) if offset < size else b""
+    if not first:
+        return
+    yield first
+    requested, most = offset + len(first), max(len(first), SMALLEST)  # a server that sent less always will
+    pending = deque[tuple[int, int, int]]()
+    while requested < size or pending:
+        while requested < size and len(pending) * most < PENDING:
+            length = min(most, size - requested)
+            pending.append((reads.request(requested, length), requested, length))
+            requested += length
+        number, start, length = pending.popleft()
+        data = reads.wait(number)
+        while len(data) < length:
+            rest = reads.wait(reads.request(start + len(data), length - len(data)))
+            if not rest:
+                yield data
+                return
+            data += rest
+        yield data
+
+
+class _Reads:
+    """Read requests on one file: paramiko calls `_async_response` with each answer that it reads off the channel."""
+
+    def __init__(self, sftp: Sftp, file: paramiko.SFTPFile):
+        self._sftp: Any = sftp
+        self._handle = file.handle
+        self._found: dict[int, bytes | Exception] = {}
+
+    def request(self, offset: int, length: int) -> int:
+        """Send one request; return its number."""
+        return self._sftp._async_request(self, CMD_READ, self._handle, int64(offset), length)
+
+    def wait(self, number: int) -> bytes:
+        """Return the answer to a request; nothing at the end of the file."""
+        while number not in self._found:
+            self._sftp._read_response()
+        found = self._found.pop(number)
+        if isinstance(found, EOFError):
+            return b""
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def _async_response(self, kind: int, message: Any, number: int) -> None:
+        if kind == CMD_DATA:
+            self._found[number] = message.get_string()
+            return
+        try:
+            if kind == CMD_STATUS:
+                self._sftp._convert_status(message)
+            raise SFTPError(f"expected data, found a message of kind {kind}")
+        except (OSError, EOFError, SFTPError) as error:
+            self._found[number] = error

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from manip_il.cli.main import main
 from manip_il.store.errors import RemoteError, mask
-from manip_il.store.url import RemoteUrl
+from manip_il.store.remote import RemoteUrl
 
 LETTERS = "abcdefgijkmnqtuvwyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789@:/%#?[]!&=+.~-_\\'\"$ "
 SECRETS = st.text(LETTERS, min_size=8, max_size=20).filter(lambda text: text == text.strip())
@@ -40,7 +40,7 @@ def _nowhere():
         raise RemoteError(f"cannot reach {url}, {url!r}")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("manip_il.store.url.open_remote", refuse)
+        patch.setattr("manip_il.store.remote.open_remote", refuse)
         yield
 
 

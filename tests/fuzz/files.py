@@ -157,7 +157,7 @@ def _resume_dagger(folder: Path) -> None:
 
 
 def _command_of_card(folder: Path) -> None:
-    from manip_il.store.card_text import command as written
+    from manip_il.store.cards import command as written
 
     written(folder / "run" / "config.yaml")
 

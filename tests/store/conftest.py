@@ -8,10 +8,13 @@ from pathlib import Path
 import boto3
 import pytest
 
+from ..synthetic import make_episode, offline, spec
 from .hub_server import Hub
 from .hub_use import a_hub, make_policy
 from .s3 import KEY, SECRET, Proxy, running_moto, running_proxy, variables
 from .sshd import Sshd, running_sshd
+
+__all__ = ["make_episode", "offline", "spec"]
 
 
 @pytest.fixture(scope="session")
@@ -45,16 +48,21 @@ def proxy(bucket: str, moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
         yield running
 
 
-@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow)])
-def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A URL where nothing is yet, on each kind of store."""
-    if request.param == "s3":
+def url_on(kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A URL where nothing is yet, on a kind of store."""
+    if kind == "s3":
         return f"s3://{request.getfixturevalue('bucket')}/some/demos"
-    if request.param == "file":
+    if kind == "file":
         return f"file://{tmp_path}/store/demos"
     server: Sshd = request.getfixturevalue("sshd")
     monkeypatch.setenv("HOME", str(server.home))
     return server.url(tmp_path / "store" / "demos")
+
+
+@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow)])
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A URL where nothing is yet, on each kind of store."""
+    return url_on(request.param, request, tmp_path, monkeypatch)
 
 
 @pytest.fixture

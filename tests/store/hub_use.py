@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
+from manip_il.store.errors import Retry
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
-from manip_il.store.remote import Published
-from manip_il.store.retry import Retry
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import MANIFEST_FILE, Published, RemoteUrl, open_remote
 
 from ..learn.tiny_policies import write_checkpoint
 from .hub_server import Hub, hub_server
+from .trees import unwatched
 
 TOKEN = "hf_NobodyMayEverReadThisToken"
 DATASET = "hf://datasets/user/demos"
@@ -37,26 +37,23 @@ def a_hub(folder: Path, token: str = TOKEN) -> Iterator[Hub]:
         yield hub
 
 
-@contextlib.contextmanager
-def silent(total: int, what: str) -> Iterator:
-    yield lambda count: None
-
-
 def do_push(source: Path, url: str = DATASET, *, private: bool = False) -> Published:
     parsed = RemoteUrl.parse(url)
-    published = push(source, parsed, open_remote(parsed, private=private), silent)[1]
+    published = push(source, parsed, open_remote(parsed, private=private), unwatched)[1]
     assert published is not None
     return published
 
 
 def do_pull(target: Path, url: str = DATASET) -> Pulled:
     parsed = RemoteUrl.parse(url)
-    return pull(parsed, open_remote(parsed), target, silent, retry=Retry(first=0.01))
+    return pull(parsed, open_remote(parsed), target, unwatched, retry=Retry(first=0.01))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    """Path -> bytes of every file."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def files_of_main(hub: Hub) -> dict[str, bytes]:
+    """Path -> bytes of what a reader of the dataset's main branch sees."""
+    repo = hub.repo("datasets/user/demos")
+    tree = repo.tree(repo.refs("heads")["main"])
+    return {path: repo.read(blob) for path, blob in tree.items() if path not in (MANIFEST_FILE, ".gitattributes")}
 
 
 def copy_sample(target: Path) -> Path:

@@ -1,11 +1,10 @@
 """A process that forks pushes and pulls and kills them: run by `test_kills`, as that has servers' threads of its own.
 
-Reads a line of JSON a command ({"do", "url", "folder", "after"}), answers with one: how the child ended.
+Reads one JSON object a line ({"do", "url", "folder", "after"}); answers with one that says how the child ended.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -13,26 +12,26 @@ import sys
 import time
 from pathlib import Path
 
-from manip_il.store import file_store, s3_store, sftp_lock, sftp_store
+from manip_il.store import cards, file_store, hub, s3_store, sftp_store
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl, open_remote
 
-IMPORTED = (file_store, s3_store, sftp_store)  # before the fork, so that a kill meets work and not imports
+from .trees import unwatched
+
+IMPORTED = (cards, file_store, hub, s3_store, sftp_store)  # before the fork, so that a kill meets work and not imports
 
 
-def work(do: str, url: RemoteUrl, folder: Path) -> None:
-    def silent(total: int, what: str):
-        return contextlib.nullcontext(lambda _: None)
-
+def work(do: str, text: str, folder: Path) -> None:
+    url = RemoteUrl.parse(text)
     if do == "push":
-        push(folder, url, open_remote(url), silent)
+        push(folder, url, open_remote(url), unwatched)
     else:
-        pull(url, open_remote(url), folder, silent)
+        pull(url, open_remote(url), folder, unwatched)
 
 
 def main() -> None:
-    sftp_lock.LOCK_STALE, sftp_lock.LOCK_REFRESH = 1.5, 0.3  # many locks are left here
+    sftp_store.LOCK_STALE, sftp_store.LOCK_REFRESH = 1.5, 0.3  # many locks are left here
     for line in sys.stdin:
         command = json.loads(line)
         start = time.monotonic()
@@ -40,10 +39,11 @@ def main() -> None:
         if child == 0:
             code = 1
             try:
-                work(command["do"], RemoteUrl.parse(command["url"]), Path(command["folder"]))
+                work(command["do"], command["url"], Path(command["folder"]))
                 code = 0
-            finally:
-                os._exit(code)
+            except BaseException as error:
+                print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            os._exit(code)
         if command["after"] is not None:
             time.sleep(command["after"])
             os.kill(child, signal.SIGKILL)  # a child that has ended is still ours to wait for

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+import pytest
+
+from manip_il.cli.main import main
 
 Script = Callable[[str], Iterable[bytes]]  # "GET /path?query" -> all that is sent
 
@@ -75,7 +82,7 @@ def a_liar(script: Script) -> Iterator[Liar]:
 
 
 def answer(value: Any = b"", status: str = "200 OK", **headers: str) -> list[bytes]:
-    """A whole answer; what is no bytes goes as JSON."""
+    """A whole answer; anything but bytes goes as JSON."""
     body = value if isinstance(value, bytes) else json.dumps(value).encode()
     return [head(status, **{"Content-Length": str(len(body)), **headers}), body]
 
@@ -85,3 +92,35 @@ def head(status: str = "200 OK", **headers: str) -> bytes:
     given = {"Connection": "close", "Content_Type": "application/json", **headers}
     lines = [f"{name.replace('_', '-')}: {value}" for name, value in given.items()]
     return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
+
+
+def drip(line: str) -> Iterator[bytes]:
+    """A body without an end, a byte at a time."""
+    yield head(Content_Length="100000000", ETag='"1"')
+    while True:
+        time.sleep(0.01)
+        yield b" "
+
+
+def drip_headers(line: str) -> Iterator[bytes]:
+    """Headers without an end, a byte at a time."""
+    yield b"HTTP/1.1 200 OK\r\nX-Slow: "
+    while True:
+        time.sleep(0.01)
+        yield b"x"
+
+
+def endless(piece: bytes, status: str = "200 OK", **headers: str) -> Iterator[bytes]:
+    """The same piece for ever."""
+    return itertools.chain([head(status, **headers)], itertools.repeat(piece))
+
+
+def error_of_pull(url: str, folder: Path, capsys: pytest.CaptureFixture[str], token: str) -> str:
+    """The one line that a pull ends in, without the token; nothing is left of it."""
+    assert main(["pull", url, str(folder / "got"), "--quiet"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1, error
+    assert len(error) < 1000
+    assert token not in error
+    assert not (folder / "got").exists()
+    return error

@@ -16,8 +16,8 @@ from PIL import Image
 from manip_il.data.lerobot_read import read_spec
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.store.card_strip import read_paths
-from manip_il.store.cards import CARD, STRIP, card_for
+from manip_il.store.card_dataset import read_paths
+from manip_il.store.cards import CARD, PICTURE, card_for
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -50,10 +50,10 @@ def test_the_datasets_card_is_what_the_hub_reads():
 
 def test_the_picture_is_a_png_that_the_card_shows_by_a_relative_link():
     files = card_for(SAMPLE, "dataset", URL)
-    picture = Image.open(io.BytesIO(files[STRIP]))
+    picture = Image.open(io.BytesIO(files[PICTURE]))
     assert picture.format == "PNG"
     assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 50
-    assert f"]({STRIP})" in files[CARD].decode()
+    assert f"]({PICTURE})" in files[CARD].decode()
 
 
 def test_the_drawn_paths_begin_and_end_where_the_cubes_do():
@@ -126,7 +126,7 @@ def test_a_card_that_somebody_wrote_is_kept_and_one_of_ours_is_made_again(tmp_pa
     copy = tmp_path / "demos"
     shutil.copytree(SAMPLE, copy)
     (copy / CARD).write_text("# My own words\n")
-    assert set(card_for(copy, "dataset", URL)) == {STRIP}
+    assert set(card_for(copy, "dataset", URL)) == {PICTURE}
     (copy / CARD).write_bytes(card_for(SAMPLE, "dataset", "hf://datasets/user/old")[CARD])
     assert b"user/demos" in card_for(copy, "dataset", URL)[CARD]
 

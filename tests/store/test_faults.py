@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import shutil
-import socket
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from manip_il.store import file_store, sftp_lock
+from manip_il.store import file_store
 from manip_il.store.errors import (
     AuthError,
     HashError,
@@ -21,14 +17,12 @@ from manip_il.store.errors import (
     RemoteError,
     TransientError,
     redact,
+    retry_after,
 )
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.retry import Retry, retry_after
-from manip_il.store.sftp_store import SftpBlobs
 
 from .s3 import KEY, SECRET, Fault, Proxy
-from .sshd import Sshd
 from .trees import content, impatient, make_run, no_wait, unwatched
 
 OBJECT, MANIFEST = "/objects/[0-9a-f]{2}/", "manip_il_manifest"
@@ -128,16 +122,25 @@ def test_no_such_bucket(bucket: str, tmp_path: Path) -> None:
             work()
 
 
-def test_nobody_is_logged_in(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
-    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
-    with pytest.raises(AuthError, match="not logged in; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"):
-        impatient(f"s3://{bucket}/demos")[1].read()
+LOGIN = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
 
 
-def test_nobody_answers(monkeypatch: pytest.MonkeyPatch, bucket: str) -> None:
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    with pytest.raises(RemoteError, match=r"no answer from http://127\.0\.0\.1:9"):
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        (LOGIN, "not logged in; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
+        ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, r"no answer from http://127\.0\.0\.1:9"),
+    ],
+    ids=["nobody is logged in", "nobody answers"],
+)
+def test_an_environment_that_leads_nowhere(
+    variables: dict[str, str], words: str, bucket: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+        if not value:
+            monkeypatch.delenv(name)
+    with pytest.raises(AuthError if variables is LOGIN else RemoteError, match=words):
         impatient(f"s3://{bucket}/demos")[1].read()
 
 
@@ -188,7 +191,7 @@ def test_an_object_that_is_gone_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from manip_il.store.scan import scan
+    from manip_il.store.push import scan
 
     run = make_run(tmp_path / "run", 1)
     _, remote = impatient(place)
@@ -232,149 +235,33 @@ class _Short:
         self.left -= min(self.left, len(data))
 
 
-@contextlib.contextmanager
-def relay(port: int, cut_after: list[int]) -> Iterator[int]:
-    """A port that leads to another; each connection is cut after so many bytes of the client, the last ones never."""
-    server = socket.create_server(("127.0.0.1", 0))
-
-    def pump(source: socket.socket, sink: socket.socket, left: float) -> None:
-        with contextlib.suppress(OSError):
-            while left > 0 and (data := source.recv(65536)):
-                sink.sendall(data)
-                left -= len(data)
-        for end in (source, sink):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def accept() -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                client, _ = server.accept()
-                there = socket.create_connection(("127.0.0.1", port))
-                left = cut_after.pop(0) if cut_after else float("inf")
-                threading.Thread(target=pump, args=(client, there, left), daemon=True).start()
-                threading.Thread(target=pump, args=(there, client, float("inf")), daemon=True).start()
-
-    threading.Thread(target=accept, daemon=True).start()
-    try:
-        yield server.getsockname()[1]
-    finally:
-        server.close()
-
-
-@pytest.mark.slow
-def test_sftp_outlives_cuts(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    shutil.copytree(sshd.home / ".ssh", tmp_path / ".ssh")
-    cuts = [200_000, 400_000]
-    with relay(sshd.port, cuts) as port:
-        known = tmp_path / ".ssh" / "known_hosts"
-        known.write_text(known.read_text().replace(f":{sshd.port}", f":{port}"))
-        url, remote = impatient(f"sftp://{sshd.user}@127.0.0.1:{port}{tmp_path}/store")
-        run = make_run(tmp_path / "run", 1)
-        push(run, url, remote, unwatched)
-        pull(url, remote, tmp_path / "got", unwatched, retry=no_wait())
-    assert cuts == []
-    assert content(tmp_path / "got") == content(run)
-
-
-@pytest.mark.slow
-def test_sftp_without_a_shell_reads_back(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(sshd.home))
-    url, remote = impatient(sshd.url(tmp_path / "store"))
-    monkeypatch.setattr(remote.blobs, "_hashed_there", lambda keys: set())
-    run = make_run(tmp_path / "run", 1)
-    push(run, url, remote, unwatched)
-    path = max((tmp_path / "store" / "objects").glob("*/*"), key=lambda path: path.stat().st_size)
-    path.write_bytes(b"x" * path.stat().st_size)
-    assert remote.blobs.wrong({path.name: 0}) == {path.name}
-
-
-@pytest.mark.slow
-def test_an_sftp_lock_that_a_dead_push_left_is_broken(
-    sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HOME", str(sshd.home))
-    monkeypatch.setattr(sftp_lock, "LOCK_STALE", 0.3)
-    (tmp_path / "store").mkdir()
-    (tmp_path / "store" / sftp_lock.LOCK).write_text("dead")
-    url, remote = impatient(sshd.url(tmp_path / "store"))
-    push(make_run(tmp_path / "run", 1), url, remote, unwatched)
-    assert not (tmp_path / "store" / sftp_lock.LOCK).exists()
-
-
-@pytest.mark.slow
-def test_an_sftp_lock_of_a_living_push_is_respected(
-    sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HOME", str(sshd.home))
-    for name, seconds in {"LOCK_REFRESH": 0.3, "LOCK_STALE": 1.5, "LOCK_WAIT": 2.5}.items():
-        monkeypatch.setattr(sftp_lock, name, seconds)
-    run, (url, remote) = make_run(tmp_path / "run", 1), impatient(sshd.url(tmp_path / "store"))
-    blobs = remote.blobs
-    assert isinstance(blobs, SftpBlobs)
-    blobs.prepare(0)
-    with blobs._sftp("x") as sftp, blobs._locked(sftp) as is_ours:
-        with pytest.raises(RemoteError, match=r"another push is updating .*; wait, and push again"):
-            push(run, url, impatient(str(url))[1], unwatched)
-        assert is_ours()
-    push(run, url, remote, unwatched)
-
-
-@pytest.mark.slow
-def test_an_unknown_host_key_is_not_trusted(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    with pytest.raises(AuthError, match=r"is not in ~/.ssh/known_hosts; run ssh 127.0.0.1 once"):
-        impatient(sshd.url(tmp_path))[1].read()
-
-
-@pytest.mark.slow
-def test_a_wrong_sftp_password_is_never_shown(sshd: Sshd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / ".ssh").mkdir()
-    shutil.copy(sshd.home / ".ssh" / "known_hosts", tmp_path / ".ssh")
-    url, remote = impatient(f"sftp://me:hunter2@127.0.0.1:{sshd.port}/x")
-    with pytest.raises(AuthError, match="rejected this user's login") as caught:
-        remote.read()
-    for text in (str(caught.value), str(url), repr(url), remote.describe(), repr(remote)):
-        assert "hunter2" not in text
-
-
 def test_no_such_host() -> None:
     with pytest.raises(NotFoundError, match=r"there is no host no-such-host\.invalid; check the name"):
         impatient("sftp://no-such-host.invalid/x")[1].read()
 
 
-def test_waits_grow_and_are_drawn_and_end() -> None:
-    waits: list[float] = []
-
-    def broken() -> None:
-        raise TransientError("cut")
-
-    with pytest.raises(RemoteError, match="cut; tried 6 times, try again later"):
-        no_wait(waits)(broken)
-    assert len(waits) == 5
-    assert all(wait <= 0.5 * 2**number for number, wait in enumerate(waits))
-
-
-def test_a_server_that_asks_for_too_much_is_not_waited_for() -> None:
-    def busy() -> None:
-        raise TransientError("busy", after=3600)
-
-    with pytest.raises(RemoteError, match="the server asks to wait 3600 s: try again then"):
-        Retry(sleep=lambda _: pytest.fail("waited"))(busy)
-
-
-def test_what_is_not_worth_a_try_is_not_tried_again() -> None:
+def attempts(error: RemoteError, waits: list[float]) -> tuple[str, int]:
+    """What work that always fails ends in, and how often it was tried."""
     tries: list[int] = []
 
-    def refused() -> None:
+    def fail() -> None:
         tries.append(1)
-        raise AuthError("no")
+        raise error
 
-    with pytest.raises(AuthError):
-        no_wait()(refused)
-    assert len(tries) == 1
+    with pytest.raises(RemoteError) as caught:
+        no_wait(waits)(fail)
+    return str(caught.value), len(tries)
+
+
+def test_only_what_may_pass_is_tried_again_after_growing_waits_that_end() -> None:
+    waits: list[float] = []
+    assert attempts(AuthError("no"), waits) == ("no", 1)
+    text, tries = attempts(TransientError("busy", after=3600), waits)
+    assert (text, tries, waits) == ("busy; the server asks to wait 3600 s: try again then", 1, [])
+    text, tries = attempts(TransientError("cut"), waits)
+    assert text.startswith("cut; tried 6 times, try again later")
+    assert (tries, len(waits)) == (6, 5)
+    assert all(wait <= 0.5 * 2**number for number, wait in enumerate(waits))
 
 
 def test_retry_after_is_read_as_seconds_or_date() -> None:

@@ -13,13 +13,11 @@ from huggingface_hub import HfApi, constants
 from huggingface_hub.utils import logging as hub_logging
 
 from manip_il.errors import UsageError
-from manip_il.store.cards import CARD, STRIP
+from manip_il.store.cards import CARD, PICTURE
 from manip_il.store.errors import ConflictError
-from manip_il.store.hub_talk import quiet
-from manip_il.store.push import check_source, push
-from manip_il.store.remote import MANIFEST_FILE
-from manip_il.store.scan import scan
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.hub_session import hub_session
+from manip_il.store.push import check_source, push, scan
+from manip_il.store.remote import MANIFEST_FILE, RemoteUrl, open_remote
 
 from .hub_server import Hub
 from .hub_use import (
@@ -27,13 +25,13 @@ from .hub_use import (
     POLICY,
     SAMPLE,
     TOKEN,
-    contents,
     copy_sample,
     do_pull,
     do_push,
     other_version,
 )
 from .hub_wire import Fault
+from .trees import content
 
 
 @pytest.fixture(scope="module")
@@ -41,28 +39,23 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return other_version(tmp_path_factory.mktemp("other") / "demos")
 
 
-def test_a_dataset_comes_back_byte_equal(hub: Hub, tmp_path: Path):
-    published = do_push(SAMPLE)
-    do_pull(tmp_path / "back")
-    back, sent = contents(tmp_path / "back"), contents(SAMPLE)
+@pytest.mark.parametrize("kind", ["dataset", "policy"])
+def test_what_is_pushed_comes_back_byte_equal_and_a_datasets_tag_names_its_commit(
+    kind: str, hub: Hub, tmp_path: Path, tiny_policy: Path
+):
+    source, url, made, name = {
+        "dataset": (SAMPLE, DATASET, {CARD, PICTURE}, "datasets/user/demos"),
+        "policy": (tiny_policy, POLICY, {CARD}, "models/user/policy"),
+    }[kind]
+    published = do_push(source, url)
+    do_pull(tmp_path / "back", url)
+    back, sent = content(tmp_path / "back"), content(source)
     assert {path: back[path] for path in sent} == sent
-    assert set(back) - set(sent) == {CARD, STRIP}
+    assert set(back) - set(sent) == made
     assert published.uploaded == len(back)
-
-
-def test_a_policy_comes_back_byte_equal(hub: Hub, tmp_path: Path, tiny_policy: Path):
-    do_push(tiny_policy, POLICY)
-    do_pull(tmp_path / "back", POLICY)
-    back, sent = contents(tmp_path / "back"), contents(tiny_policy)
-    assert {path: back[path] for path in sent} == sent
-    assert set(back) - set(sent) == {CARD}
-    assert hub.repo("models/user/policy").refs("tags") == {}
-
-
-def test_the_tag_names_the_commit(hub: Hub):
-    published = do_push(SAMPLE)
-    repo = hub.repo("datasets/user/demos")
-    assert repo.refs("tags") == {"v3.0": published.token} == {"v3.0": repo.refs("heads")["main"]}
+    repo = hub.repo(name)
+    assert repo.refs("heads")["main"] == published.token
+    assert repo.refs("tags") == ({"v3.0": published.token} if kind == "dataset" else {})
 
 
 def test_an_unchanged_dataset_makes_no_commit(hub: Hub):
@@ -119,7 +112,7 @@ def test_a_reader_of_the_old_commit_finishes_while_a_new_one_is_pushed(hub: Hub,
     for entry in old.manifest.files:
         with (tmp_path / "part").open("wb") as file:
             remote.fetch(old, entry, file, 0)
-        if entry.path not in (CARD, STRIP):
+        if entry.path not in (CARD, PICTURE):
             assert (tmp_path / "part").read_bytes() == (SAMPLE / entry.path).read_bytes()
 
 
@@ -129,7 +122,7 @@ def test_readers_see_one_version_or_the_other(hub: Hub, tmp_path: Path, other: P
     for source in (SAMPLE, other):
         do_push(source)
         do_pull(tmp_path / source.name)
-        versions.append(contents(tmp_path / source.name))
+        versions.append(content(tmp_path / source.name))
     stop, seen = threading.Event(), []
 
     def read() -> None:
@@ -165,7 +158,7 @@ def test_of_two_pushers_one_wins_and_the_other_is_told(hub: Hub, other: Path):
 def test_settings_of_the_client_hold_until_the_last_thread_is_done(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", False)
     level = hub_logging.get_verbosity()
-    first, second = quiet("http://127.0.0.1:1"), quiet("http://127.0.0.1:1")
+    first, second = (hub_session("a repository", "http://127.0.0.1:1") for _ in range(2))
     first.__enter__()
     with second:
         first.__exit__(None, None, None)
@@ -220,7 +213,7 @@ def test_what_another_program_pushed_can_be_pulled_and_replaced(hub: Hub, tmp_pa
         patch.setattr(constants, "HF_HUB_DISABLE_XET", True)
         api.upload_folder(repo_id="user/demos", repo_type="dataset", folder_path=SAMPLE)
     do_pull(tmp_path / "back")
-    assert contents(tmp_path / "back") == contents(SAMPLE)
+    assert content(tmp_path / "back") == content(SAMPLE)
     published = do_push(SAMPLE)
     assert published.uploaded == 2  # the card and its picture
 

@@ -1,46 +1,37 @@
-"""What a push to a Hub and a pull from it outlive: kills, cut connections, slow servers, errors, wrong bytes."""
+"""What a push to a Hub and a pull from it outlive, and what a user is told where they do not: one line, no token."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
-import signal
-import subprocess
-import sys
-import threading
-import time
+import logging
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from manip_il.store import hub_client
-from manip_il.store.errors import ConflictError, HashError, RemoteError
+from manip_il.errors import ManipError, UsageError
+from manip_il.store import hub_http
+from manip_il.store.errors import (
+    AuthError,
+    ConflictError,
+    HashError,
+    NoSpaceError,
+    NotFoundError,
+    RemoteError,
+    Retry,
+)
 from manip_il.store.hub import HubRemote
-from manip_il.store.remote import MANIFEST_FILE
-from manip_il.store.retry import Retry
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.push import scan
+from manip_il.store.remote import RemoteUrl, open_remote
 
-from .hub_server import Hub, clean_environment
-from .hub_use import DATASET, SAMPLE, TOKEN, a_hub, contents, copy_sample, do_pull, do_push, other_version
+from .hub_server import LFS_SECRET, Hub
+from .hub_use import DATASET, POLICY, SAMPLE, TOKEN, copy_sample, do_pull, do_push, files_of_main
 from .hub_wire import Fault
-from .trees import wait_little
-
-KILLS = int(os.environ.get("MANIP_IL_KILLS", "4"))  # of each direction
+from .trees import content, wait_little
 
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     wait_little(monkeypatch)
-
-
-def _files(hub: Hub) -> dict[str, bytes]:
-    """What a reader of the main branch sees."""
-    repo = hub.repo("datasets/user/demos")
-    tree = repo.tree(repo.refs("heads")["main"])
-    hidden = (MANIFEST_FILE, ".gitattributes")
-    return {path: repo.read(blob) for path, blob in tree.items() if path not in hidden}
 
 
 PUSH_FAULTS = {
@@ -62,8 +53,8 @@ def test_a_push_outlives(hub: Hub, fault: Fault):
     hub.faults.append(fault)
     do_push(SAMPLE)
     assert fault.times < 1 or fault.match == "/commit/"
-    seen = _files(hub)
-    assert {path: seen[path] for path in contents(SAMPLE)} == contents(SAMPLE)
+    seen = files_of_main(hub)
+    assert {path: seen[path] for path in content(SAMPLE)} == content(SAMPLE)
     repo = hub.repo("datasets/user/demos")
     assert len(repo.log(repo.refs("heads")["main"])) == 2  # the Hub's own first one, and one of this push
     assert repo.refs("tags")["v3.0"] == repo.refs("heads")["main"]
@@ -84,7 +75,7 @@ def test_a_pull_outlives(hub: Hub, tmp_path: Path, fault: Fault):
     do_push(SAMPLE)
     hub.faults.append(fault)
     do_pull(tmp_path / "back")
-    assert contents(tmp_path / "back") == _files(hub)
+    assert content(tmp_path / "back") == files_of_main(hub)
 
 
 def test_a_download_goes_on_where_it_was_cut(hub: Hub, tmp_path: Path):
@@ -105,7 +96,7 @@ def test_bytes_that_stay_wrong_are_never_taken(hub: Hub, tmp_path: Path):
 
 
 def test_a_server_that_keeps_silent_is_given_up(hub: Hub, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(hub_client, "PATIENCE", 0.2)
+    monkeypatch.setattr(hub_http, "PATIENCE", 0.2)
     hub.faults.append(Fault("GET /api/datasets", 100, pause=1.0))
     remote = HubRemote(RemoteUrl.parse(DATASET), retry=Retry(tries=2, first=0.01))
     with pytest.raises(RemoteError, match="gave no answer in time; tried 2 times"):
@@ -120,101 +111,109 @@ def test_a_commit_that_somebody_else_made_meanwhile_is_a_conflict_even_when_the_
     before = remote.read()
     repo.commit("refs/heads/main", head, {"notes.txt": b"theirs"}, {}, [], "theirs")
     hub.faults.append(Fault("/commit/", cut=10))
-    from manip_il.store.scan import scan
-
     scanned = scan(SAMPLE, "dataset")
     with pytest.raises(ConflictError):
         remote.publish(scanned.local, scanned.manifest, before, lambda count: None)
 
 
-class Child:
-    """The process whose forks push and pull."""
-
-    def __init__(self, hub: Hub, folder: Path):
-        kept = {key: value for key, value in os.environ.items() if not key.startswith("HF_")}
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("hub_child.py"))],
-            env=kept | clean_environment(hub, folder / "home", TOKEN),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def run(self, do: str, folder: Path, kill_after: float | None = None) -> int:
-        """Its exit code, -9 where it was killed in time."""
-        job = {"do": do, "folder": str(folder), "url": DATASET}
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        pid = int(self._process.stdout.readline())
-        killer = threading.Timer(1e6 if kill_after is None else kill_after, _kill, (pid,))
-        killer.start()
-        code = int(self._process.stdout.readline())
-        killer.cancel()
-        killer.join()
-        return code
-
-    def seconds(self, do: str, folder: Path) -> float:
-        """How long it takes."""
-        begin = time.perf_counter()
-        assert self.run(do, folder) == 0
-        return time.perf_counter() - begin
-
-    def close(self) -> str:
-        """What it said."""
-        return self._process.communicate(timeout=120)[1]
+def said(kind: type[ManipError], work: Callable[[], object]) -> str:
+    """The one line of the error."""
+    with pytest.raises(kind) as caught:
+        work()
+    text = str(caught.value)
+    assert "\n" not in text
+    assert TOKEN not in text
+    return text
 
 
-def _kill(pid: int) -> None:
-    with contextlib.suppress(ProcessLookupError):  # it has just ended
-        os.kill(pid, signal.SIGKILL)
+TOKENS = {
+    "none": (None, "not logged in; run `hf auth login`"),
+    "unknown": ("hf_AnOldToken", "the token is refused"),
+    "read-only": ("hf_ReadOnlyToken", "with write permission"),
+}
 
 
-class Kills:
-    """Kills one kind of work at random moments of the time that it takes."""
-
-    def __init__(self, child: Child, do: str, usual: float):
-        self._child, self._do, self._usual = child, do, usual
-        self._rng = np.random.default_rng(7)
-        self.count = 0
-
-    def __call__(self, folder: Path) -> None:
-        if self.count == KILLS:
-            return
-        code = self._child.run(self._do, folder, float(self._rng.uniform(0.05, 1.0)) * self._usual)
-        assert code in (0, -signal.SIGKILL)
-        if code:
-            self.count += 1
-        else:
-            self._usual *= 0.9  # it was slow when it was measured
+@pytest.mark.parametrize(("token", "text"), TOKENS.values(), ids=TOKENS)
+def test_a_token_that_may_not_push(
+    hub: Hub, token: str | None, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    do_push(SAMPLE)
+    hub.add_token("hf_ReadOnlyToken", "user", write=False)
+    monkeypatch.delenv("HF_TOKEN") if token is None else monkeypatch.setenv("HF_TOKEN", token)
+    copy = copy_sample(tmp_path / "demos")
+    (copy / "notes.txt").write_text("new")
+    for work in (lambda: do_push(SAMPLE, "hf://datasets/user/more"), lambda: do_push(copy)):
+        error = said(AuthError, work)
+        assert text in error
+        assert token is None or token not in error
 
 
-@pytest.mark.slow
-def test_kills_at_random_moments_leave_one_version_and_the_next_try_is_whole(tmp_path: Path):
-    sources = [copy_sample(tmp_path / "a" / "demos"), other_version(tmp_path / "b" / "demos")]
-    with a_hub(tmp_path / "hub") as hub:
-        child = Child(hub, tmp_path)
-        versions, took = [], 0.0
-        for source in sources:
-            took = child.seconds("push", source)
-            versions.append(_files(hub))
-        push, pull = Kills(child, "push", took), Kills(child, "pull", child.seconds("pull", tmp_path / "first"))
-        for number in range(30 + 5 * KILLS):
-            if min(push.count, pull.count) == KILLS:
-                break
-            source, target = sources[number % 2], tmp_path / f"pulled_{number}"
-            push(source)
-            assert _files(hub) in versions
-            assert child.run("push", source) == 0
-            assert _files(hub) == versions[number % 2]
-            repo = hub.repo("datasets/user/demos")
-            assert repo.refs("tags")["v3.0"] == repo.refs("heads")["main"]
-            pull(target)
-            assert not target.exists() or contents(target) == versions[number % 2]
-            if not target.exists():
-                assert child.run("pull", target) == 0
-            assert contents(target) == versions[number % 2]
-            # Killed right after the rename, a pull has left an empty folder.
-            assert not [path for path in tmp_path.glob(".pulled_*/**/*") if path.is_file()]
-        assert TOKEN not in child.close()
-    assert (push.count, pull.count) == (KILLS, KILLS)
+def test_no_such_repository(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
+    assert "(no such dataset, or a private one that this token cannot access) holds nothing" in text
+    monkeypatch.delenv("HF_TOKEN")
+    text = said(NotFoundError, lambda: do_pull(tmp_path / "back"))
+    assert "or a private one, for which you run `hf auth login`, or set HF_TOKEN)" in text
+
+
+def test_no_such_revision(hub: Hub, tmp_path: Path):
+    do_push(SAMPLE)
+    text = said(NotFoundError, lambda: do_pull(tmp_path / "back", f"{DATASET}@v9.9"))
+    assert "no revision v9.9; there are: main, v3.0" in text
+
+
+def test_a_name_that_is_taken_by_the_other_type(hub: Hub, tmp_path: Path, tiny_policy: Path):
+    do_push(SAMPLE)
+    text = said(UsageError, lambda: do_push(tiny_policy, "hf://user/demos"))
+    assert "user/demos is taken by a dataset, hf://datasets/user/demos; choose another name" in text
+    text = said(NotFoundError, lambda: do_pull(tmp_path / "back", "hf://user/demos"))
+    assert "there is only a dataset of that name, hf://datasets/user/demos" in text
+
+
+FULL = {
+    "an upload too large": (Fault("^PUT ", 100, status=413), "does not accept files this large; ask who runs it"),
+    "a commit too large": (Fault("/commit/", 100, status=413), "does not accept files this large; ask who runs it"),
+    "a full disk": (Fault("^PUT ", 100, status=507), "has no space left for this account; delete old files there"),
+    "an account that must pay": (Fault("/preupload/", 100, status=402), "has no space left for this account; delete"),
+    "a quota": (
+        Fault(
+            "/repos/create", 100, status=403, headers={"X-Error-Message": "Private repository storage limit reached"}
+        ),
+        "has no space left for this account (Private repository storage limit reached); delete",
+    ),
+}
+
+
+@pytest.mark.parametrize(("fault", "text"), FULL.values(), ids=FULL)
+def test_no_space(hub: Hub, fault: Fault, text: str):
+    hub.faults.append(fault)
+    assert text in said(NoSpaceError, lambda: do_push(SAMPLE))
+
+
+def test_a_server_that_fails_for_good(hub: Hub):
+    hub.faults.append(Fault("^PUT ", 100, status=500))
+    text = said(RemoteError, lambda: do_push(SAMPLE))
+    assert "answered 500" in text
+    assert "try again later" in text
+    assert LFS_SECRET not in text
+
+
+def test_the_token_is_nowhere(
+    hub: Hub,
+    tmp_path: Path,
+    tiny_policy: Path,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+):
+    caplog.set_level(logging.DEBUG)
+    hub.faults.append(Fault("^PUT ", status=500))
+    do_push(SAMPLE)
+    do_push(tiny_policy, POLICY)
+    do_pull(tmp_path / "back")
+    out = capfd.readouterr()
+    for text in (caplog.text, out.out, out.err):
+        assert TOKEN not in text
+        assert LFS_SECRET not in text
+    for repo in hub.repos.values():
+        for commit, _ in repo.log("main"):
+            assert not any(TOKEN.encode() in repo.read(blob) for blob in repo.tree(commit).values())

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.store.cards import CARD, STRIP
+from manip_il.store.cards import CARD, PICTURE
 
 from .hub_server import clean_environment
-from .hub_use import SAMPLE, TOKEN, a_hub, contents
+from .hub_use import SAMPLE, TOKEN, a_hub
+from .trees import content
 
 BIN = Path(sys.executable).parent
 ACT = (
@@ -74,7 +75,7 @@ def test_what_is_pushed_is_trained_on_loaded_and_pulled(program: Program, tmp_pa
         program("manip-il", "pull", "hf://datasets/user/demos", tmp_path / "demos", "--quiet")
         assert loaded.result().splitlines()[-1] == "375 10 v3.0 tensor(True)"
     assert (tmp_path / "lerobot" / "checkpoints" / "000002" / "pretrained_model" / "model.safetensors").is_file()
-    back, demos = contents(tmp_path / "back"), contents(tmp_path / "demos")
+    back, demos = content(tmp_path / "back"), content(tmp_path / "demos")
     assert b"lerobot-eval --policy.path=user/run" in back.pop(CARD)
-    assert back == contents(run)
-    assert {path: demos[path] for path in demos if path not in (CARD, STRIP)} == contents(SAMPLE)
+    assert back == content(run)
+    assert {path: demos[path] for path in demos if path not in (CARD, PICTURE)} == content(SAMPLE)

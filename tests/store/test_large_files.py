@@ -14,8 +14,7 @@ import pytest
 from manip_il.store import s3_store, s3_upload
 from manip_il.store.errors import AuthError, RemoteError
 from manip_il.store.pull import pull
-from manip_il.store.push import push
-from manip_il.store.scan import scan
+from manip_il.store.push import push, scan
 
 from .s3 import KEY, SECRET, Fault, Proxy
 from .trees import content, impatient, make_run, unwatched

@@ -13,12 +13,12 @@ import pytest
 from huggingface_hub import close_session, constants
 
 from manip_il.cli.main import main
-from manip_il.store import hub_client, hub_tree, pace
+from manip_il.store import errors, hub_http, hub_repo
+from manip_il.store.errors import Retry
 from manip_il.store.hub_repo import HubRepo
-from manip_il.store.retry import Retry
 
 from .hub_use import DATASET, TOKEN
-from .liar import Liar, a_liar, answer, head
+from .liar import Liar, a_liar, answer, drip, drip_headers, endless, error_of_pull, head
 from .trees import wait_little
 
 COMMIT = "c" * 40
@@ -50,12 +50,7 @@ def honest(line: str) -> list[bytes]:
 def pulled(hub: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     """The one line that a pull ends in; it is an error."""
     monkeypatch.setattr(constants, "ENDPOINT", hub.url)
-    assert main(["pull", DATASET, str(folder / "got"), "--quiet"]) == 1
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert TOKEN not in captured.err
-    assert not (folder / "got").exists()
-    return captured.err
+    return error_of_pull(DATASET, folder, capsys, TOKEN)
 
 
 def authorized(liar: Liar) -> list[bool]:
@@ -125,7 +120,7 @@ def test_a_connection_that_was_made_anew_keeps_to_the_limits(tmp_path: Path) -> 
 
 
 def same_origin(left: str, right: str) -> bool:
-    return hub_client._same_origin(httpx.URL(left), httpx.URL(right))
+    return hub_http._same_origin(httpx.URL(left), httpx.URL(right))
 
 
 def test_an_origin_is_scheme_host_and_port() -> None:
@@ -136,30 +131,8 @@ def test_an_origin_is_scheme_host_and_port() -> None:
     assert not same_origin("https://hub.co@evil.com", "https://hub.co")
 
 
-def forever(piece: bytes) -> Iterator[bytes]:
-    yield head()
-    yield from itertools.repeat(piece)
-
-
-def drip(line: str) -> Iterator[bytes]:
-    """A byte at a time, without an end; the event is never set."""
-    from threading import Event
-
-    yield head(Content_Length="100000000")
-    while not Event().wait(0.01):
-        yield b" "
-
-
-def drip_headers(line: str) -> Iterator[bytes]:
-    from threading import Event
-
-    yield b"HTTP/1.1 200 OK\r\nX-Slow: "
-    while not Event().wait(0.01):
-        yield b"x"
-
-
 ENDLESS = {
-    "JSON": (lambda _: forever(b"[" * 65536), "answered more than 200,000 bytes"),
+    "JSON": (lambda _: endless(b"[" * 65536), "answered more than 200,000 bytes"),
     "a body, bit by bit": (drip, "expected at least 1,000 bytes a second"),
     "headers, bit by bit": (drip_headers, "expected at least 1,000 bytes a second"),
     "headers": (lambda _: itertools.chain([b"HTTP/1.1 200 OK\r\n"], itertools.repeat(b"X-A: b\r\n" * 999)), "cut"),
@@ -173,17 +146,17 @@ ENDLESS = {
 
 @pytest.mark.parametrize(("script", "says"), ENDLESS.values(), ids=ENDLESS)
 def test_what_has_no_end_ends_in_one_line(script, says, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(hub_client, "LARGEST_ANSWER", 200_000)
+    monkeypatch.setattr(hub_http, "LARGEST_ANSWER", 200_000)
     if "a second" in says:  # the others may take as long as a busy machine needs
-        monkeypatch.setattr(pace, "WINDOW", 0.2)
+        monkeypatch.setattr(errors, "WINDOW", 0.2)
     with a_liar(script) as hub:
         assert says in pulled(hub, tmp_path, monkeypatch, capsys)
 
 
 @pytest.mark.parametrize("page", [[], [FILE], [FILE | {"type": "directory"}]], ids=["empty", "files", "folders"])
 def test_a_list_without_an_end_ends_in_one_line(page: Any, tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(hub_client, "MOST_PAGES", 20)
-    monkeypatch.setattr(hub_tree, "MOST_ENTRIES", 15)
+    monkeypatch.setattr(hub_http, "MOST_PAGES", 20)
+    monkeypatch.setattr(hub_repo, "MOST_ENTRIES", 15)
 
     def script(line: str) -> list[bytes]:
         return answer(page, Link=f'<{hub.url}/tree/more>; rel="next"') if "/tree/" in line else honest(line)
@@ -195,22 +168,22 @@ def test_a_list_without_an_end_ends_in_one_line(page: Any, tmp_path, monkeypatch
 
 
 def test_an_answer_and_a_list_may_take_so_long_and_no_longer(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(hub_client, "LONGEST_LISTING", -1.0)
+    monkeypatch.setattr(hub_http, "LONGEST_LISTING", -1.0)
     with a_liar(honest) as hub:
         assert "has a list of more than -1 s" in pulled(hub, tmp_path, monkeypatch, capsys)
-    monkeypatch.setattr(hub_client, "LONGEST_ANSWER", -1.0)
+    monkeypatch.setattr(hub_http, "LONGEST_ANSWER", -1.0)
     with a_liar(honest) as hub:
         assert "took more than -1 s for an answer" in pulled(hub, tmp_path, monkeypatch, capsys)
 
 
 def test_a_file_that_drips_ends_in_one_line_and_one_at_the_least_speed_comes(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(pace, "WINDOW", 0.2)
+    monkeypatch.setattr(errors, "WINDOW", 0.2)
     large = answer([FILE | {"size": 10**6}])
     with a_liar(lambda x: drip(x) if "/resolve/" in x else large if "/tree/" in x else honest(x)) as hub:
         assert "expected at least 1,000 bytes a second" in pulled(hub, tmp_path, monkeypatch, capsys)
-    slow = pace.Pace("x")
+    slow = errors.Pace("x")
     for _ in range(1000):
-        slow.add(pace.WINDOW / 7, int(pace.LEAST_SPEED * pace.WINDOW / 7) + 1)
+        slow.add(errors.WINDOW / 7, int(errors.LEAST_SPEED * errors.WINDOW / 7) + 1)
 
 
 DEEP = b'{"a":' * 100_000

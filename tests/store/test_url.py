@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from manip_il.errors import UsageError
-from manip_il.store.url import RemoteUrl
+from manip_il.store.remote import RemoteUrl
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,15 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from huggingface_hub.utils import _http as hub_http
 
+from manip_il.store.errors import Retry
 from manip_il.store.object_store import ObjectRemote
-from manip_il.store.retry import Retry
-from manip_il.store.url import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl, open_remote
 
 
 def make_run(folder: Path, seed: int, files: int = 12, size: int = 20_000) -> Path:
@@ -36,7 +37,7 @@ def make_run(folder: Path, seed: int, files: int = 12, size: int = 20_000) -> Pa
     return folder
 
 
-def content(folder: Path) -> dict[str, bytes | str]:
+def content(folder: Path) -> dict[str, Any]:
     """Everything below: bytes of files, targets of links."""
     return {
         path.relative_to(folder).as_posix(): os.readlink(path) if path.is_symlink() else path.read_bytes()

@@ -1,4 +1,4 @@
-"""Talking to a Hub by huggingface_hub: with time limits, without its noise, and with errors of ours."""
+"""Sessions with a Hub through huggingface_hub: with limits, without its messages, and with its errors in our words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import logging
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import httpx
 from huggingface_hub import constants
@@ -20,15 +20,8 @@ from huggingface_hub.errors import (
     RepositoryNotFoundError,
     RevisionNotFoundError,
 )
-from huggingface_hub.utils import (
-    are_progress_bars_disabled,
-    disable_progress_bars,
-    enable_progress_bars,
-    get_token,
-)
-from huggingface_hub.utils import (
-    logging as hub_logging,
-)
+from huggingface_hub.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars, get_token
+from huggingface_hub.utils import logging as hub_logging
 
 from manip_il.errors import ManipError
 from manip_il.store.errors import (
@@ -39,75 +32,77 @@ from manip_il.store.errors import (
     RemoteError,
     TransientError,
     redact,
+    retry_after,
 )
-from manip_il.store.hub_client import guarded
-from manip_il.store.retry import retry_after
+from manip_il.store.hub_http import TEMPORARY, limited
 
 HF = "https://huggingface.co"
 LOGIN = "run `hf auth login`, or set HF_TOKEN"
-_TEMPORARY = (408, 429, 500, 502, 503, 504)
-_one_at_a_time = threading.Lock()
-_talks: list[str] = []  # endpoints talked to now, one for each `quiet`
-_found: list[tuple[bool, int, bool]] = []  # bars, verbosity and no xet, as they were before the first of them
 # What huggingface_hub raises over an answer of the wrong shape: it checks none.
 _NONSENSE = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
 _FULL = (402, 507)  # payment required, insufficient storage
-_QUOTA = re.compile(
-    r"(?i)\b(?:storage|quota|space)\b"
-)  # of the Hub's own words, where it answers 403 to a full account
+_QUOTA = re.compile(r"(?i)\b(?:storage|quota|space)\b")  # in a Hub's message, if it answers 403 to a full account
+_lock = threading.Lock()
+_endpoints: list[str] = []  # of the sessions that are open now
+_saved: list[tuple[bool, int, bool]] = []  # bars, verbosity and no xet, as they were before the first of them
 
 
 @contextlib.contextmanager
-def talking(place: str, endpoint: str, *, listing: bool = False) -> Iterator[None]:
-    """What goes wrong inside is one of our errors, about `place`; the limits of `hub_client` hold inside."""
-    noisy = logging.getLogger("httpx")  # it tells every URL, signatures included, wherever INFO is on
+def hub_session(place: str, endpoint: str, *, listing: bool = False) -> Generator[None]:
+    """Apply the limits of `hub_http` inside, silence huggingface_hub, and raise its errors as ours, about `place`.
+
+    listing: the answer comes in pages.
+    """
+    noisy = logging.getLogger("httpx")  # it logs every URL, with signatures, at level INFO
     if noisy.getEffectiveLevel() < logging.WARNING:
         noisy.setLevel(logging.WARNING)
     try:
-        with guarded(endpoint, listing=listing):
+        with _silenced(endpoint), limited(endpoint, listing=listing):
             yield
     except ManipError:
         raise
     except Exception as error:
-        known = explained(error, place, endpoint)
-        if known is None:
+        ours = translate(error, place, endpoint)
+        if ours is None:
             raise
-        raise known from None  # its text may hold the signature of an upload
+        raise ours from None  # its text may hold the signature of an upload
 
 
 @contextlib.contextmanager
-def quiet(endpoint: str) -> Iterator[None]:
-    """No progress bars and warnings of huggingface_hub, and no xet where only the public Hub is known to have it.
+def _silenced(endpoint: str) -> Generator[None]:
+    """Switch off progress bars and warnings of huggingface_hub, and xet unless it is the public Hub, which has it.
 
-    Its warnings name URLs, those of uploads with their signatures. All of it is the process's, so threads that talk
-    at once share it: what was found comes back when the last one is done.
+    Its warnings contain URLs, those of uploads with their signatures. The settings are the process's, so threads share
+    them: the last one to leave restores them.
     """
-    with _one_at_a_time:
-        if not _talks:
-            _found.append((not are_progress_bars_disabled(), hub_logging.get_verbosity(), constants.HF_HUB_DISABLE_XET))
+    with _lock:
+        if not _endpoints:
+            _saved.append((not are_progress_bars_disabled(), hub_logging.get_verbosity(), constants.HF_HUB_DISABLE_XET))
             disable_progress_bars()
             hub_logging.set_verbosity_error()
-        _talks.append(endpoint)
+        _endpoints.append(endpoint)
         constants.HF_HUB_DISABLE_XET |= endpoint != HF
     try:
         yield
     finally:
-        with _one_at_a_time:
-            _talks.remove(endpoint)
-            if not _talks:
-                shown, level, constants.HF_HUB_DISABLE_XET = _found.pop()
+        with _lock:
+            _endpoints.remove(endpoint)
+            if not _endpoints:
+                has_bars, level, constants.HF_HUB_DISABLE_XET = _saved.pop()
                 hub_logging.set_verbosity(level)
-                if shown:
+                if has_bars:
                     enable_progress_bars()
 
 
-def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | None:
-    """Return the error in our words; None for one that is no remote's."""
-    cause = _cause(error)
+def translate(error: BaseException, place: str, endpoint: str) -> RemoteError | None:
+    """Return an error in our words; None for one that is not a remote's."""
+    cause = error
+    while isinstance(cause, RuntimeError) and cause.__cause__ is not None:
+        cause = cause.__cause__  # huggingface_hub's upload threads wrap errors
     if isinstance(cause, RemoteError):
         return cause
     if isinstance(cause, HfHubHTTPError):
-        return _answered(cause, place, endpoint)
+        return _translate_answer(cause, place, endpoint)
     if isinstance(cause, OfflineModeIsEnabled):
         return RemoteError(f"{place} cannot be reached: HF_HUB_OFFLINE is set; unset it")
     if isinstance(cause, LocalTokenNotFoundError):
@@ -130,13 +125,13 @@ def explained(error: BaseException, place: str, endpoint: str) -> RemoteError | 
 
 
 def host(endpoint: str) -> str:
-    """Return the endpoint without the name and password that it may hold."""
+    """Return the endpoint without a name and password."""
     return httpx.URL(endpoint).copy_with(userinfo=b"").__str__().rstrip("/")
 
 
-def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
-    status, said = error.response.status_code, _said(error.response)
-    if status in _TEMPORARY:
+def _translate_answer(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
+    status, said = error.response.status_code, _message(error.response)
+    if status in TEMPORARY:
         after = retry_after(error.response.headers.get("Retry-After"))
         return TransientError(f"{place}: {host(endpoint)} answered {status}{said}", after)
     if isinstance(error, RevisionNotFoundError):
@@ -164,14 +159,7 @@ def _answered(error: HfHubHTTPError, place: str, endpoint: str) -> RemoteError:
     return RemoteError(f"{place}: {host(endpoint)} answered {status}{said}")
 
 
-def _said(response: httpx.Response) -> str:
-    """The server's own words, one line of them, without the token."""
+def _message(response: httpx.Response) -> str:
+    """Return the server's own message in one line, without the token."""
     text = " ".join(response.headers.get("X-Error-Message", "").split())[:200]
     return f" ({redact(text, get_token() or '')})" if text else ""
-
-
-def _cause(error: BaseException) -> BaseException:
-    """What huggingface_hub wrapped in a RuntimeError of its upload threads."""
-    while isinstance(error, RuntimeError) and error.__cause__ is not None:
-        error = error.__cause__
-    return error

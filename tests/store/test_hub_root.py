@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from manip_il.store.cards import CARD
-from manip_il.store.front import policy_folder, with_front, without_front
 from manip_il.store.manifest import FileEntry, Manifest
-from manip_il.store.scan import Scanned, scan
+from manip_il.store.push import Scanned, policy_folder, scan, with_root_copies, without_root_copies
 
 from .hub_server import Hub
-from .hub_use import POLICY, contents, do_pull, do_push
+from .hub_use import POLICY, do_pull, do_push
+from .trees import content
 
 RUN = {
     "config.yaml": b"# manip-il\n",
@@ -30,8 +30,8 @@ def manifest(files: dict[str, bytes]) -> Manifest:
     return Manifest("policy", tuple(entries))
 
 
-def fronted(files: dict[str, bytes]) -> Scanned:
-    return with_front(Scanned(manifest(files), {path: Path(path) for path in files}))
+def copied(files: dict[str, bytes]) -> Scanned:
+    return with_root_copies(Scanned(manifest(files), {path: Path(path) for path in files}))
 
 
 @pytest.fixture
@@ -60,40 +60,40 @@ def run(tmp_path: Path, tiny_policy: Path) -> Path:
         (["best/pretrained_model/model.safetensors"], None),
     ],
 )
-def test_where_the_policy_of_a_run_lies(paths: list[str], folder: str | None):
+def test_the_folder_of_a_runs_policy(paths: list[str], folder: str | None):
     assert policy_folder(paths) == folder
 
 
 def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
-    scanned = fronted(RUN)
+    scanned = copied(RUN)
     new = scanned.manifest.by_path.keys() - RUN.keys()
     assert new == {"config.json", "model.safetensors"}
     assert scanned.local["config.json"] == Path("checkpoints/001000/pretrained_model/config.json")
-    assert without_front(scanned.manifest) == manifest(RUN)
+    assert without_root_copies(scanned.manifest) == manifest(RUN)
 
 
 @pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
 def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
     files = {**RUN, there: b"its own"}
-    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 @pytest.mark.parametrize("changed", ["config.json", "model.safetensors"])
-def test_a_front_that_is_not_the_policy_any_more_comes_along(changed: str):
+def test_root_copies_that_are_not_the_policy_any_more_come_along(changed: str):
     files = {**RUN, "config.json": b"{}", "model.safetensors": b"weights", changed: b"edited on the website"}
-    assert without_front(manifest(files)) == manifest(files)
+    assert without_root_copies(manifest(files)) == manifest(files)
 
 
 def test_a_policy_that_lies_at_the_root_stays_as_it_is():
     files = {"config.json": b"{}", "model.safetensors": b"weights"}
-    assert fronted(files).manifest == manifest(files) == without_front(manifest(files))
+    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):
     do_push(run, POLICY)
     repo = hub.repo("models/user/policy")
     tree = repo.tree(repo.refs("heads")["main"])
-    for path, data in contents(tiny_policy).items():
+    for path, data in content(tiny_policy).items():
         assert repo.read(tree[path]) == data
         assert repo.read(tree[f"best/pretrained_model/{path}"]) == data
     large = {hashlib.sha256(path.read_bytes()).hexdigest() for path in tiny_policy.glob("*.safetensors")}
@@ -104,21 +104,23 @@ def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hu
 def test_a_run_comes_back_as_it_was_however_often_it_goes_there(hub: Hub, run: Path, tmp_path: Path):
     first = do_push(run, POLICY)
     do_pull(tmp_path / "back", POLICY)
-    back = contents(tmp_path / "back")
+    back = content(tmp_path / "back")
     card = back.pop(CARD)
-    assert back == contents(run)
-    assert (tmp_path / "back" / "round_00" / "policy" / "checkpoints" / "last").readlink() == Path("000200")
+    assert back == content(run)
+    assert back.pop("round_00/policy/checkpoints/last") == "000200"
     again = do_push(tmp_path / "back", POLICY)
     assert (again.token, again.uploaded, again.removed) == (first.token, 0, 0)
     assert b"lerobot-eval --policy.path=user/policy" in card
-    assert scan(tmp_path / "back", "policy").manifest.size == sum(map(len, back.values())) + len(card)
+    assert scan(tmp_path / "back", "policy").manifest.size == sum(
+        len(data) for data in back.values() if isinstance(data, bytes)
+    ) + len(card)
 
 
-def test_a_better_policy_takes_the_place_of_the_one_in_front(hub: Hub, run: Path, tmp_path: Path):
+def test_a_better_policy_replaces_the_copy_at_the_root(hub: Hub, run: Path, tmp_path: Path):
     do_push(run, POLICY)
     better = run / "best" / "pretrained_model" / "config.json"
     better.write_bytes(better.read_bytes() + b"\n")
-    assert do_push(run, POLICY).uploaded == 2  # where it lies, and in front
+    assert do_push(run, POLICY).uploaded == 2  # where it lies, and at the root
     repo = hub.repo("models/user/policy")
     assert repo.read(repo.tree(repo.refs("heads")["main"])["config.json"]) == better.read_bytes()
     do_pull(tmp_path / "back", POLICY)
