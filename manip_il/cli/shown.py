@@ -97,7 +97,7 @@ def run_curve(policy: Path | None) -> LearningCurve | None:
 
 
 def _paths(job: RolloutJob, episode: Episode) -> Paths:
-    from manip_il.engine.describe import env_spec
+    from manip_il.engine.environments import env_spec
     from manip_il.evaluation.film import paths
 
     shown = paths(episode, env_spec(job.env), caption(job, episode).capitalize())

@@ -1,7 +1,6 @@
-"""A Ray cluster: the one that `RAY_ADDRESS` names or that runs on this machine, else a local one of its own.
+"""Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-Workers send what is to be stored back here, and get the policy's files from here: nodes need the program, no disk
-that they share.
+They send what is to be stored to this process, and get the policy's files from it: nodes need no shared disk.
 """
 
 from __future__ import annotations
@@ -54,13 +53,13 @@ class RayCluster:
         return len(self._running) < self.workers
 
     def submit(self, task: Task) -> None:
-        """Hand a task to the cluster."""
+        """Send a task to the cluster."""
         # Deaths are counted by the engine, which knows which seeds had ended: Ray itself is to try once.
         remote = _run_remote.options(num_returns="streaming", max_retries=0)
         self._running[remote.remote(task, self._ship(task.job.policy))] = task
 
     def wait(self) -> list[Event]:
-        """Return one event of every task that has something to say."""
+        """Return one event of every task that has a message."""
         ready, _ = ray.wait(list(self._running), num_returns=1, fetch_local=False)
         return [self._next(answers) for answers in ready]
 

@@ -1,4 +1,8 @@
-"""Conditions of an evaluation: ranges from which each episode's circumstances are drawn by its seed alone."""
+"""Conditions: ranges by name from which each episode draws how it differs from the nominal world, by its seed alone.
+
+Whose values are applied where: to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
+`env.py`, and during the episode by `events.py`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from manip_il.sim.look import CAMERAS, PLAIN, Appearance
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
-# What a value may be at most and at least; outside, a range is a slip of the pen and not an experiment.
+# Least and greatest value; a range beyond is a mistake and not an experiment.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
     "knock": (0, 0.3),
@@ -34,18 +38,19 @@ _BOUNDS: dict[str, Range] = {
     "light_turn": (-180, 180),
 }
 _WHOLE = ("knock_step", "delay")
-_OBJECT = ("knock", "mass", "size", "friction", "colour")  # what a task without an object has not
-_VIEW = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # what only cameras see
+_MODEL = ("mass", "size", "friction")  # of the object, in physics
+_OBJECT = ("knock", "colour", *_MODEL)
+_PICTURES = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Ranges (low, high), both ends included; one that is not given leaves the world as it is.
+    """Ranges (low, high), both ends included; without one the world is nominal in that.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
     knock: the object is moved by so much once [m], at a control step of knock_step. joint_noise [rad], position_noise
-    [m]: standard deviations of Gaussian noise on the joints that a policy is shown and on where it is told the object
-    is. delay: control steps by which it sees everything late. mass [kg], size (edge [m]) and sliding friction of the
+    [m]: standard deviations of Gaussian noise on the joints and the object's position in a policy's observations.
+    delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction of the
     cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a drawn
     direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
 
@@ -86,23 +91,35 @@ class Condition:
         }
 
     def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
-        """Return the condition without what a task without an object, or a policy without cameras, does not notice.
+        """Return the condition without what has no effect on a task without an object, or a policy without cameras.
 
         None where nothing of it is left.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else _VIEW)}
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else _PICTURES)}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
         return Condition(self.name, **kept)
 
+    def changes_model(self) -> bool:
+        """Return whether the object is another one than the compiled model's."""
+        return not self.ranges.keys().isdisjoint(_MODEL)
+
+    def draw(self, seed: int) -> Drawn:
+        """Return what the episode of a seed draws; each value has a random stream of its own.
+
+        So another range leaves the other values as they were.
+        """
+        streams = ((name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items())
+        return Drawn(self.name, {name: _draw(name, range_, rng) for name, range_, rng in streams})
+
     def to_json(self) -> dict[str, Any]:
-        """Name and ranges as plain JSON values."""
+        """Return name and ranges as plain JSON values."""
         return {"name": self.name} | {name: list(range_) for name, range_ in self.ranges.items()}
 
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
-        """Return ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
+        """Make a condition of ranges as YAML or JSON has them, `[low, high]` or one number; else `UsageError`."""
         for key in tree:
             if key not in _BOUNDS:
                 raise UnknownName(f"key in {name}:", str(key)[: checks.LONGEST_NAME], _BOUNDS)
@@ -114,28 +131,29 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class Circumstances:
-    """What was drawn for one episode. `drawn` holds every value by the name of its range; see `Condition` for units.
+class Drawn:
+    """Values of one episode by the name of their range, and the condition they were drawn from.
 
-    camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own frame [m], [deg].
+    See `Condition` for units. camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own
+    frame [m], [deg].
     """
 
     condition: str
-    drawn: Mapping[str, Any]
+    values: Mapping[str, Any]
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """Return a drawn number, or what holds without it."""
-        return float(self.drawn.get(name, default))
+        """Return a drawn number, or the nominal one."""
+        return float(self.values.get(name, default))
 
     @property
     def appearance(self) -> Appearance:
-        """How the world looks to the cameras."""
-        if not self.drawn.keys() & {*_VIEW, "size"}:
+        """Values that change pictures and not physics, with the size of the object that both have."""
+        if not self.values.keys() & {*_PICTURES, "size"}:
             return PLAIN
-        shift, turn = self.drawn.get("camera_shift", {}), self.drawn.get("camera_turn", {})
-        colour = self.drawn.get("colour")
+        shift, turn = self.values.get("camera_shift", {}), self.values.get("camera_turn", {})
+        colour = self.values.get("colour")
         return Appearance(
-            edge=self.drawn.get("size"),
+            edge=self.values.get("size"),
             colour=None if colour is None else tuple(colour),
             camera_shift=tuple((name, tuple(shift[name])) for name in CAMERAS if name in shift),
             camera_turn=tuple((name, tuple(turn[name])) for name in CAMERAS if name in turn),
@@ -144,21 +162,9 @@ class Circumstances:
         )
 
 
-def changes_object(named: Mapping[str, Any]) -> bool:
-    """Return whether ranges, or what was drawn from them, make the object another than the model's."""
-    return not named.keys().isdisjoint(("mass", "size", "friction"))
-
-
-def draw(conditions: Sequence[Condition], seed: int) -> Circumstances:
-    """Return the circumstances of a seed: conditions take turns, each value has a random stream of its own.
-
-    So a range that is changed leaves the other draws as they were.
-    """
-    condition = conditions[seed % len(conditions)]
-    return Circumstances(
-        condition.name,
-        {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in condition.ranges.items()},
-    )
+def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
+    """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal."""
+    return (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
 
 
 def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:

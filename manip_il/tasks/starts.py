@@ -50,9 +50,7 @@ def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: Worl
         drawn = draw()
         if fits(drawn):
             return drawn
-    raise UsageError(
-        f"task {world.scene.task.name}: no place for {what} in reach of {world.scene.robot.name} was found"
-    )
+    raise UsageError(f"task {world.scene.task}: no place for {what} in reach of {world.scene.robot.name} was found")
 
 
 def resting_height(world: World, name: str) -> float:

@@ -10,7 +10,7 @@ import pytest
 from manip_il.cli import groups
 from manip_il.cli.main import main
 from manip_il.data.lerobot_io import read_provenance, read_spec, read_table, write_dataset
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.sim import render
 from manip_il.sim.env import EnvConfig

@@ -13,8 +13,8 @@ from kept import DeadlyKeep
 from ray.cluster_utils import Cluster
 
 from manip_il.data.journal import JournalKeep, list_episodes
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds

@@ -15,8 +15,8 @@ import pytest
 from kept import DeadlyKeep, FailingKeep
 
 from manip_il.data.journal import JournalKeep, list_episodes, list_seeds
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine, _tasks
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds

@@ -14,10 +14,9 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.data.journal import JournalKeep, list_episodes, read_journal
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.sight import drawn_cameras, policy_cameras
+from manip_il.engine.environments import env_fingerprint, env_spec, policy_cameras
+from manip_il.engine.jobs import RolloutJob, observed_cameras, run_job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import CheckpointMeta
@@ -133,10 +132,10 @@ def test_a_checkpoint_says_what_it_must_be_shown(act, seeing, tmp_path):
 
 def test_what_is_recorded_must_hold_what_the_policy_looks_at(act, seeing):
     job = RolloutJob(ENV, "policy", policy=seeing)
-    assert drawn_cameras(job) == DIM
+    assert observed_cameras(job) == DIM
     wide = CameraConfig(("wrist", "front"), 32, 32)
-    assert drawn_cameras(replace(job, cameras=wide)) == wide
-    assert drawn_cameras(replace(job, policy=act)) is None
+    assert observed_cameras(replace(job, cameras=wide)) == wide
+    assert observed_cameras(replace(job, policy=act)) is None
     for cameras, words in ((replace(wide, names=("wrist",)), "cameras"), (replace(wide, width=64), "size of pictures")):
         with pytest.raises(MismatchError, match=rf"{words} differs"):
             list(run_job(replace(job, cameras=cameras), SEEDS[:1]))

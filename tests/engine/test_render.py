@@ -17,7 +17,7 @@ from manip_il.data.lerobot_io import (
     read_table,
     write_dataset,
 )
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.engine.render import open_source, render_dataset, render_episodes, render_states
 from manip_il.errors import ManipError, MismatchError

@@ -15,6 +15,7 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.table import get_task
 
 from ..tables import every_scene, every_scene_with_an_object
 
@@ -25,7 +26,7 @@ HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 @pytest.fixture
 def world() -> World:
     world = World(build_scene("fetch", "pick_place"))
-    world.moved()
+    world.update()
     return world
 
 
@@ -127,7 +128,7 @@ def compiled_with(half: float, mass: float) -> mujoco.MjModel:
     from manip_il.sim.scene import scene_spec
 
     scene = build_scene("fetch", "lift")
-    spec = scene_spec(scene.robot, scene.task)
+    spec = scene_spec(scene.robot, get_task(scene.task))
     spec.geom(OBJECT).size, spec.geom(OBJECT).mass = [half] * 3, mass
     spec.body(OBJECT).pos = scene.model.body(OBJECT).pos
     return spec.compile()
@@ -147,7 +148,7 @@ def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, e
     world.vary(with_drawn(world.scene.nominal, {"size": edge}))
     world.place(OBJECT, np.array([0.6, 0.1, edge / 2 + 0.01]), UPRIGHT)
     mujoco.mj_step(world.model, world.data, 400)
-    world.moved()
+    world.update()
     assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
 
 
@@ -180,7 +181,7 @@ def test_a_restored_world_is_the_one_that_was_saved(world: World):
     other = World(world.scene)
     world.vary(with_drawn(world.scene.nominal, HEAVY))
     fall(world, 30)
-    world.moved()
+    world.update()
     other.restore(world.physics(), world.variation)
     assert other.physics().tobytes() == world.physics().tobytes()
     for name in (OBJECT, "robot/robot0:gripper_link"):
@@ -201,10 +202,10 @@ def test_what_was_worked_out_is_known_until_the_world_moves(world: World):
         return len(asked)
 
     assert [world.remember("answer", work_out) for _ in range(3)] == [1, 1, 1]
-    world.moved()
+    world.update()
     assert world.remember("answer", work_out) == 2
     world.vary(with_drawn(world.scene.nominal, HEAVY))
-    world.moved()
+    world.update()
     assert world.remember("answer", work_out) == 3
     world.restore(world.physics(), world.variation)
     assert world.remember("answer", work_out) == 4
@@ -217,7 +218,7 @@ def test_answers_follow_the_world(world: World):
         world.place(OBJECT, np.array([x, 0.1, 0.2]), UPRIGHT)
         world.place("goal", np.array([x, 0.0, 0.3]), UPRIGHT)
         world.data.qpos[world.scene.arm_q] = np.asarray(world.scene.robot.home) + (x - 0.6)
-        world.moved()
+        world.update()
         assert world.opening == pytest.approx(opening)
         assert world.pose(OBJECT).position[0] == world.goal[0] == pytest.approx(x)
         np.testing.assert_array_equal(world.ee.position, world.data.site("robot/ee").xpos)
@@ -226,7 +227,7 @@ def test_answers_follow_the_world(world: World):
 def test_placing_puts_an_object_at_rest(world: World):
     world.data.qvel[:] = 1.0
     world.place(OBJECT, np.array([0.5, 0.1, 0.3]), UPRIGHT)
-    world.moved()
+    world.update()
     np.testing.assert_array_equal(world.pose(OBJECT).position, [0.5, 0.1, 0.3])
     np.testing.assert_allclose(world.pose(OBJECT).rotation, np.eye(3))
     assert not world.data.joint(OBJECT).qvel.any()

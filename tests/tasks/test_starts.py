@@ -38,7 +38,7 @@ def world_of(robot: str, task: str, edge: float | None = None) -> World:
 
 
 def start(world: World, seed: int) -> Start:
-    return world.scene.task.draw(rng_for(seed, "reset"), world)
+    return get_task(world.scene.task).draw(rng_for(seed, "reset"), world)
 
 
 def position(drawn: Start, name: str) -> np.ndarray:
@@ -149,7 +149,7 @@ def test_a_drawn_turn_is_about_the_vertical_and_no_wider_than_asked(widest: floa
 
 
 def test_where_nothing_fits_the_error_names_task_thing_and_robot():
-    scene = SimpleNamespace(task=SimpleNamespace(name="stack"), robot=SimpleNamespace(name="dwarf"))
+    scene = SimpleNamespace(task="stack", robot=SimpleNamespace(name="dwarf"))
     with pytest.raises(UsageError, match="task stack: no place for the goal in reach of dwarf was found"):
         draw_until(lambda: np.zeros(3), lambda at: False, SimpleNamespace(scene=scene), "the goal")
 
