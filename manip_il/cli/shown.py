@@ -66,7 +66,7 @@ def film_episode(job: RolloutJob, episode: Episode) -> Film:
     from manip_il.sim.conditions import NOMINAL, draw
 
     met = draw(job.conditions or (NOMINAL,), episode.seed)
-    frames = film(episode, job.env, every=FILM_EVERY, appearance=met.appearance)
+    frames = film(episode, job.env, every=FILM_EVERY, drawn=met)
     fps = job.env.control_hz // FILM_EVERY or 1
     return make_film(caption(job, episode).capitalize(), frames, fps, success=episode.success)
 

@@ -89,16 +89,13 @@ class NoisyExpertDriver:
     """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: (n, n), of actions."""
 
     def __init__(self, covariance: F64):
-        self._covariance = covariance
-        self._rngs: dict[int, np.random.Generator] = {}
+        self._mean, self._covariance = np.zeros(len(covariance)), covariance
+        self._rngs = _Generators("dart")
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
         """Return the label (n,) plus a draw from each episode's own generator."""
-        return [(turn.query().action + self._draw(turn.seed), Actor.NOISY_EXPERT) for turn in turns]
-
-    def _draw(self, seed: int) -> F64:
-        rng = self._rngs.setdefault(seed, rng_for(seed, "dart"))
-        return rng.multivariate_normal(np.zeros(len(self._covariance)), self._covariance)
+        noise = [self._rngs[turn.seed].multivariate_normal(self._mean, self._covariance) for turn in turns]
+        return [(turn.query().action + one, Actor.NOISY_EXPERT) for turn, one in zip(turns, noise, strict=True)]
 
 
 class LearnerDriver:
@@ -117,14 +114,13 @@ class MixtureDriver:
 
     def __init__(self, policy: Policy, beta: float):
         self._learner, self._beta = LearnerDriver(policy), beta
-        self._rngs: dict[int, np.random.Generator] = {}
+        self._rngs = _Generators("mixture")
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
         """Return the learner's or the expert's action (n,), by each episode's own generator."""
         actions = self._learner.act(turns)
         for i, turn in enumerate(turns):
-            rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "mixture"))
-            if rng.uniform() < self._beta:
+            if self._rngs[turn.seed].uniform() < self._beta:
                 actions[i] = (turn.query().action, Actor.EXPERT)
         return actions
 
@@ -169,16 +165,12 @@ class RandomDriver:
     """Joint targets drawn evenly within the longest step of the measured joints, any gripper opening."""
 
     def __init__(self, actions: ActionSpace):
-        self._actions = actions
-        self._rngs: dict[int, np.random.Generator] = {}
+        self._actions, self._rngs = actions, _Generators("random policy")
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
         """Return a drawn action (n,) for every turn."""
-        return [(self._draw(turn), Actor.LEARNER) for turn in turns]
-
-    def _draw(self, turn: Turn) -> F64:
-        rng = self._rngs.setdefault(turn.seed, rng_for(turn.seed, "random policy"))
-        return self._actions.random_near(turn.observation.state.astype(np.float64), rng)
+        draw, rngs = self._actions.random_near, self._rngs
+        return [(draw(turn.observation.state, rngs[turn.seed]), Actor.LEARNER) for turn in turns]
 
 
 def action_gap(left: F64, right: F64, scale: F64) -> F64:
@@ -203,13 +195,8 @@ def at_drawn_step(horizon: int) -> Gate:
 
 def by_chance(probability: float) -> Gate:
     """Query in each step with the same probability, drawn from the episode's own generator."""
-    rngs: dict[int, np.random.Generator] = {}
-
-    def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> list[bool]:
-        own = [rngs.setdefault(turn.seed, rng_for(turn.seed, _STREAM)) for turn in turns]
-        return [rng.uniform() < probability for rng in own]
-
-    return gate
+    rngs = _Generators(_STREAM)
+    return lambda turns, actions: [rngs[turn.seed].uniform() < probability for turn in turns]
 
 
 def on_gap(bound: float, scale: F64) -> Gate:
@@ -248,6 +235,17 @@ def on_low_likelihood(bound: float, learner: Policy) -> Gate:
         return (learner.log_prob(*observed, stacked) / stacked.shape[1] < bound).tolist()
 
     return gate
+
+
+class _Generators(dict[int, np.random.Generator]):
+    """A random generator for every episode, by its seed."""
+
+    def __init__(self, stream: str):
+        super().__init__()
+        self._stream = stream
+
+    def __missing__(self, seed: int) -> np.random.Generator:
+        return self.setdefault(seed, rng_for(seed, self._stream))
 
 
 def _policy_actions(policy: Policy, turns: Sequence[Turn]) -> F64:

@@ -104,7 +104,10 @@ class Engine:
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
         if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
-            yield from _run_here(job, wanted, keep)
+            for episode in run_job(job, wanted):
+                if keep is not None:
+                    keep.store(episode.seed, keep.pack(episode))
+                yield episode
             return
         if self._pool is None:
             self._pool = _open_pool(self._backend, self.workers)
@@ -151,7 +154,8 @@ class Engine:
                     assert event.episode is not None
                     left[event.task].discard(event.episode.seed)
                     deaths_without_progress = 0
-                    _store(event)
+                    if event.packed is not None and event.task.keep is not None:
+                        event.task.keep.store(event.episode.seed, event.packed)
                     yield event.episode
                     continue
                 unfinished = sorted(left.pop(event.task))
@@ -183,18 +187,6 @@ def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
 def portable(error: Exception) -> Exception:
     """Return the error in a form that pickles: the program's own as it is, others in words."""
     return error if isinstance(error, ManipError) else ManipError(f"{type(error).__name__}: {error}")
-
-
-def _run_here(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[Episode]:
-    for episode in run_job(job, seeds):
-        if keep is not None:
-            keep.store(episode.seed, keep.pack(episode))
-        yield episode
-
-
-def _store(event: Event) -> None:
-    if event.packed is not None and event.task.keep is not None and event.episode is not None:
-        event.task.keep.store(event.episode.seed, event.packed)
 
 
 def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:

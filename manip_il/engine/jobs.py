@@ -94,12 +94,12 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     if not seeds:
         return
     cameras = observed_cameras(job)
-    envs = [_make_env(ManipEnv, job, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
+    envs = [ManipEnv.of(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
     expert = _expert(job.env.robot, job.env.task)
     transitions = rollout(envs, seeds, _make_driver(job, envs[0]), _rules(job), expert)
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
-    branch_env = _make_env(_BranchEnv, job, job.cameras) if job.label == "branch" else None
+    branch_env = _BranchEnv.of(job.env, job.cameras) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
         yield _to_episode(job, frames, expert, branch_env)
 
@@ -124,15 +124,6 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     if wanted.size != job.cameras.size:
         raise MismatchError("size of pictures", str(job.policy), wanted.size, "the recording", job.cameras.size)
     return job.cameras
-
-
-def _make_env[E: ManipEnv](
-    kind: type[E], job: RolloutJob, cameras: CameraConfig | None, conditions: tuple[Condition, ...] = ()
-) -> E:
-    if cameras is None:
-        return kind(config=job.env, conditions=conditions)
-    size, look = cameras.size, cameras.look
-    return kind(config=job.env, conditions=conditions, cameras=cameras.names, image_size=size, look=look)
 
 
 def _make_driver(job: RolloutJob, env: ManipEnv) -> Driver:

@@ -34,8 +34,9 @@ from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import PLAIN, Appearance, CameraConfig
+from manip_il.sim.look import CameraConfig
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -140,14 +141,14 @@ def render_episodes(
 
 
 def render_states(
-    env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], appearance: Appearance = PLAIN
+    env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], drawn: Drawn = NOMINAL_VALUES
 ) -> Pictures:
     """Return pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
 
-    The bytes are those that an environment with these cameras gave when it was in these states and looked so.
+    drawn: what their episode draws. An environment with these cameras gives the same bytes in these states.
     """
-    view = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
-    view.appearance = appearance
+    view = ManipEnv.of(env, cameras)
+    view.drawn = drawn
     pictures = {
         schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
     }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
-from manip_il.sim.look import CAMERAS, PLAIN, Appearance
+from manip_il.sim.look import CAMERAS
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
@@ -40,7 +40,7 @@ _BOUNDS: dict[str, Range] = {
 _WHOLE = ("knock_step", "delay")
 _MODEL = ("mass", "size", "friction")  # of the object, in physics
 _OBJECT = ("knock", "colour", *_MODEL)
-_PICTURES = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")
+PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Condition:
 
         None where nothing of it is left.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else _PICTURES)}
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED)}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
@@ -144,22 +144,6 @@ class Drawn:
     def number(self, name: str, default: float = 0.0) -> float:
         """Return a drawn number, or the nominal one."""
         return float(self.values.get(name, default))
-
-    @property
-    def appearance(self) -> Appearance:
-        """Values that change pictures and not physics, with the size of the object that both have."""
-        if not self.values.keys() & {*_PICTURES, "size"}:
-            return PLAIN
-        shift, turn = self.values.get("camera_shift", {}), self.values.get("camera_turn", {})
-        colour = self.values.get("colour")
-        return Appearance(
-            edge=self.values.get("size"),
-            colour=None if colour is None else tuple(colour),
-            camera_shift=tuple((name, tuple(shift[name])) for name in CAMERAS if name in shift),
-            camera_turn=tuple((name, tuple(turn[name])) for name in CAMERAS if name in turn),
-            brightness=self.number("brightness", 1.0),
-            light_turn=self.number("light_turn"),
-        )
 
 
 def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
@@ -221,3 +205,4 @@ def _words(range_: Range) -> str:
 
 
 NOMINAL = Condition()
+NOMINAL_VALUES = NOMINAL.draw(0)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, Self
 
 import gymnasium
 import mujoco
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from manip_il.errors import UsageError
 from manip_il.mdp import LONGEST_EPISODE, Observation, State
 from manip_il.seeding import rng_for
-from manip_il.sim.conditions import Condition, Drawn, draw
+from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
 from manip_il.sim.events import Events
 from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.render import Picture, pictures
@@ -88,7 +88,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.world = World(build_scene(self.config.robot, self.config.task))
         self._task = get_task(self.config.task)
         self._conditions = tuple(conditions)
-        self._begin(0, draw((), 0))
+        self._begin(0, NOMINAL_VALUES)
         self.render_mode = render_mode
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
@@ -99,6 +99,14 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._ever = False
         self.action_space = _bounded(self.scene.actions.low, self.scene.actions.high)
         self.observation_space = self._observation_space()
+
+    @classmethod
+    def of(cls, config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> Self:
+        """Make an environment of configurations."""
+        if cameras is None:
+            return cls(config=config, conditions=conditions)
+        size, look = cameras.size, cameras.look
+        return cls(config=config, cameras=cameras.names, image_size=size, look=look, conditions=conditions)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -138,7 +146,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _begin(self, seed: int, drawn: Drawn) -> None:
         """Make ready for an episode with these values."""
-        self.drawn, self.appearance = drawn, drawn.appearance
+        self.drawn = drawn
         self._events = Events.of(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
         self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
@@ -231,7 +239,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras, self.appearance)
+        return pictures(self.config.robot, self.config.task, self.data, cameras, self.drawn)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

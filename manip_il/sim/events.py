@@ -177,7 +177,7 @@ STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), kn
 
 
 class Events:
-    """What happens in one episode, drawn from its seed: `drawn` has what, how much and when.
+    """Events of one episode: which, how much and when is in `drawn`, the rest is drawn from the seed.
 
     Raises `UsageError` for a perturbation that needs an object in a task without one.
     """
@@ -200,7 +200,7 @@ class Events:
         return Events(world, drawn, seed) if drawn.values.keys() & {"knock", "action_noise", *KINDS} else None
 
     def before(self, step: int) -> bool:
-        """Change the world, where this is the step for it; returns whether a perturbation did.
+        """Apply the events of a step to the world; returns whether a perturbation changed it.
 
         A perturbation that finds no place, or changes nothing (fingers that are open already), leaves the world as it
         was, bit for bit.

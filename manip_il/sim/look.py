@@ -1,4 +1,4 @@
-"""Settings of pictures: which cameras, how large, in what light, and how one episode looks different."""
+"""Settings of pictures: which cameras, how large, and in what light."""
 
 from __future__ import annotations
 
@@ -64,23 +64,3 @@ class CameraConfig:
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.height, self.width
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """Difference of one episode's pictures from the model's.
-
-    edge: of the cube [m], None for the model's. colour: red, green and blue of the cube, 0 to 1. camera_shift [m] and
-    camera_turn (a rotation vector [deg]): (camera, (x, y, z)), in the camera's own frame. brightness: factor on every
-    lamp; light_turn: of the lamps about the vertical through the world's origin [deg].
-    """
-
-    edge: float | None = None
-    colour: tuple[float, ...] | None = None
-    camera_shift: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    camera_turn: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    brightness: float = 1.0
-    light_turn: float = 0.0
-
-
-PLAIN = Appearance()

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.look import CAMERAS, PLAIN, Appearance, CameraConfig, Look
+from manip_il.sim.look import CAMERAS, CameraConfig, Look
 from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.view import ViewModel
 
@@ -22,15 +23,15 @@ _MAX_GEOMS = 1_000
 
 
 def pictures(
-    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, appearance: Appearance = PLAIN
+    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, drawn: Drawn = NOMINAL_VALUES
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    A picture depends on `qpos`, the goal and the appearance alone: whoever asks, in any order, gets the same bytes.
+    A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
     Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(robot, task, cameras.look)
-    renderer.pose(data, appearance)
+    renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
@@ -55,9 +56,9 @@ class _Renderer:
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
             raise RuntimeError("it has no off-screen buffers")
 
-    def pose(self, data: mujoco.MjData, appearance: Appearance) -> None:
-        """Put everything where `data` has it, and make it look as `appearance` says."""
-        self._view.apply(appearance)
+    def pose(self, data: mujoco.MjData, drawn: Drawn) -> None:
+        """Put everything where `data` has it, and apply what the episode draws."""
+        self._view.apply(drawn)
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

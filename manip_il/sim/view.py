@@ -1,6 +1,6 @@
 """The model that pictures are drawn from: the physics model's copy with few faces, lit by a `Look`.
 
-It takes the appearance of one episode, and is plain again for the next.
+It is changed by what one episode draws, and as it was again for the next.
 
 A software renderer pays for every triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 """
@@ -8,6 +8,7 @@ A software renderer pays for every triangle, and the Panda's meshes have 136,040
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -15,7 +16,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.look import PLAIN, Appearance, Look
+from manip_il.sim.conditions import PICTURED, Drawn
+from manip_il.sim.look import CAMERAS, Look
 from manip_il.sim.scene import build_scene, camera_id
 
 F64 = NDArray[np.float64]
@@ -42,41 +44,43 @@ class ViewModel:
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
         self._headlight = [colour.copy() for colour in self._headlight_colours()]
-        self._applied = PLAIN
+        self._applied: dict[str, Any] = {}
 
-    def apply(self, appearance: Appearance) -> None:
-        """Look like this from the next picture on. None of it lies on the graphics card, so OpenGL need not know."""
-        if appearance == self._applied:
+    def apply(self, drawn: Drawn) -> None:
+        """Apply what an episode draws to the next pictures. None of it lies on the graphics card."""
+        values = {name: drawn.values[name] for name in ("size", *PICTURED) if name in drawn.values}
+        if values == self._applied:
             return
         for name, plain in self._plain.items():
             getattr(self.model, name)[:] = plain
         for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
             colour[:] = plain
-        self._change_objects(appearance)
-        self._move_cameras(appearance)
-        self._light(appearance.brightness, appearance.light_turn)
-        self._applied = appearance
+        self._change_objects(values.get("size"), values.get("colour"))
+        for camera in CAMERAS:
+            self._move_camera(camera, values.get("camera_shift", {}), values.get("camera_turn", {}))
+        self._light(drawn.number("brightness", 1.0), drawn.number("light_turn"))
+        self._applied = values
 
     def _headlight_colours(self) -> list[Any]:
         lamp = self.model.vis.headlight
         return [lamp.ambient, lamp.diffuse, lamp.specular]
 
-    def _change_objects(self, appearance: Appearance) -> None:
+    def _change_objects(self, edge: float | None, colour: Sequence[float] | None) -> None:
         for geom in self._geoms:
-            if appearance.edge is not None:
-                self.model.geom_size[geom] *= appearance.edge / 2 / self.model.geom_size[geom].max()
-            if appearance.colour is not None:
+            if edge is not None:
+                self.model.geom_size[geom] *= edge / 2 / self.model.geom_size[geom].max()
+            if colour is not None:
                 self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
-                self.model.geom_rgba[geom] = [*appearance.colour, 1.0]
+                self.model.geom_rgba[geom] = [*colour, 1.0]
 
-    def _move_cameras(self, appearance: Appearance) -> None:
-        shifts, turns = dict(appearance.camera_shift), dict(appearance.camera_turn)
-        for name in {*shifts, *turns}:
-            camera = camera_id(self.model, name)
-            quat, turn, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
-            mujoco.mju_rotVecQuat(moved, np.asarray(shifts.get(name, (0.0, 0.0, 0.0))), quat)
+    def _move_camera(self, name: str, shifts: Mapping[str, Any], turns: Mapping[str, Any]) -> None:
+        camera = camera_id(self.model, name)
+        quat, turn, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
+        if name in shifts:
+            mujoco.mju_rotVecQuat(moved, np.asarray(shifts[name]), quat)
             self.model.cam_pos[camera] += moved
-            vector = np.deg2rad(turns.get(name, (0.0, 0.0, 0.0)))
+        if name in turns:
+            vector = np.deg2rad(turns[name])
             angle = float(np.linalg.norm(vector))
             mujoco.mju_axisAngle2Quat(turn, vector / angle if angle else np.array([1.0, 0, 0]), angle)
             mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turn)

@@ -163,7 +163,8 @@ class World:
     @property
     def ee(self) -> Pose:
         """The frame between the fingertips: z out of the hand, y along the fingers' motion."""
-        return self.remember("ee", self._ee)
+        at = self.scene.ee_site
+        return self.remember("ee", lambda: Pose(self.data.site_xpos[at], self.data.site_xmat[at].reshape(3, 3)))
 
     def pose(self, name: str) -> Pose:
         """Return the pose of a body. Raises `UnknownName`."""
@@ -179,7 +180,7 @@ class World:
     @property
     def opening(self) -> float:
         """Opening between the gripper's pads."""
-        return self.remember("opening", self._opening)
+        return self.remember("opening", lambda: self.scene.gripper.opening(self.data.qpos))
 
     @property
     def most_opening(self) -> float:
@@ -203,13 +204,6 @@ class World:
     def reach(self) -> Reach:
         """Map of the points that the hand, pointing down, gets to."""
         return self.scene.reach
-
-    def _ee(self) -> Pose:
-        site = self.scene.ee_site
-        return Pose(self.data.site_xpos[site], self.data.site_xmat[site].reshape(3, 3))
-
-    def _opening(self) -> float:
-        return self.scene.gripper.opening(self.data.qpos)
 
     @cached_property
     def has_goal(self) -> bool:

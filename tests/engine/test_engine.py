@@ -125,7 +125,7 @@ def test_workers_end_with_the_process_that_started_them():
         "from manip_il.sim.env import EnvConfig\n"
         "engine = Engine(2)\n"
         "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
-        "    pids = [worker._process.pid for worker in engine._place._busy.values()]\n"
+        "    pids = [worker._process.pid for worker in engine._pool._busy.values()]\n"
         "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
         "    print(pids, flush=True)\n"
     )

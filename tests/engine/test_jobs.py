@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.data.schema import fitted_columns
 from manip_il.engine.engine import Engine, default_workers
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Episode
@@ -94,15 +94,6 @@ def test_labels_of_the_last_step_alone_tell_the_phase_at_the_end():
 def test_no_seeds_give_no_episodes():
     assert list(run_job(EXPERT, [])) == []
     assert list(Engine().run(EXPERT, [])) == []
-
-
-def test_an_environments_description_names_what_it_is():
-    spec, fingerprint = env_spec(EnvConfig("fetch", "lift", control_hz=25)), env_fingerprint(EnvConfig("fetch"))
-    assert (spec.robot, spec.task, spec.fps) == ("fetch", "lift", 25)
-    assert spec.joint_names[-1] == "gripper"
-    assert env_fingerprint(EnvConfig("fetch")) == fingerprint
-    assert env_fingerprint(EnvConfig("panda")) != fingerprint
-    assert env_fingerprint(EnvConfig("fetch", tolerance=0.05)) != fingerprint
 
 
 def test_an_engine_wants_a_worker():

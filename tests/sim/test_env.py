@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from manip_il.errors import MismatchError, NotFiniteError, UnknownName, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv, environment_state_names
 from manip_il.sim.register import ENV_IDS, register_envs
@@ -240,13 +240,6 @@ def test_every_number_that_a_learner_sees_has_a_name(robot: str, task: str):
     assert len(seen.environment_state) == len(names) == len(set(names))
     assert len(seen.state) == len(env.scene.robot.joint_names)
     assert env.observation_space.contains({"agent_pos": seen.state, "environment_state": seen.environment_state})
-
-
-def test_a_name_that_is_unknown_gets_the_nearest():
-    with pytest.raises(UnknownName, match="did you mean 'panda'"):
-        ManipEnv("pnada")
-    with pytest.raises(UnknownName, match="did you mean 'pick_place'"):
-        ManipEnv("panda", "pick_and_place")
 
 
 @pytest.mark.parametrize(

@@ -273,10 +273,6 @@ def test_without_an_object_neither_it_nor_the_gripper_matters():
     assert kinds_for(TASKS["lift"]) == kinds_for(TASKS["pick_place"]) == KINDS
 
 
-def test_every_kind_changes_either_the_world_or_an_action():
-    assert all((kind.change is None) != (kind.wrong is None) for kind in KINDS.values())
-
-
 def test_a_perturbation_that_cannot_be_is_refused():
     with pytest.raises(UnknownName, match="did you mean 'jolt'"):
         Perturbation("jolts")

@@ -9,17 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
-from manip_il.tasks.table import get_task
 
 from ..tables import every_scene, every_scene_with_an_object
 
-SEED = 5_000_000
 HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 
 
@@ -109,29 +106,6 @@ def test_physics_has_what_the_variation_says(edge: float, mass: float, friction:
     np.testing.assert_allclose(model.dof_invweight0[one.v : one.v + 3], 1 / mass)
     np.testing.assert_allclose(model.dof_invweight0[one.v + 3 : one.v + 6], 6 / (mass * edge**2))
     assert model.geom_rbound[one.geom] == pytest.approx(np.sqrt(3) * edge / 2)
-
-
-def test_a_varied_model_is_the_model_compiled_with_those_numbers():
-    drawn = {"size": 0.064, "mass": 0.21}
-    world = World(build_scene("fetch", "lift"))
-    world.vary(with_drawn(world.scene.nominal, drawn))
-    compiled = compiled_with(half=0.032, mass=0.21)
-    for name in ("body_mass", "body_inertia", "body_subtreemass", "dof_invweight0", "geom_size", "geom_rbound",
-                 "geom_aabb", "geom_friction", "bvh_aabb", "body_invweight0"):  # fmt: skip
-        np.testing.assert_allclose(
-            getattr(world.model, name), getattr(compiled, name), rtol=1e-9, atol=1e-12, err_msg=name
-        )
-
-
-def compiled_with(half: float, mass: float) -> mujoco.MjModel:
-    """Lift's scene with a cube that was made so."""
-    from manip_il.sim.scene import scene_spec
-
-    scene = build_scene("fetch", "lift")
-    spec = scene_spec(scene.robot, get_task(scene.task))
-    spec.geom(OBJECT).size, spec.geom(OBJECT).mass = [half] * 3, mass
-    spec.body(OBJECT).pos = scene.model.body(OBJECT).pos
-    return spec.compile()
 
 
 def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
@@ -241,12 +215,3 @@ def test_what_cannot_be_placed_is_refused_by_name(world: World):
         world.pose("gaol")
     with pytest.raises(ManipError, match="'robot/robot0:gripper_link' is neither an object nor a mocap body"):
         world.place("robot/robot0:gripper_link", np.zeros(3), UPRIGHT)
-
-
-@every_scene
-def test_an_environments_state_holds_its_variation(robot: str, task: str):
-    env = ManipEnv(robot, task)
-    env.start(SEED)
-    state = env.get_state()
-    np.testing.assert_array_equal(state.variation, env.scene.nominal)
-    assert state.to_vector().size == env.scene.state_size + len(env.scene.nominal) + 4
