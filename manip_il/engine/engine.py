@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Literal, Protocol
@@ -43,13 +43,12 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Event:
-    """Message of a task: an episode ended, all did, its worker died, or the work itself failed.
+class Message:
+    """Message of a worker: an episode ended, all did, the worker died, or the work itself failed.
 
-    episode: without pictures. packed: what is still to be stored here.
+    episode: without pictures. packed: what is still to be stored in the engine's process.
     """
 
-    task: Task
     kind: Literal["episode", "done", "died", "failed"]
     episode: Episode | None = None
     packed: Any = None
@@ -72,8 +71,8 @@ class Pool(Protocol):
         """Start a task."""
         ...
 
-    def wait(self) -> list[Event]:
-        """Wait until tasks have messages; returns at least one event."""
+    def wait(self) -> list[tuple[Task, Message]]:
+        """Wait until tasks have messages; returns at least one."""
         ...
 
     def close(self, in_order: bool) -> None:
@@ -146,25 +145,25 @@ class Engine:
                 task = waiting.popleft()
                 left[task] = set(task.seeds)
                 pool.submit(task)
-            for event in pool.wait():
-                if event.kind == "failed":
-                    assert event.error is not None
-                    raise event.error
-                if event.kind == "episode":
-                    assert event.episode is not None
-                    left[event.task].discard(event.episode.seed)
+            for task, message in pool.wait():
+                if message.kind == "failed":
+                    assert message.error is not None
+                    raise message.error
+                if message.kind == "episode":
+                    assert message.episode is not None
+                    left[task].discard(message.episode.seed)
                     deaths_without_progress = 0
-                    if event.packed is not None and event.task.keep is not None:
-                        event.task.keep.store(event.episode.seed, event.packed)
-                    yield event.episode
+                    if message.packed is not None and task.keep is not None:
+                        task.keep.store(message.episode.seed, message.packed)
+                    yield message.episode
                     continue
-                unfinished = sorted(left.pop(event.task))
-                if event.kind == "died":
+                unfinished = sorted(left.pop(task))
+                if message.kind == "died":
                     deaths_without_progress += 1
-                    self._retry(event.task, unfinished, deaths, waiting)
+                    self._retry(task, unfinished, deaths, waiting)
                     if deaths_without_progress > MAX_DEATHS * (pool.workers + 1):
                         raise ManipError(
-                            f"{deaths_without_progress} rollout workers died one after the other ({event.error}); "
+                            f"{deaths_without_progress} rollout workers died one after the other ({message.error}); "
                             "finished episodes are kept"
                         )
 
@@ -178,10 +177,21 @@ class Engine:
                 waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
 
 
-def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
-    """Run a task in a worker: yields each episode as it ends, without pictures, and what is to be stored of it."""
-    for episode in run_job(task.job, task.seeds):
-        yield episode.without_pictures(), task.keep.pack(episode) if task.keep is not None else None
+def run_task(get_task: Callable[[], Task], store: bool) -> Iterator[Message]:
+    """Run a task in a worker: yields a message for each episode as it ends, and one for the end or a failure.
+
+    store: whether episodes are stored here, or in the engine's process.
+    """
+    try:
+        task = get_task()
+        for episode in run_job(task.job, task.seeds):
+            packed = task.keep.pack(episode) if task.keep is not None else None
+            if store and task.keep is not None:
+                task.keep.store(episode.seed, packed)
+            yield Message("episode", episode.without_pictures(), None if store else packed)
+        yield Message("done")
+    except Exception as error:
+        yield Message("failed", error=portable(error))
 
 
 def portable(error: Exception) -> Exception:

@@ -9,14 +9,14 @@ import os
 import pickle
 import signal
 from collections.abc import Generator, Iterator
+from functools import partial
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from manip_il.child_processes import bound_to_this_process, watch_parent
-from manip_il.engine.engine import Event, Task, portable, run_task
+from manip_il.engine.engine import Message, Task, run_task
 from manip_il.errors import ManipError
-from manip_il.mdp import Episode
 
 # Workers are forked from a server that has imported what they need, and nothing else: neither OpenGL nor threads are
 # shared, and the import of torch, seconds of work, is paid once and not by every worker.
@@ -85,18 +85,19 @@ class LocalProcesses:
         self._busy[worker.connection] = worker
         worker.start(task)
 
-    def wait(self) -> list[Event]:
-        """Return one event of every worker that has a message."""
-        events: list[Event] = []
+    def wait(self) -> list[tuple[Task, Message]]:
+        """Return one message of every worker that has one."""
+        messages: list[tuple[Task, Message]] = []
         for ready in wait(list(self._busy)):
             assert isinstance(ready, Connection)
-            event = self._busy[ready].receive()
-            events.append(event)
-            if event.kind != "episode":
-                worker = self._busy.pop(ready)
-                if event.kind != "died":
+            worker = self._busy[ready]
+            task, message = worker.receive()
+            messages.append((task, message))
+            if message.kind != "episode":
+                del self._busy[ready]
+                if message.kind != "died":
                     self._idle.append(worker)
-        return events
+        return messages
 
     def close(self, in_order: bool) -> None:
         """End all workers."""
@@ -123,15 +124,14 @@ class _Worker:
         with contextlib.suppress(OSError):  # a worker that died meanwhile is found by `receive`
             self.connection.send_bytes(pickle.dumps(task))
 
-    def receive(self) -> Event:
+    def receive(self) -> tuple[Task, Message]:
         assert self._task is not None
         try:
-            kind, episode, error = self.connection.recv()
+            return self._task, self.connection.recv()
         except (EOFError, OSError):
             self._process.join()
             self.connection.close()
-            return Event(self._task, "died", error=RuntimeError(_cause(self._process.exitcode)))
-        return Event(self._task, kind, episode, error=error)
+            return self._task, Message("died", error=RuntimeError(_cause(self._process.exitcode)))
 
     def stop(self, in_order: bool) -> None:
         if not in_order:
@@ -149,20 +149,9 @@ def _serve(connection: Connection) -> None:
     watch_parent()
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while True:
-            for message in _answer(connection.recv_bytes()):
+            pickled = connection.recv_bytes()  # from the process that started this one
+            for message in run_task(partial(pickle.loads, pickled), store=True):
                 connection.send(message)
-
-
-def _answer(pickled: bytes) -> Iterator[tuple[str, Episode | None, Exception | None]]:
-    try:
-        task: Task = pickle.loads(pickled)  # from the process that started this one
-        for episode, packed in run_task(task):
-            if task.keep is not None:
-                task.keep.store(episode.seed, packed)
-            yield "episode", episode, None
-        yield "done", None, None
-    except Exception as error:
-        yield "failed", None, portable(error)
 
 
 def _cause(exit_code: int | None) -> str:

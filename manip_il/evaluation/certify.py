@@ -111,7 +111,7 @@ class _Run:
         """After a perturbation."""
         moments = {seed: draw_moment(seed, kind, run.steps) for seed, run in self._undisturbed.items()}
         longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
-        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments=moments),))
+        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
             moment, run = moments[episode.seed], self._undisturbed[episode.seed]

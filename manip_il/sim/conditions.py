@@ -6,8 +6,8 @@ Whose values are applied where: to the model by `variation.py`, to pictures by `
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,57 +38,38 @@ _BOUNDS: dict[str, Range] = {
     "light_turn": (-180, 180),
 }
 _WHOLE = ("knock_step", "delay")
+_KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
 _MODEL = ("mass", "size", "friction")  # of the object, in physics
 _OBJECT = ("knock", "colour", *_MODEL)
 PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Condition:
     """Ranges (low, high), both ends included; without one the world is nominal in that.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
-    knock: the object is moved by so much once [m], at a control step of knock_step. joint_noise [rad], position_noise
-    [m]: standard deviations of Gaussian noise on the joints and the object's position in a policy's observations.
-    delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction of the
-    cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a drawn
-    direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+    knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
+    [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
+    policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
+    of the cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a
+    drawn direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
 
-    Raises `UsageError` for a range that is empty or out of bounds.
+    Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
     """
 
-    name: str = "nominal"
-    action_noise: Range | None = None
-    knock: Range | None = None
-    knock_step: Range = (5, 24)
-    joint_noise: Range | None = None
-    position_noise: Range | None = None
-    delay: Range | None = None
-    mass: Range | None = None
-    size: Range | None = None
-    friction: Range | None = None
-    colour: Range | None = None
-    camera_shift: Range | None = None
-    camera_turn: Range | None = None
-    brightness: Range | None = None
-    light_turn: Range | None = None
+    name: str
+    ranges: Mapping[str, Range] = field(hash=False)
 
-    def __post_init__(self) -> None:
-        _require_name("a condition's name", self.name)
-        for name in _BOUNDS:
-            given = getattr(self, name)
-            if given is not None:
-                _require_range(f"{self.name}: {name}", given, _BOUNDS[name], whole=name in _WHOLE)
-
-    @property
-    def ranges(self) -> dict[str, Range]:
-        """Name -> range of everything that is drawn, in the order of the fields."""
-        given = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "name"}
-        return {
-            name: range_
-            for name, range_ in given.items()
-            if range_ is not None and (name != "knock_step" or self.knock is not None)
-        }
+    def __init__(self, name: str = "nominal", **ranges: Range):
+        _require_name("a condition's name", name)
+        _require_known(name, ranges)
+        if "knock" in ranges:
+            ranges = {"knock_step": _KNOCK_STEP} | ranges
+        for one, range_ in ranges.items():
+            _require_range(f"{name}: {one}", range_, _BOUNDS[one], whole=one in _WHOLE)
+        kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
         """Return the condition without what has no effect on a task without an object, or a policy without cameras.
@@ -120,9 +101,7 @@ class Condition:
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
         """Make a condition of ranges as YAML or JSON has them, `[low, high]` or one number; else `UsageError`."""
-        for key in tree:
-            if key not in _BOUNDS:
-                raise UnknownName(f"key in {name}:", str(key)[: checks.LONGEST_NAME], _BOUNDS)
+        _require_known(name, tree)
         return cls(name, **{key: _as_range(f"{name}: {key}", value) for key, value in tree.items()})
 
     def __str__(self) -> str:
@@ -172,6 +151,12 @@ def _require_name(what: str, name: object) -> None:
         checks.name(what, name)
     except ManipError as error:
         raise UsageError(str(error)) from None
+
+
+def _require_known(what: str, names: Iterable[object]) -> None:
+    for name in names:
+        if name not in _BOUNDS:
+            raise UnknownName(f"key in {what}:", str(name)[: checks.LONGEST_NAME], _BOUNDS)
 
 
 def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:

@@ -6,7 +6,7 @@ Functions that change the world do it in place, and draw from the generator that
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -144,20 +144,18 @@ def kinds_for(task: Task) -> dict[str, Kind]:
     return {name: kind for name, kind in KINDS.items() if task.grasped or not kind.needs_object}
 
 
-@dataclass(frozen=True)
 class Perturbation(Condition):
-    """A condition under which one of `KINDS`, its name, happens once.
+    """A condition under which one of `KINDS` happens once. moments: seed -> the control step at which it does."""
 
-    moments: the episode's seed -> the control step at which it does.
-    """
+    moments: Mapping[int, int]
 
-    moments: Mapping[int, int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.name not in KINDS:
-            raise UnknownName("perturbation", self.name, KINDS)
-        if any(step < 0 for step in self.moments.values()):
-            raise UsageError(f"a perturbation at step {min(self.moments.values())}; expected 0 or later")
+    def __init__(self, kind: str, moments: Mapping[int, int]):
+        super().__init__(kind)
+        if kind not in KINDS:
+            raise UnknownName("perturbation", kind, KINDS)
+        if any(step < 0 for step in moments.values()):
+            raise UsageError(f"a perturbation at step {min(moments.values())}; expected 0 or later")
+        vars(self).update(moments=moments)
 
     def draw(self, seed: int) -> Drawn:
         """Return the step at which it happens. Raises `UsageError` where none is given for the seed."""
@@ -170,7 +168,8 @@ class _Training(Condition):
     """A condition whose knock is drawn when it happens, as in all rollouts that were recorded so far."""
 
     def draw(self, seed: int) -> Drawn:
-        return Drawn(self.name, {**super().draw(seed).values, "knock": self.knock, "knock_step": self.knock_step})
+        late = {name: self.ranges[name] for name in ("knock", "knock_step")}
+        return Drawn(self.name, {**super().draw(seed).values, **late})
 
 
 STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))

@@ -122,7 +122,7 @@ def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate
     expert = Expert(build_scene("fetch", "pick_place"))
 
     def steps_to_go(seed: int, moment: int, perturbed: bool) -> int | None:
-        perturbation = Perturbation(kind, moments={seed: moment if perturbed else 10_000})
+        perturbation = Perturbation(kind, {seed: moment if perturbed else 10_000})
         env = ManipEnv("fetch", "pick_place", conditions=[perturbation])
         env.start(seed)
         for step in range(moment + env.config.horizon):

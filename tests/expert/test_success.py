@@ -58,7 +58,7 @@ def test_the_expert_solves_the_task_under_noise_and_a_knock(robot: str):
 @every_robot
 def test_the_expert_recovers(robot: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
-    config, condition = EnvConfig(robot, horizon=at + 100), Perturbation(kind, moments={seed: at})
+    config, condition = EnvConfig(robot, horizon=at + 100), Perturbation(kind, {seed: at})
     [episode] = run_job(RolloutJob(config, "expert", hold=0, conditions=(condition,)), [seed])
     assert episode.success
     assert len(episode) > at

@@ -223,7 +223,7 @@ def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, drive_
     drive_until(env, "descend")  # with open fingers
     env.set_state(replace(env.get_state(), streak=3))
     state = env.get_state()
-    perturbed = ManipEnv(env.config.robot, conditions=(Perturbation(kind, moments={SEED: state.step}),))
+    perturbed = ManipEnv(env.config.robot, conditions=(Perturbation(kind, {SEED: state.step}),))
     perturbed.start(SEED)
     perturbed.set_state(state)
     perturbed.begin_step()
@@ -275,10 +275,10 @@ def test_without_an_object_neither_it_nor_the_gripper_matters():
 
 def test_a_perturbation_that_cannot_be_is_refused():
     with pytest.raises(UnknownName, match="did you mean 'jolt'"):
-        Perturbation("jolts")
+        Perturbation("jolts", {})
     with pytest.raises(UsageError, match="step -1"):
-        Perturbation("jolt", moments={1: 3, 2: -1})
+        Perturbation("jolt", {1: 3, 2: -1})
     with pytest.raises(UsageError, match="'moved' needs an object; reach has none"):
-        ManipEnv("panda", "reach", conditions=(Perturbation("moved", moments={1: 3}),)).start(1)
+        ManipEnv("panda", "reach", conditions=(Perturbation("moved", {1: 3}),)).start(1)
     with pytest.raises(UsageError, match="no moment for seed 2"):
-        Perturbation("jolt", moments={1: 3}).draw(2)
+        Perturbation("jolt", {1: 3}).draw(2)
