@@ -99,7 +99,7 @@ class Rules:
     """Rules of an episode: how long it runs and when the expert is queried.
 
     horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
-    query: in every state, in the last one only, or only where the driver asks.
+    query: in every state, in the last one only, or only where the driver queries it.
     """
 
     horizon: int

@@ -62,7 +62,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
     `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
-    "solved once" and "solved at the end" can both be told. conditions: what episodes differ in from the nominal world,
+    "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
     in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
     Raises `UnknownName` for a robot, task or camera, `UsageError` for a size of pictures that `CameraConfig` refuses.
     """

@@ -86,7 +86,7 @@ class _Renderer:
 
 
 class _Process:
-    """This process's OpenGL context and the renderer that was asked for last."""
+    """This process's OpenGL context and the renderer that was used last."""
 
     def __init__(self) -> None:
         self._gl: Any = None

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from kept import written
 
 from manip_il.data.schema import fitted_columns
 from manip_il.engine.engine import Engine, default_workers
 from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
-from manip_il.mdp import Actor, Episode
+from manip_il.mdp import Actor
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
@@ -21,10 +22,6 @@ from manip_il.sim.events import STANDARD
 
 SEEDS = stream_seeds("certificate", 6)
 EXPERT = RolloutJob(EnvConfig("fetch"), "expert", hold=3)
-
-
-def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
-    return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
 
 
 def test_hold_ends_an_episode_so_many_steps_after_success():

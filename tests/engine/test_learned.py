@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from kept import written
 from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
@@ -20,7 +20,6 @@ from manip_il.engine.jobs import RolloutJob, observed_cameras, run_job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig, Look
@@ -48,10 +47,6 @@ def seeing_policy(folder: Path, cameras: CameraConfig = DIM) -> Path:
     look = {"brightness": cameras.look.brightness}
     meta = CheckpointMeta.of(spec, env_fingerprint(ENV, cameras), observation="images", look=look)
     return write_checkpoint(folder, "act", spec, "images", meta=meta)
-
-
-def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
-    return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
 
 
 def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None = None) -> np.ndarray:
