@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.engine.describe import env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig

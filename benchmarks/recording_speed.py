@@ -29,8 +29,8 @@ os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks
 
 from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_episode
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.recording import collect, provenance
 from manip_il.robots.robot import ROBOTS

@@ -24,8 +24,8 @@ from manip_il.data.journal import (
 )
 from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode

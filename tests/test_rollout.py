@@ -31,9 +31,13 @@ class Counter:
     def start(self, seed: int) -> None:
         self.x, self.steps = -float(seed % 10), 0
 
-    def advance(self, action: np.ndarray) -> None:
+    def begin_step(self) -> None:
+        """Nothing disturbs it."""
+
+    def advance(self, action: np.ndarray) -> np.ndarray:
         self.x += float(action[0])
         self.steps += 1
+        return action
 
     def observe(self) -> Observation:
         return Observation(np.array([self.x], np.float32), np.array([self.steps], np.float32))
@@ -71,18 +75,19 @@ class Follow:
         return [(turn.label.action, Actor.EXPERT) for turn in turns]
 
 
-class Kick:
-    """Sets the number back once, and every action off by a tenth."""
+class Kicked(Counter):
+    """Its number is set back by 5 before one step, and every action is off by a tenth."""
 
-    def __init__(self, env: Counter, at: int):
-        self._env, self._at = env, at
+    def __init__(self, at: int):
+        super().__init__()
+        self._at = at
 
-    def before(self, step: int) -> None:
-        if step == self._at:
-            self._env.x -= 5.0
+    def begin_step(self) -> None:
+        if self.steps == self._at:
+            self.x -= 5.0
 
-    def action(self, action: np.ndarray) -> np.ndarray:
-        return action + 0.1
+    def advance(self, action: np.ndarray) -> np.ndarray:
+        return super().advance(action + 0.1)
 
 
 def episodes(transitions) -> dict[int, list[Transition]]:
@@ -109,8 +114,7 @@ def test_every_seed_is_one_whole_episode(envs: int):
 @pytest.mark.parametrize("envs", [2, 5])
 def test_an_episode_does_not_depend_on_its_neighbours(envs: int):
     def run(count: int) -> dict[int, list[tuple]]:
-        rules = Rules(horizon=20, hold=1)
-        found = rollout([Counter() for _ in range(count)], range(9), Follow(), rules, Ones(), lambda e, s: Kick(e, s))
+        found = rollout([Kicked(3) for _ in range(count)], range(9), Follow(), Rules(horizon=20, hold=1), Ones())
         return {seed: columns(frames) for seed, frames in episodes(found).items()}
 
     assert run(envs) == run(1)
@@ -160,10 +164,7 @@ def test_hold_ends_an_episode_that_long_after_success(hold: int | None, length: 
 
 
 def test_an_episode_goes_on_to_its_end_where_success_is_lost_again():
-    def kick(env: Counter, seed: int) -> Kick:
-        return Kick(env, at=4)
-
-    frames = episodes(rollout([Counter()], [0], Follow(), Rules(30, hold=3), Ones(), kick))[0]
+    frames = episodes(rollout([Kicked(4)], [0], Follow(), Rules(30, hold=3), Ones()))[0]
     assert [frame.success for frame in frames] == [False, False, True, True, False, False]
 
 
@@ -183,15 +184,15 @@ def test_the_label_is_the_experts_whoever_drove():
 
 
 def test_an_expert_whose_action_is_changed_on_its_way_is_a_noisy_one():
-    frames = episodes(rollout([Counter()], [0], Follow(), Rules(4), Ones(), lambda e, s: Kick(e, 99)))[0]
+    frames = episodes(rollout([Kicked(99)], [0], Follow(), Rules(4), Ones()))[0]
     assert {frame.actor for frame in frames} == {Actor.NOISY_EXPERT}
     assert [frame.label.action[0] for frame in frames] == [1.0] * 4
     assert [frame.executed_action[0] for frame in frames] == [1.1] * 4
-    learner = episodes(rollout([Counter()], [0], Halves(), Rules(4), Ones(), lambda e, s: Kick(e, 99)))[0]
+    learner = episodes(rollout([Kicked(99)], [0], Halves(), Rules(4), Ones()))[0]
     assert {frame.actor for frame in learner} == {Actor.LEARNER}
 
 
 def test_a_disturbance_happens_before_the_state_is_read():
-    frames = episodes(rollout([Counter()], [0], Halves(), Rules(3), None, lambda e, s: Kick(e, 1)))[0]
+    frames = episodes(rollout([Kicked(1)], [0], Halves(), Rules(3)))[0]
     assert [frame.state.physics[0] for frame in frames] == pytest.approx([0, 0.6 - 5, 1.2 - 5])
     assert [frame.observation.state[0] for frame in frames] == pytest.approx([0, 0.6 - 5, 1.2 - 5])

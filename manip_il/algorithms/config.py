@@ -7,7 +7,7 @@ from typing import Literal
 
 from manip_il.algorithms.beta import BetaSchedule
 from manip_il.algorithms.sampling import Sampling
-from manip_il.engine.query import QueryRule
+from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import MAX_ROUNDS
@@ -34,7 +34,7 @@ class RunConfig:
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
     many steps after success. disturbed_share: of a round's learner rollouts that run under
-    `manip_il.sim.disturb.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
+    `manip_il.sim.events.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from manip_il.algorithms import sampling
 from manip_il.algorithms.config import RunConfig
 from manip_il.data.lerobot_read import read_tables
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import stream_base

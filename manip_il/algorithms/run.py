@@ -31,16 +31,16 @@ from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, merge_datasets
 from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_read import dataset_info, read_table
+from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.query import QueryRule
 from manip_il.errors import NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.mdp import Episode
 from manip_il.recording import MAX_TRIES, Collected, check_journals, collect, collect_successes, provenance, record
 from manip_il.seeding import stream_seeds
-from manip_il.sim.disturb import STANDARD
+from manip_il.sim.events import STANDARD
 
 _LOG = logging.getLogger(__name__)
 BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "journals", "policy"
@@ -187,7 +187,7 @@ class Run:
         seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
         journals, seen = self._folder(job.round) / JOURNALS, self._watch.on_episode
         return itertools.chain(
-            collect(self._engine, replace(job, disturbance=STANDARD), seeds[:disturbed], journals, seen),
+            collect(self._engine, replace(job, conditions=(STANDARD,)), seeds[:disturbed], journals, seen),
             collect(self._engine, job, seeds[disturbed:], journals, seen),
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.engine.query import action_gap
+from manip_il.engine.drivers import action_gap
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor
 

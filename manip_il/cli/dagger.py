@@ -158,7 +158,7 @@ class DaggerOptions:
         from manip_il.algorithms.beta import BetaSchedule
         from manip_il.algorithms.config import RunConfig, check_cameras
         from manip_il.algorithms.sampling import Sampling
-        from manip_il.engine.query import QueryRule
+        from manip_il.engine.drivers import QueryRule
 
         made = {"env", "fit", "sampling", "cameras", "beta", "query_rule"}
         own = {one.name for one in fields(RunConfig)} - made
@@ -187,7 +187,7 @@ class DaggerOptions:
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
-    from manip_il.engine.describe import env_fingerprint
+    from manip_il.engine.environments import env_fingerprint
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     atomic_write(folder / FINGERPRINT_FILE, json.dumps(fingerprint, indent=1) + "\n")

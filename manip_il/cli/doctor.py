@@ -81,7 +81,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         spec, fingerprint = read_spec(dataset), read_fingerprint(dataset.root)
     except (OSError, ValueError, TypeError, RecursionError, ManipError):
         return  # named by the check of the spec
-    from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.engine.environments import env_fingerprint, env_spec
     from manip_il.robots.robot import ROBOTS
     from manip_il.sim.env import EnvConfig
     from manip_il.tasks.table import TASKS

@@ -169,7 +169,7 @@ class EvalOptions:
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
         """Before anything large is loaded; on a cluster memory is its own affair."""
         from manip_il.engine.engine import default_workers
-        from manip_il.engine.memory import check_memory
+        from manip_il.engine.local import check_memory
 
         if self.engine != "local":
             return
@@ -177,7 +177,7 @@ class EvalOptions:
         if policy is None:
             check_memory(workers, cameras=False, learned=False)
             return
-        from manip_il.engine.sight import policy_cameras
+        from manip_il.engine.environments import policy_cameras
 
         weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
         check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)

@@ -37,7 +37,7 @@ class ExportOptions:
         output = self._output()
         path = find_policy(self.policy)
         self._check(path, output)
-        from manip_il.engine.describe import policy_sha256
+        from manip_il.engine.environments import policy_sha256
         from manip_il.learn.export import export_onnx, export_torchscript
 
         write = export_onnx if self.format == "onnx" else export_torchscript

@@ -43,7 +43,7 @@ class HealthOptions:
         check_shared_memory()
         drawing = _draw()
         from manip_il.engine.engine import default_workers
-        from manip_il.engine.memory import available_memory
+        from manip_il.engine.local import available_memory
 
         # How little is free is no fault: a health check runs beside the evaluation that has taken the rest.
         free = available_memory()

@@ -64,12 +64,12 @@ class KeptEpisodes:
 
 
 def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
-    from manip_il.engine.describe import env_fingerprint, policy_sha256
-    from manip_il.engine.sight import drawn_cameras
+    from manip_il.engine.environments import env_fingerprint, policy_sha256
+    from manip_il.engine.jobs import observed_cameras
     from manip_il.evaluation.results import EvalSettings
 
     return {
         "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver,
-        "fingerprint": env_fingerprint(job.env, drawn_cameras(job)),
+        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }

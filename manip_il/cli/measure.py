@@ -43,7 +43,7 @@ class Trial:
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path], trust: bool = False) -> Trial:
         """Under a suite's conditions: those of cameras are left out where none of the policies looks at one."""
-        from manip_il.engine.sight import policy_cameras
+        from manip_il.engine.environments import policy_cameras
 
         sees = any(policy_cameras(policy) is not None for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees), trust)
@@ -61,7 +61,7 @@ class Trial:
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
-        from manip_il.engine.describe import env_fingerprint, policy_sha256
+        from manip_il.engine.environments import env_fingerprint, policy_sha256
 
         settings = EvalSettings.of(self.job(policy), self.suite).to_json()
         made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, policy_sha256(policy))

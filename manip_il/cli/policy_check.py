@@ -26,8 +26,7 @@ def check_policy(
     `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
     `LearnedPolicy.load` raises.
     """
-    from manip_il.engine.describe import env_spec
-    from manip_il.engine.sight import policy_cameras
+    from manip_il.engine.environments import env_spec, policy_cameras
     from manip_il.learn.checkpoint import check_fits
     from manip_il.learn.policy import LearnedPolicy
     from manip_il.learn.pretrained import check_interface, read_interface
@@ -48,7 +47,7 @@ def check_policy(
 
 def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
     from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.engine.describe import env_fingerprint
+    from manip_il.engine.environments import env_fingerprint
 
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]

@@ -80,7 +80,7 @@ class ReplayOptions:
         """As the evaluation had it; warns where policy or program are not those of then."""
         from manip_il.cli.policy_check import check_policy
         from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.engine.describe import env_fingerprint, policy_sha256
+        from manip_il.engine.environments import env_fingerprint, policy_sha256
         from manip_il.engine.jobs import RolloutJob
         from manip_il.learn.checkpoint import read_meta
 

@@ -66,7 +66,7 @@ def film_episode(job: RolloutJob, episode: Episode) -> Film:
     from manip_il.sim.conditions import NOMINAL, draw
 
     met = draw(job.conditions or (NOMINAL,), episode.seed)
-    frames = film(episode, job.env, every=FILM_EVERY, appearance=met.appearance)
+    frames = film(episode, job.env, every=FILM_EVERY, drawn=met)
     fps = job.env.control_hz // FILM_EVERY or 1
     return make_film(caption(job, episode).capitalize(), frames, fps, success=episode.success)
 
@@ -97,7 +97,7 @@ def run_curve(policy: Path | None) -> LearningCurve | None:
 
 
 def _paths(job: RolloutJob, episode: Episode) -> Paths:
-    from manip_il.engine.describe import env_spec
+    from manip_il.engine.environments import env_spec
     from manip_il.evaluation.film import paths
 
     shown = paths(episode, env_spec(job.env), caption(job, episode).capitalize())

@@ -17,7 +17,7 @@ from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_read import read_table
-from manip_il.engine.describe import env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import RenderError
 from manip_il.evaluation.film import film, make_film, paths, run_states, strip

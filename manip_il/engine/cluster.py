@@ -1,7 +1,6 @@
-"""A Ray cluster: the one that `RAY_ADDRESS` names or that runs on this machine, else a local one of its own.
+"""Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-Workers send what is to be stored back here, and get the policy's files from here: nodes need the program, no disk
-that they share.
+They send what is to be stored to this process, and get the policy's files from it: nodes need no shared disk.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from manip_il.data.atomic import new_folder
-from manip_il.engine.engine import Event, Task, portable, run_task
+from manip_il.engine.engine import Message, Task, portable, run_task
 from manip_il.errors import FolderExistsError, ManipError
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
@@ -54,13 +53,13 @@ class RayCluster:
         return len(self._running) < self.workers
 
     def submit(self, task: Task) -> None:
-        """Hand a task to the cluster."""
+        """Send a task to the cluster."""
         # Deaths are counted by the engine, which knows which seeds had ended: Ray itself is to try once.
         remote = _run_remote.options(num_returns="streaming", max_retries=0)
         self._running[remote.remote(task, self._ship(task.job.policy))] = task
 
-    def wait(self) -> list[Event]:
-        """Return one event of every task that has something to say."""
+    def wait(self) -> list[tuple[Task, Message]]:
+        """Return one message of every task that has one."""
         ready, _ = ray.wait(list(self._running), num_returns=1, fetch_local=False)
         return [self._next(answers) for answers in ready]
 
@@ -73,21 +72,17 @@ class RayCluster:
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
-    def _next(self, answers: Any) -> Event:
-        task = self._running[answers]
+    def _next(self, answers: Any) -> tuple[Task, Message]:
         try:
-            kind, episode, packed, error = ray.get(next(answers))
-        except StopIteration:
-            del self._running[answers]
-            return Event(task, "done")
+            message = cast(Message, ray.get(next(answers)))
         except _DIED as death:
+            message = Message("died", error=death)
+        except exceptions.RayError as failure:  # what the task itself raises comes as a message
+            message = Message("failed", error=portable(failure))
+        task = self._running[answers]
+        if message.kind != "episode":
             del self._running[answers]
-            return Event(task, "died", error=death)
-        except exceptions.RayError as failure:  # what the task itself raises comes as an answer
-            kind, episode, packed, error = "failed", None, None, portable(failure)
-        if kind == "failed":
-            del self._running[answers]
-        return Event(task, kind, episode, packed, error)
+        return task, message
 
     def _ship(self, policy: Path | None) -> Any:
         if policy is None:
@@ -99,14 +94,11 @@ class RayCluster:
 
 
 @ray.remote(num_cpus=1)
-def _run_remote(task: Task, files: Files | None) -> Iterator[tuple[str, Any, Any, Any]]:
-    try:
-        if files is not None:
-            task = replace(task, job=replace(task.job, policy=_unpack(files)))
-        for episode, packed in run_task(task):
-            yield "episode", episode, packed, None
-    except Exception as error:
-        yield "failed", None, None, portable(error)
+def _run_remote(task: Task, files: Files | None) -> Iterator[Message]:
+    def unpacked() -> Task:
+        return task if files is None else replace(task, job=replace(task.job, policy=_unpack(files)))
+
+    yield from run_task(unpacked, store=False)
 
 
 def _unpack(files: Files) -> Path:

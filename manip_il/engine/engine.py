@@ -1,14 +1,14 @@
-"""The one seam for where episodes run: in this process, in local processes, or on a Ray cluster.
+"""Runs episodes in this process, in local processes, or on a Ray cluster.
 
 A task is some seeds of one job; each seed gives one episode, the same one wherever and however often it runs. So a
-worker that dies costs nothing but time: what it had not finished runs again, each seed alone, elsewhere.
+worker that dies costs nothing but time: the seeds that it had not finished run again, each alone, in other workers.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Literal, Protocol
@@ -18,18 +18,18 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
 MAX_DEATHS = 3  # of workers that one seed may cost before it is left out
-Where = Literal["local", "ray"]
+Backend = Literal["local", "ray"]
 
 
 class Keep(Protocol):
-    """Puts a finished episode away; must pickle."""
+    """Stores finished episodes; must pickle."""
 
     def pack(self, episode: Episode) -> Any:
         """Make what is stored; called in the process that ran the episode."""
         ...
 
     def store(self, seed: int, packed: Any) -> None:
-        """Store it; called where the disk is: in that process too, but on a cluster in the one that asked."""
+        """Store it; called on the machine with the disk: on a cluster in the engine's process, else in the worker."""
         ...
 
 
@@ -43,21 +43,20 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Event:
-    """What became of a task: an episode ended, all did, its worker died, or the work itself failed.
+class Message:
+    """Message of a worker: an episode ended, all did, the worker died, or the work itself failed.
 
-    episode: without pictures. packed: what is still to be stored here.
+    episode: without pictures. packed: what is still to be stored in the engine's process.
     """
 
-    task: Task
     kind: Literal["episode", "done", "died", "failed"]
     episode: Episode | None = None
     packed: Any = None
     error: BaseException | None = None
 
 
-class Place(Protocol):
-    """Where tasks run."""
+class Pool(Protocol):
+    """Workers of one backend."""
 
     @property
     def workers(self) -> int:
@@ -72,12 +71,12 @@ class Place(Protocol):
         """Start a task."""
         ...
 
-    def wait(self) -> list[Event]:
-        """Block until something happened to the tasks that run; at least one event."""
+    def wait(self) -> list[tuple[Task, Message]]:
+        """Wait until tasks have messages; returns at least one."""
         ...
 
     def close(self, in_order: bool) -> None:
-        """Let go of all workers; those still at work are killed unless all is `in_order`."""
+        """End all workers; those still at work are killed unless all is `in_order`."""
         ...
 
 
@@ -88,13 +87,13 @@ class Engine:
     left out, as each of them killed its worker three times, are in `given_up`.
     """
 
-    def __init__(self, workers: int | None = 1, where: Where = "local"):
+    def __init__(self, workers: int | None = 1, backend: Backend = "local"):
         if workers is not None and workers < 1:
             raise UsageError(f"workers is {workers}; expected at least 1")
-        self.workers = default_workers() if workers is None and where == "local" else workers
-        self.where: Where = where
+        self.workers = default_workers() if workers is None and backend == "local" else workers
         self.given_up: list[int] = []
-        self._place: Place | None = None
+        self._backend: Backend = backend
+        self._pool: Pool | None = None
 
     def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
         """Yield one episode a seed as they end, in no fixed order, each once it is kept.
@@ -103,20 +102,23 @@ class Engine:
         raises, and `ManipError` where workers die without one episode getting done.
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
-        if self.where == "local" and (self.workers == 1 or (len(wanted) == 1 and self._place is None)):
-            yield from _run_here(job, wanted, keep)
+        if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
+            for episode in run_job(job, wanted):
+                if keep is not None:
+                    keep.store(episode.seed, keep.pack(episode))
+                yield episode
             return
-        if self._place is None:
-            self._place = _open_place(self.where, self.workers)
+        if self._pool is None:
+            self._pool = _open_pool(self._backend, self.workers)
         try:
-            yield from self._schedule(self._place, _tasks(job, wanted, keep, self._place.workers))
+            yield from self._schedule(self._pool, _tasks(job, wanted, keep, self._pool.workers))
         except BaseException:
-            self._close(in_order=False)  # what still runs belongs to nobody any more
+            self._close(in_order=False)  # nobody takes the episodes that still run
             raise
 
     def warm_up(self, learned: bool) -> None:
         """Begin to start what workers need, and return at once. learned: whether policies will drive."""
-        if self.where == "local" and self.workers != 1:
+        if self._backend == "local" and self.workers != 1:
             from manip_il.engine.local import start_server
 
             start_server(learned)
@@ -130,41 +132,42 @@ class Engine:
         self._close(in_order=kind is None)
 
     def _close(self, in_order: bool) -> None:
-        if self._place is not None:
-            self._place.close(in_order)
-            self._place = None
+        if self._pool is not None:
+            self._pool.close(in_order)
+            self._pool = None
 
-    def _schedule(self, place: Place, waiting: deque[Task]) -> Iterator[Episode]:
+    def _schedule(self, pool: Pool, waiting: deque[Task]) -> Iterator[Episode]:
         left: dict[Task, set[int]] = {}  # seeds of running tasks that have not ended
         deaths: Counter[int] = Counter()
-        in_vain = 0  # deaths since an episode ended
+        deaths_without_progress = 0
         while waiting or left:
-            while waiting and place.has_room():
+            while waiting and pool.has_room():
                 task = waiting.popleft()
                 left[task] = set(task.seeds)
-                place.submit(task)
-            for event in place.wait():
-                if event.kind == "failed":
-                    assert event.error is not None
-                    raise event.error
-                if event.kind == "episode":
-                    assert event.episode is not None
-                    left[event.task].discard(event.episode.seed)
-                    in_vain = 0
-                    _store(event)
-                    yield event.episode
+                pool.submit(task)
+            for task, message in pool.wait():
+                if message.kind == "failed":
+                    assert message.error is not None
+                    raise message.error
+                if message.kind == "episode":
+                    assert message.episode is not None
+                    left[task].discard(message.episode.seed)
+                    deaths_without_progress = 0
+                    if message.packed is not None and task.keep is not None:
+                        task.keep.store(message.episode.seed, message.packed)
+                    yield message.episode
                     continue
-                unfinished = sorted(left.pop(event.task))
-                if event.kind == "died":
-                    in_vain += 1
-                    self._bury(event.task, unfinished, deaths, waiting)
-                    if in_vain > MAX_DEATHS * (place.workers + 1):
+                unfinished = sorted(left.pop(task))
+                if message.kind == "died":
+                    deaths_without_progress += 1
+                    self._retry(task, unfinished, deaths, waiting)
+                    if deaths_without_progress > MAX_DEATHS * (pool.workers + 1):
                         raise ManipError(
-                            f"{in_vain} rollout workers died one after the other ({event.error}); "
+                            f"{deaths_without_progress} rollout workers died one after the other ({message.error}); "
                             "finished episodes are kept"
                         )
 
-    def _bury(self, task: Task, unfinished: list[int], deaths: Counter[int], waiting: deque[Task]) -> None:
+    def _retry(self, task: Task, unfinished: list[int], deaths: Counter[int], waiting: deque[Task]) -> None:
         """Have every unfinished seed run again, alone, so that the one that kills is known."""
         deaths.update(unfinished)
         for seed in reversed(unfinished):
@@ -174,27 +177,26 @@ class Engine:
                 waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
 
 
-def run_task(task: Task) -> Iterator[tuple[Episode, Any]]:
-    """In a worker: each episode as it ends, without pictures, and what there is to store of it."""
-    for episode in run_job(task.job, task.seeds):
-        yield episode.without_pictures(), task.keep.pack(episode) if task.keep is not None else None
+def run_task(get_task: Callable[[], Task], store: bool) -> Iterator[Message]:
+    """Run a task in a worker: yields a message for each episode as it ends, and one for the end or a failure.
+
+    store: whether episodes are stored here, or in the engine's process.
+    """
+    try:
+        task = get_task()
+        for episode in run_job(task.job, task.seeds):
+            packed = task.keep.pack(episode) if task.keep is not None else None
+            if store and task.keep is not None:
+                task.keep.store(episode.seed, packed)
+            yield Message("episode", episode.without_pictures(), None if store else packed)
+        yield Message("done")
+    except Exception as error:
+        yield Message("failed", error=portable(error))
 
 
 def portable(error: Exception) -> Exception:
-    """Return the error as it can travel between processes: ours as they are, others in words."""
+    """Return the error in a form that pickles: the program's own as it is, others in words."""
     return error if isinstance(error, ManipError) else ManipError(f"{type(error).__name__}: {error}")
-
-
-def _run_here(job: RolloutJob, seeds: Sequence[int], keep: Keep | None) -> Iterator[Episode]:
-    for episode in run_job(job, seeds):
-        if keep is not None:
-            keep.store(episode.seed, keep.pack(episode))
-        yield episode
-
-
-def _store(event: Event) -> None:
-    if event.packed is not None and event.task.keep is not None and event.episode is not None:
-        event.task.keep.store(event.episode.seed, event.packed)
 
 
 def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:
@@ -203,8 +205,8 @@ def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: in
     return deque(Task(job, tuple(seeds[i : i + size]), keep) for i in range(0, len(seeds), size))
 
 
-def _open_place(where: Where, workers: int | None) -> Place:
-    if where == "ray":
+def _open_pool(backend: Backend, workers: int | None) -> Pool:
+    if backend == "ray":
         from manip_il.engine.cluster import RayCluster
 
         return RayCluster(workers)
@@ -214,5 +216,5 @@ def _open_place(where: Where, workers: int | None) -> Place:
 
 
 def default_workers() -> int:
-    """As many as this process may use cores."""
+    """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0))

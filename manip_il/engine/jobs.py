@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Literal, cast
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from manip_il.data.episodes import group_rollouts, to_episode
-from manip_il.engine.branches import Brancher
-from manip_il.engine.choose import choose_driver
-from manip_il.engine.query import LabelMode, QueryRule, drawn_step
-from manip_il.engine.sight import drawn_cameras
-from manip_il.errors import UsageError
+from manip_il.engine import drivers
+from manip_il.engine.drivers import LabelMode, QueryRule, drawn_step
+from manip_il.engine.environments import env_spec, policy_cameras
+from manip_il.errors import MismatchError, UsageError
 from manip_il.expert.expert import Expert
-from manip_il.mdp import Actor, Episode, Transition
-from manip_il.rollout import Environment, Intruder, Rules, rollout
-from manip_il.sim.conditions import Condition, changes_object, draw
-from manip_il.sim.disturb import Disturbance, Disturber, disturbance_of
+from manip_il.learn.pretrained import check_interface
+from manip_il.mdp import Actor, Episode, State, Transition
+from manip_il.rollout import Driver, Rules, rollout
+from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig
-from manip_il.sim.perturb import Perturbation, Perturber
 from manip_il.sim.scene import build_scene
-from manip_il.sim.varied import VariedEnv
+
+if TYPE_CHECKING:  # torch only where a learner drives
+    from manip_il.learn.policy import LearnedPolicy
 
 LOCKSTEP = 25  # environments that share one call of the policy
 OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 26 MB for the Panda
@@ -31,7 +33,7 @@ OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 
 
 @dataclass(frozen=True)
 class RolloutJob:
-    """Who drives in which environment, for how long, and what is kept.
+    """Driver and environment of rollouts, their length, and what is kept of them.
 
     policy: a checkpoint's `pretrained_model` folder, needed where a learner drives; ensemble: others that answer with
     it where `query` wants their disagreement. beta: the share of steps that the expert drives (`mixture`). noise: the
@@ -42,14 +44,13 @@ class RolloutJob:
     first one on it drives to the end, for which it has a horizon of its own. `branch`: in a copy of the simulator it
     drives `branch_steps` ahead. `last`: none of this, but the label of the last state, for its phase.
 
-    perturbation: what happens once, in place of a disturbance. conditions: what an evaluation's episodes meet, in turn
-    by their seeds, in place of both.
+    conditions: what episodes differ in from the nominal world, in turn by their seeds; none: nothing.
 
     batch: episodes that share one call of the policy, at most; it changes no outcome. trust: whether models that the
     policies' checkpoints name may be loaded.
 
-    cameras: what is pictured in every step and kept; None for nothing. A policy that looks at cameras is shown them
-    all the same.
+    cameras: what is pictured in every step and kept; None for nothing. A policy that looks at cameras gets their
+    pictures all the same.
     """
 
     env: EnvConfig
@@ -62,8 +63,6 @@ class RolloutJob:
     label: LabelMode = "per_state"
     query: QueryRule = field(default_factory=QueryRule)
     branch_steps: int = 1
-    disturbance: Disturbance = field(default_factory=Disturbance)
-    perturbation: Perturbation | None = None
     conditions: tuple[Condition, ...] = ()
     batch: int = LOCKSTEP
     round: int = 0
@@ -79,60 +78,115 @@ class RolloutJob:
             raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver!r}")
         if self.query.kind == "ensemble" and not self.ensemble:
             raise UsageError("query=ensemble needs other policies to disagree with")
-        if self.perturbation is not None and self.disturbance != Disturbance():
-            raise UsageError("a rollout has a disturbance or a perturbation, not both")
-        if self.conditions and (self.perturbation is not None or self.disturbance != Disturbance()):
-            raise UsageError("a rollout has conditions, or a disturbance or perturbation, not both")
         if self.batch < 1:
             raise UsageError(f"batch is {self.batch}; expected at least 1")
         if self.branch_steps < 1:
             raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
+
+    @property
+    def labels_all(self) -> bool:
+        """True where every state gets its label, whoever drives."""
+        return self.label == "per_state" and self.query.kind == "every"
 
 
 def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     """Yield one episode a seed, in the order in which they end."""
     if not seeds:
         return
-    cameras = drawn_cameras(job)
-    envs = [_environment(job.env, cameras, job.conditions) for _ in range(min(side_by_side(job), len(seeds)))]
+    cameras = observed_cameras(job)
+    envs = [ManipEnv.of(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
     expert = _expert(job.env.robot, job.env.task)
-    driver = choose_driver(job, envs[0])
-    transitions = rollout(envs, seeds, driver, _rules(job), expert, _intrude(job))
+    transitions = rollout(envs, seeds, _make_driver(job, envs[0]), _rules(job), expert)
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
-    brancher = Brancher(_environment(job.env, job.cameras), expert, job.branch_steps) if job.label == "branch" else None
+    branch_env = _BranchEnv.of(job.env, job.cameras) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
-        yield _finish(job, frames, expert, brancher)
+        yield _to_episode(job, frames, expert, branch_env)
 
 
-def side_by_side(job: RolloutJob) -> int:
-    """Environments of a job that run in lockstep in one process."""
+def lockstep(job: RolloutJob) -> int:
+    """Return how many environments of a job run in lockstep in one process."""
     if job.policy is None:
         return 1  # alone, an environment has the processor's cache
-    own_models = any(changes_object(condition.ranges) for condition in job.conditions)
-    return min(job.batch, OWN_MODELS) if own_models else job.batch
+    return min(job.batch, OWN_MODELS) if any(one.changes_model() for one in job.conditions) else job.batch
+
+
+def observed_cameras(job: RolloutJob) -> CameraConfig | None:
+    """Return the cameras of a job's environments: those that are recorded, else those that its policy looks at.
+
+    Raises `MismatchError` where the policy would not find its pictures among the recorded ones.
+    """
+    wanted = policy_cameras(job.policy) if job.policy is not None else None
+    if wanted is None or job.cameras is None:
+        return job.cameras or wanted
+    if not set(wanted.names) <= set(job.cameras.names):
+        raise MismatchError("cameras", str(job.policy), wanted.names, "the recording", job.cameras.names)
+    if wanted.size != job.cameras.size:
+        raise MismatchError("size of pictures", str(job.policy), wanted.size, "the recording", job.cameras.size)
+    return job.cameras
+
+
+def _make_driver(job: RolloutJob, env: ManipEnv) -> Driver:
+    """The driver of a job, with its gate. Raises what loading a policy raises."""
+    if job.driver == "expert":
+        return drivers.ExpertDriver()
+    if job.driver == "noisy_expert":
+        return drivers.NoisyExpertDriver(np.asarray(job.noise))
+    if job.driver == "random":
+        return drivers.RandomDriver(env.scene.actions)
+    assert job.policy is not None
+    policy = _load(job, job.policy, env)
+    driver = drivers.LearnerDriver(policy) if job.driver == "policy" else drivers.MixtureDriver(policy, job.beta)
+    if job.label == "takeover":
+        return drivers.TakeoverDriver(driver, _gate(job, policy, env))
+    if job.label == "last" or job.labels_all or job.query.kind == "one":  # `_rules` or `_to_episode` query
+        return driver
+    return drivers.QueryingDriver(driver, _gate(job, policy, env))
+
+
+def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> drivers.Gate:
+    kind, bound, scale = job.query.kind, job.query.bound, env.scene.actions.scale
+    if kind == "one":
+        return drivers.at_drawn_step(job.env.horizon)
+    if kind == "probability":
+        return drivers.by_chance(bound)
+    if kind == "safety":
+        return drivers.on_gap(bound, scale)
+    if kind == "ensemble":
+        return drivers.on_disagreement(bound, [_load(job, path, env) for path in job.ensemble], scale)
+    if kind == "likelihood":
+        policy.require_likelihood()
+        return drivers.on_low_likelihood(bound, policy)
+    return drivers.at_every_step()
+
+
+def _load(job: RolloutJob, path: Path, env: ManipEnv) -> LearnedPolicy:
+    from manip_il.learn.policy import LearnedPolicy
+
+    policy = LearnedPolicy.load(path, task=env.task_description, trust=job.trust)
+    check_interface(policy.interface, env_spec(job.env, observed_cameras(job)))
+    return policy
 
 
 def _rules(job: RolloutJob) -> Rules:
     if job.label == "last":
         return Rules(job.env.horizon, job.hold, "last")
     twice = 2 if job.label == "takeover" else 1  # a horizon for the learner, and one for the expert
-    everywhere = job.label == "per_state" and job.query.kind == "every"
-    return Rules(twice * job.env.horizon, job.hold, "every" if everywhere else "driver")
+    return Rules(twice * job.env.horizon, job.hold, "every" if job.labels_all else "driver")
 
 
-def _finish(job: RolloutJob, frames: list[Transition], expert: Expert, brancher: Brancher | None) -> Episode:
+def _to_episode(job: RolloutJob, frames: list[Transition], expert: Expert, branch_env: _BranchEnv | None) -> Episode:
     if job.label == "last":
         return to_episode(frames, job.round, job.beta, labelled=False)
-    if job.query.kind == "one" and job.label != "takeover":
-        chosen = drawn_step(frames[0].seed, len(frames))
-        frames[chosen] = replace(frames[chosen], label=expert.label(frames[chosen].state))
     if job.label == "takeover":
         return to_episode(_cut_at_takeover(frames, job.env.horizon), job.round, job.beta)
-    if brancher is None:
+    if job.query.kind == "one":
+        step = drawn_step(frames[0].seed, len(frames))
+        frames[step] = replace(frames[step], label=expert.label(frames[step].state))
+    if branch_env is None:
         return to_episode(frames, job.round, job.beta)
     path = [replace(frame, label=None) for frame in frames]
-    return to_episode([*path, *brancher.from_labelled(frames)], job.round, job.beta, path=len(path))
+    return to_episode([*path, *_branches(job, frames, expert, branch_env)], job.round, job.beta, path=len(path))
 
 
 def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
@@ -145,11 +199,22 @@ def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]
     return [*frames[:last], replace(frames[last], done=True), *rest]
 
 
-def _environment(env: EnvConfig, cameras: CameraConfig | None, conditions: tuple[Condition, ...] = ()) -> ManipEnv:
-    make = partial(VariedEnv, conditions) if any(condition.ranges for condition in conditions) else ManipEnv
-    if cameras is None:
-        return make(config=env)
-    return make(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+class _BranchEnv(ManipEnv):
+    """Begins every episode in `first`."""
+
+    first: State
+
+    def start(self, seed: int) -> None:
+        """Begin the episode."""
+        self.set_state(self.first)
+
+
+def _branches(job: RolloutJob, frames: Iterable[Transition], expert: Expert, env: _BranchEnv) -> Iterator[Transition]:
+    """From every frame that has a sound label, the expert's next steps; each branch ends with `done`."""
+    for frame in frames:
+        if frame.label is not None and frame.label.valid:
+            env.first = frame.state
+            yield from rollout([env], [frame.seed], drivers.ExpertDriver(), Rules(job.branch_steps), expert)
 
 
 def _without_pictures(transition: Transition) -> Transition:
@@ -160,19 +225,3 @@ def _without_pictures(transition: Transition) -> Transition:
 @cache
 def _expert(robot: str, task: str) -> Expert:
     return Expert(build_scene(robot, task))
-
-
-def _intrude(job: RolloutJob):
-    disturbing = any({"knock", "action_noise"} & condition.ranges.keys() for condition in job.conditions)
-    if job.disturbance == Disturbance() and job.perturbation is None and not disturbing:
-        return None
-
-    def make(env: Environment, seed: int) -> Intruder | None:
-        if disturbing:
-            asked = disturbance_of(draw(job.conditions, seed))
-            return None if asked == Disturbance() else Disturber(cast(ManipEnv, env), asked, seed)
-        if job.perturbation is not None:
-            return Perturber(cast(ManipEnv, env), job.perturbation, seed)
-        return Disturber(cast(ManipEnv, env), job.disturbance, seed)
-
-    return make

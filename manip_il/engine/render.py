@@ -30,12 +30,13 @@ from manip_il.data.lerobot_read import (
 )
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import PLAIN, Appearance, CameraConfig
+from manip_il.sim.look import CameraConfig
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -57,7 +58,7 @@ class Source:
 
 
 def open_source(root: Path) -> Source:
-    """Read what a dataset says of itself.
+    """Read what is needed to picture a dataset's states.
 
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
     a robot and task that are known here, `MismatchError` where its states do not fit them.
@@ -76,8 +77,8 @@ def open_source(root: Path) -> Source:
     if spec.sim_state_size != size:
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), read_fingerprint(root)
-    sides = [{key: side.get(key, "nothing") for key in _DECIDE} for side in (there, here)]
-    return Source(root, spec, tuple(compare_fingerprints(str(root), sides[0], "this machine", sides[1])))
+    left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
+    return Source(root, spec, tuple(compare_fingerprints(str(root), left, "this machine", right)))
 
 
 def render_dataset(
@@ -140,20 +141,20 @@ def render_episodes(
 
 
 def render_states(
-    env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], appearance: Appearance = PLAIN
+    env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], drawn: Drawn = NOMINAL_VALUES
 ) -> Pictures:
     """Return pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
 
-    The bytes are those that an environment with these cameras gave when it was in these states and looked so.
+    drawn: what their episode draws. An environment with these cameras gives the same bytes in these states.
     """
-    world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
-    world.appearance = appearance
+    view = ManipEnv.of(env, cameras)
+    view.drawn = drawn
     pictures = {
         schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
     }
     for row, state in enumerate(states):
-        world.set_state(State.from_vector(state))
-        for name, picture in world.observe().images.items():
+        view.set_state(State.from_vector(state))
+        for name, picture in view.observe().images.items():
             pictures[schema.IMAGES + name][row] = picture
     return pictures
 

@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
-from manip_il.engine.describe import env_fingerprint
+from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint
 from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.query import QueryRule
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import rng_for, stream_seeds
-from manip_il.sim.disturb import Disturbance
+from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.perturb import Perturbation, kinds_for
+from manip_il.sim.events import Perturbation, kinds_for
 from manip_il.tasks.table import get_task
 
 _LOG = logging.getLogger(__name__)
@@ -103,7 +103,7 @@ class _Run:
 
     def noisy(self) -> Row:
         """From where episodes begin, with noise on every action."""
-        job = RolloutJob(self._env, "expert", hold=0, disturbance=Disturbance(NOISE))
+        job = RolloutJob(self._env, "expert", hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
         cases = [self._case(episode, 0) for episode in self._episodes(job, self._seeds)]
         return self._row("start", "noise", f"{NOISE:.0%} noise on every action", cases)
 
@@ -111,7 +111,7 @@ class _Run:
         """After a perturbation."""
         moments = {seed: draw_moment(seed, kind, run.steps) for seed, run in self._undisturbed.items()}
         longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
-        job = RolloutJob(longer, "expert", hold=0, perturbation=Perturbation(kind, moments))
+        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
             moment, run = moments[episode.seed], self._undisturbed[episode.seed]

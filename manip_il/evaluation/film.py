@@ -23,8 +23,9 @@ from manip_il.engine.render import render_states
 from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Film, Paths
 from manip_il.mdp import Episode
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import FILM, PLAIN, Appearance, CameraConfig
+from manip_il.sim.look import FILM, CameraConfig
 
 AFTER_SUCCESS = 1.0  # what a film shows once the task is solved [s]
 Frames = Sequence[NDArray[np.uint8]]
@@ -41,16 +42,16 @@ def film(
     camera: str = "front",
     size: tuple[int, int] = (240, 320),
     every: int = 1,
-    appearance: Appearance = PLAIN,
+    drawn: Drawn = NOMINAL_VALUES,
 ) -> list[NDArray[np.uint8]]:
     """Return one picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
 
-    appearance: how the episode's world looked.
+    drawn: what the episode draws.
 
     Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
     """
     states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz) : every]
-    seen = render_states(env_config, CameraConfig((camera,), *size, FILM), states, appearance)
+    seen = render_states(env_config, CameraConfig((camera,), *size, FILM), states, drawn)
     return list(seen[schema.IMAGES + camera])
 
 

@@ -8,17 +8,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from manip_il.data import schema
-from manip_il.engine.describe import env_fingerprint, policy_sha256
 from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.sight import drawn_cameras
-from manip_il.engine.where import places
+from manip_il.engine.environments import env_fingerprint, policy_sha256, positions
+from manip_il.engine.jobs import RolloutJob, observed_cameras
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.statistics import Proportion
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
-from manip_il.sim.scene import build_scene
+from manip_il.tasks.table import get_task
 from manip_il.tasks.task import phases
 
 _LOG = logging.getLogger(__name__)
@@ -64,7 +62,7 @@ def evaluate(
         policy=name,
         robot=job.env.robot,
         task=job.env.task,
-        fingerprint=env_fingerprint(job.env, drawn_cameras(job)),
+        fingerprint=env_fingerprint(job.env, observed_cameras(job)),
         episodes=tuple(results[seed] for seed in seeds if seed in results),
         settings=EvalSettings.of(job, suite),
         policy_sha256=policy_sha256(job.policy) if job.policy is not None else "",
@@ -77,7 +75,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     solved = episode.columns[schema.SUCCESS].ravel()
     first = int(np.argmax(solved)) + 1 if solved.any() else None
     states = episode.columns[schema.SIM_STATE]
-    start, end = (places(job.env.robot, job.env.task, states[row]) for row in (0, -1))
+    start, end = (positions(job.env.robot, job.env.task, states[row]) for row in (0, -1))
     met = draw(job.conditions or (NOMINAL,), episode.seed)
     return EpisodeResult(
         seed=episode.seed,
@@ -89,7 +87,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         detail={
             "steps_to_success": first,
             "condition": met.condition,
-            "drawn": dict(met.drawn),
+            "drawn": dict(met.values),
             "goal": start.pop("goal", None),
             "start": start,
             "end": {name: at for name, at in end.items() if name != "goal"},
@@ -99,7 +97,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
 
 def _last_phase(job: RolloutJob, episode: Episode) -> str:
     """What the expert calls the last state; nobody asks it about one in which the task is solved."""
-    names = phases(build_scene(job.env.robot, job.env.task).task)
+    names = phases(get_task(job.env.task))
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     return names[-1] if phase == 0 and episode.success_at_end else names[phase]
 

@@ -11,6 +11,7 @@ from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.ladder import angle_between
+from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Target
 
 F64 = NDArray[np.float64]
@@ -31,7 +32,8 @@ class Expert:
     def __init__(self, scene: Scene):
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
-        self._rungs = tuple(zip(range(len(scene.task.rungs), 0, -1), scene.task.rungs, strict=True))
+        self._grasped, rungs = get_task(scene.task).grasped, get_task(scene.task).rungs
+        self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
     def label(self, state: State) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
@@ -50,7 +52,7 @@ class Expert:
 
     def _unsound(self) -> str:
         world = self._world
-        for name in self._scene.task.grasped:
+        for name in self._grasped:
             position = world.pose(name).position.tolist()
             if position[2] < FALLEN:
                 return f"{name} off the table"

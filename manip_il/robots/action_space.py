@@ -62,7 +62,7 @@ class ActionSpace:
             raise NotFiniteError(f"action at step {step} is not finite: {action}")
         return np.minimum(np.maximum(action, self.low), self.high)
 
-    def random_near(self, state: F64, rng: np.random.Generator) -> F64:
+    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
         """Draw joint targets within the longest step of the measured joints in `state` (n,), and any opening."""
         drawn = rng.uniform(-1, 1, len(self.arm)) * self.scale[self.arm]
         opening = rng.uniform(self.low[self.gripper], self.high[self.gripper])

@@ -1,7 +1,7 @@
-"""One gripper for everyone: an opening [m] between the pads, whatever drives the fingers and however they move.
+"""A gripper as its opening [m] between the pads, whatever drives the fingers and however they move.
 
-Opening and command are tied by moving the actuators from closed to open once, when a robot is first used, and looking
-at how far apart the fingers come to rest. Parallel, hinged and linked fingers are then one thing.
+Command and opening are related by a sweep: when a robot is first used, its actuators are moved from closed to open and
+the distance is measured at which the fingers come to rest. So parallel, hinged and linked fingers are alike.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # of the sweep from closed to open
 _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
-_FAR = 1.0  # beyond which nobody asks how far fingers are apart [m]
+_FAR = 1.0  # longest distance between fingers that is measured [m]
 _PAD = 0.004  # what is this much farther from the other finger than the nearest is no pad [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What a gripper does. shares: of the way from closed to open, commanded and measured, rising, (c,).
+    """Measured relation of command and opening.
 
-    openings: between the pads at rest [m], rising, (c,). pads: for each finger its geoms' places among the finger's,
-    the nearest to the other finger first.
+    shares: of the way from closed to open, commanded and measured, rising, (c,). openings: between the pads at rest
+    [m], rising, (c,). pads: for each finger its geoms' places among the finger's, the nearest to the other one first.
     """
 
     shares: F64
@@ -70,13 +70,13 @@ class Gripper:
         return float(openings[last - 1] + along * (openings[last] - openings[last - 1]))
 
     def command(self, opening: float) -> F64:
-        """Return what the actuators are told for an opening [m], (g,)."""
+        """Return the actuators' commands for an opening [m], (g,)."""
         share = np.interp(opening, self._sweep.openings, self._sweep.shares)
         return self._closed + share * self._travel
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) -> bool:
         """Return whether every finger touches one of an object's geoms. Needs kinematics to be up to date in `data`."""
-        # Of two boxes that are apart `mj_geomDistance` now and then says 0, but only within what it is asked to look.
+        # For two boxes that are apart `mj_geomDistance` now and then returns 0, but only within its greatest distance.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads for geom in geoms)
             for pads in self.pads
@@ -85,7 +85,7 @@ class Gripper:
 
 @cache
 def sweep(robot: Robot) -> Sweep:
-    """Move a robot's gripper from closed to open and see where the fingers come to rest.
+    """Move a robot's gripper from closed to open and measure where the fingers come to rest.
 
     Raises `UsageError` where they do not come apart.
     """

@@ -89,7 +89,7 @@ _CONVERGED = 1e-4
 def _solve(problem: qpsolvers.Problem) -> F64 | None:
     """Solve a quadratic program by DAQP, (nv,); None where there is no solution.
 
-    Asked directly it takes a third of the time that qpsolvers takes to ask it.
+    Called directly it takes a third of the time that it takes through qpsolvers.
     """
     matrix, upper = problem.G, problem.h
     if matrix is None or upper is None:  # no joint has limits

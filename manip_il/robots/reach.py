@@ -1,7 +1,7 @@
-"""Where a robot's hand gets to, pointing down: a map of solutions of its inverse kinematics.
+"""A map of the points that a robot's hand, pointing down, gets to by inverse kinematics.
 
-Worked out once a robot and kept: beside the YAML of a robot that ships, else in the user's cache, under the hash of
-what it follows from.
+It is computed once a robot and kept: beside the YAML of a robot that ships, else in the user's cache, under the hash
+of what it follows from.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ F64 = NDArray[np.float64]
 _CELL = 0.05  # of the grid [m]
 _BEYOND = 0.2  # the map goes on around the workspace by this much [m]
 _ABOVE = 0.05  # and above it [m]
-_VERSION = 1  # of how the map is worked out
+_VERSION = 1  # of how the map is computed
 _STEPS = 80  # of inverse kinematics, at most
 _NEAR, _ANGLE = 1e-3, 0.05  # where it has arrived [m], and what a radian counts for beside that [m/rad]
 ARRIVES = 0.004  # what the hand may miss a pose by and still be there [m]
@@ -92,14 +92,14 @@ class Reach:
 
 @cache
 def reach_of(robot: Robot) -> Reach:
-    """Return a robot's map, from where it is kept, else worked out (some seconds) and kept."""
+    """Return a robot's map: read where it is kept, else computed (some seconds) and kept."""
     name = f"{robot.name}.reach.{_key(robot)}.npz"
     cached = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
     for path in (HERE / name, cached):
         with contextlib.suppress(*_BROKEN), np.load(path, allow_pickle=False) as kept:
             return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     reach = _solve(robot)
-    with contextlib.suppress(OSError):  # a map that cannot be kept is worked out again
+    with contextlib.suppress(OSError):  # a map that cannot be kept is computed again
         _keep(reach, cached)
     return reach
 
@@ -113,7 +113,7 @@ def _keep(reach: Reach, path: Path) -> None:
 
 
 def _key(robot: Robot) -> str:
-    """Hash what a map follows from: the robot's files, and how this file works it out."""
+    """Hash what a map follows from: the robot's files, and the constants of this file."""
     constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, _CLEARANCE)
     return hashlib.sha256(repr(constants).encode() + robot.content()).hexdigest()[:16]
 

@@ -1,4 +1,4 @@
-"""A robot is one YAML beside its MJCF: what it says, checked."""
+"""A robot as its YAML beside an MJCF has it, checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FURTHEST = 10.0  # of anything from anything [m]
 
 @dataclass(frozen=True)
 class EndEffector:
-    """Where `ee` sits: between the fingertips, z out of the hand, y along the fingers' motion.
+    """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
 
     With the hand straight down at zero yaw its axes are world x, -y, -z. position [m] and quaternion (wxyz) in `body`.
     """
@@ -79,7 +79,7 @@ class GripperConfig:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
+    """Volume in which tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
 
     centre: tuple[float, ...]
     half_width: float = 0.15
@@ -130,7 +130,7 @@ class Robot:
         return (*self.joints, "gripper")
 
     def content(self) -> bytes:
-        """What the robot follows from: its fields, its model with what that includes, its meshes' names and sizes."""
+        """Return what identifies the robot: its fields, its model with all includes, its meshes' names and sizes."""
         places = {"model", "includes", "meshes", "colours"}
         said = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in places}
         included = sorted((self.includes or self.model.parent).glob("*.xml"))

@@ -1,9 +1,13 @@
-"""Conditions of an evaluation: ranges from which each episode's circumstances are drawn by its seed alone."""
+"""Conditions: ranges by name from which each episode draws how it differs from the nominal world, by its seed alone.
+
+Whose values are applied where: to the model by `variation.py`, to pictures by `view.py`, to what a policy observes by
+`env.py`, and during the episode by `events.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,11 +16,11 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
-from manip_il.sim.look import CAMERAS, PLAIN, Appearance
+from manip_il.sim.look import CAMERAS
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
-# What a value may be at most and at least; outside, a range is a slip of the pen and not an experiment.
+# Least and greatest value; a range beyond is a mistake and not an experiment.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
     "knock": (0, 0.3),
@@ -34,78 +38,70 @@ _BOUNDS: dict[str, Range] = {
     "light_turn": (-180, 180),
 }
 _WHOLE = ("knock_step", "delay")
-_OBJECT = ("knock", "mass", "size", "friction", "colour")  # what a task without an object has not
-_VIEW = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # what only cameras see
+_KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
+_MODEL = ("mass", "size", "friction")  # of the object, in physics
+_OBJECT = ("knock", "colour", *_MODEL)
+PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Condition:
-    """Ranges (low, high), both ends included; one that is not given leaves the world as it is.
+    """Ranges (low, high), both ends included; without one the world is nominal in that.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
-    knock: the object is moved by so much once [m], at a control step of knock_step. joint_noise [rad], position_noise
-    [m]: standard deviations of Gaussian noise on the joints that a policy is shown and on where it is told the object
-    is. delay: control steps by which it sees everything late. mass [kg], size (edge [m]) and sliding friction of the
-    cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a drawn
-    direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+    knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
+    [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
+    policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
+    of the cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a
+    drawn direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
 
-    Raises `UsageError` for a range that is empty or out of bounds.
+    Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
     """
 
-    name: str = "nominal"
-    action_noise: Range | None = None
-    knock: Range | None = None
-    knock_step: Range = (5, 24)
-    joint_noise: Range | None = None
-    position_noise: Range | None = None
-    delay: Range | None = None
-    mass: Range | None = None
-    size: Range | None = None
-    friction: Range | None = None
-    colour: Range | None = None
-    camera_shift: Range | None = None
-    camera_turn: Range | None = None
-    brightness: Range | None = None
-    light_turn: Range | None = None
+    name: str
+    ranges: Mapping[str, Range] = field(hash=False)
 
-    def __post_init__(self) -> None:
-        _require_name("a condition's name", self.name)
-        for name in _BOUNDS:
-            given = getattr(self, name)
-            if given is not None:
-                _require_range(f"{self.name}: {name}", given, _BOUNDS[name], whole=name in _WHOLE)
-
-    @property
-    def ranges(self) -> dict[str, Range]:
-        """Name -> range of everything that is drawn, in the order of the fields."""
-        given = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "name"}
-        return {
-            name: range_
-            for name, range_ in given.items()
-            if range_ is not None and (name != "knock_step" or self.knock is not None)
-        }
+    def __init__(self, name: str = "nominal", **ranges: Range):
+        _require_name("a condition's name", name)
+        _require_known(name, ranges)
+        if "knock" in ranges:
+            ranges = {"knock_step": _KNOCK_STEP} | ranges
+        for one, range_ in ranges.items():
+            _require_range(f"{name}: {one}", range_, _BOUNDS[one], whole=one in _WHOLE)
+        kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        vars(self).update(name=name, ranges=kept)  # frozen from here on
 
     def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
-        """Return the condition without what a task without an object, or a policy without cameras, does not notice.
+        """Return the condition without what has no effect on a task without an object, or a policy without cameras.
 
         None where nothing of it is left.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else _VIEW)}
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED)}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
         return Condition(self.name, **kept)
 
+    def changes_model(self) -> bool:
+        """Return whether the object is another one than the compiled model's."""
+        return not self.ranges.keys().isdisjoint(_MODEL)
+
+    def draw(self, seed: int) -> Drawn:
+        """Return what the episode of a seed draws; each value has a random stream of its own.
+
+        So another range leaves the other values as they were.
+        """
+        streams = ((name, range_, rng_for(seed, f"condition {name}")) for name, range_ in self.ranges.items())
+        return Drawn(self.name, {name: _draw(name, range_, rng) for name, range_, rng in streams})
+
     def to_json(self) -> dict[str, Any]:
-        """Name and ranges as plain JSON values."""
+        """Return name and ranges as plain JSON values."""
         return {"name": self.name} | {name: list(range_) for name, range_ in self.ranges.items()}
 
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
-        """Return ranges as YAML or JSON reads them, `[low, high]` or one number; `UsageError` names what is wrong."""
-        for key in tree:
-            if key not in _BOUNDS:
-                raise UnknownName(f"key in {name}:", str(key)[: checks.LONGEST_NAME], _BOUNDS)
+        """Make a condition of ranges as YAML or JSON has them, `[low, high]` or one number; else `UsageError`."""
+        _require_known(name, tree)
         return cls(name, **{key: _as_range(f"{name}: {key}", value) for key, value in tree.items()})
 
     def __str__(self) -> str:
@@ -114,51 +110,24 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class Circumstances:
-    """What was drawn for one episode. `drawn` holds every value by the name of its range; see `Condition` for units.
+class Drawn:
+    """Values of one episode by the name of their range, and the condition they were drawn from.
 
-    camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own frame [m], [deg].
+    See `Condition` for units. camera_shift and camera_turn are there a camera: a vector (3,) each in the camera's own
+    frame [m], [deg].
     """
 
     condition: str
-    drawn: Mapping[str, Any]
+    values: Mapping[str, Any]
 
     def number(self, name: str, default: float = 0.0) -> float:
-        """Return a drawn number, or what holds without it."""
-        return float(self.drawn.get(name, default))
-
-    @property
-    def appearance(self) -> Appearance:
-        """How the world looks to the cameras."""
-        if not self.drawn.keys() & {*_VIEW, "size"}:
-            return PLAIN
-        shift, turn = self.drawn.get("camera_shift", {}), self.drawn.get("camera_turn", {})
-        colour = self.drawn.get("colour")
-        return Appearance(
-            edge=self.drawn.get("size"),
-            colour=None if colour is None else tuple(colour),
-            camera_shift=tuple((name, tuple(shift[name])) for name in CAMERAS if name in shift),
-            camera_turn=tuple((name, tuple(turn[name])) for name in CAMERAS if name in turn),
-            brightness=self.number("brightness", 1.0),
-            light_turn=self.number("light_turn"),
-        )
+        """Return a drawn number, or the nominal one."""
+        return float(self.values.get(name, default))
 
 
-def changes_object(named: Mapping[str, Any]) -> bool:
-    """Return whether ranges, or what was drawn from them, make the object another than the model's."""
-    return not named.keys().isdisjoint(("mass", "size", "friction"))
-
-
-def draw(conditions: Sequence[Condition], seed: int) -> Circumstances:
-    """Return the circumstances of a seed: conditions take turns, each value has a random stream of its own.
-
-    So a range that is changed leaves the other draws as they were.
-    """
-    condition = conditions[seed % len(conditions)]
-    return Circumstances(
-        condition.name,
-        {name: _draw(name, range_, rng_for(seed, f"condition {name}")) for name, range_ in condition.ranges.items()},
-    )
+def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
+    """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal."""
+    return (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
 
 
 def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
@@ -182,6 +151,12 @@ def _require_name(what: str, name: object) -> None:
         checks.name(what, name)
     except ManipError as error:
         raise UsageError(str(error)) from None
+
+
+def _require_known(what: str, names: Iterable[object]) -> None:
+    for name in names:
+        if name not in _BOUNDS:
+            raise UnknownName(f"key in {what}:", str(name)[: checks.LONGEST_NAME], _BOUNDS)
 
 
 def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:
@@ -215,3 +190,4 @@ def _words(range_: Range) -> str:
 
 
 NOMINAL = Condition()
+NOMINAL_VALUES = NOMINAL.draw(0)

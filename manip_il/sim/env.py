@@ -1,9 +1,12 @@
-"""One gymnasium environment for every robot and task, with exact save and restore."""
+"""One gymnasium environment for every robot and task, with exact save and restore, and under conditions."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache, cached_property
+from typing import Any, Self
 
 import gymnasium
 import mujoco
@@ -13,19 +16,22 @@ from numpy.typing import NDArray
 from manip_il.errors import UsageError
 from manip_il.mdp import LONGEST_EPISODE, Observation, State
 from manip_il.seeding import rng_for
-from manip_il.sim.look import PLAIN, CameraConfig, Look
-from manip_il.sim.observe import environment_state, environment_state_names, joint_state
+from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
+from manip_il.sim.events import Events
+from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import DT_SIM, build_scene
+from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import Scene, World
+from manip_il.tasks.table import get_task
 
-F64 = NDArray[np.float64]
+F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """What makes one environment; every field is part of the fingerprint."""
+    """Settings of an environment; every field is part of the fingerprint."""
 
     robot: str = "panda"
     task: str = "pick_place"
@@ -56,8 +62,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
     `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
-    "solved once" and "solved at the end" can both be told. Raises `UnknownName` for a robot, task or camera,
-    `UsageError` for a size of pictures that `CameraConfig` refuses.
+    "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
+    in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
+    Raises `UnknownName` for a robot, task or camera, `UsageError` for a size of pictures that `CameraConfig` refuses.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -72,22 +79,34 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         image_size: tuple[int, int] = (128, 128),
         look: Look | None = None,
         render_mode: str | None = None,
+        conditions: Sequence[Condition] = (),
         **settings: Any,
     ):
-        self.look, self.appearance = look or Look(), PLAIN
+        self.look = look or Look()
         self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
         self.world = World(build_scene(self.config.robot, self.config.task))
+        self._task = get_task(self.config.task)
+        self._conditions = tuple(conditions)
+        self._begin(0, NOMINAL_VALUES)
         self.render_mode = render_mode
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
-        self.task_description = self.scene.task.instruction
+        self.task_description = self._task.instruction
         self.task = self.config.task
         self._step = self._streak = 0
         self._ever = False
         self.action_space = _bounded(self.scene.actions.low, self.scene.actions.high)
         self.observation_space = self._observation_space()
+
+    @classmethod
+    def of(cls, config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()) -> Self:
+        """Make an environment of configurations."""
+        if cameras is None:
+            return cls(config=config, conditions=conditions)
+        size, look = cameras.size, cameras.look
+        return cls(config=config, cameras=cameras.names, image_size=size, look=look, conditions=conditions)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -99,7 +118,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     @property
     def scene(self) -> Scene:
-        """What is simulated."""
+        """Compiled scene, shared by all environments of a robot and a task."""
         return self.world.scene
 
     @property
@@ -108,12 +127,13 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self.world.data
 
     def start(self, seed: int) -> None:
-        """`reset` without making an observation."""
+        """Start the episode of a seed: `reset` without making an observation."""
         world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
-        world.vary(self._drawn_variation())
+        self._begin(seed, draw(self._conditions, seed))
+        world.vary(with_drawn(scene.nominal, self.drawn.values))
         data, robot = world.data, scene.robot
         mujoco.mj_resetData(world.model, data)
-        for name, pose in scene.task.draw(rng, world).poses.items():
+        for name, pose in self._task.draw(rng, world).poses.items():
             world.place(name, *pose)
         posture = np.asarray(robot.home) + rng.uniform(-1, 1, len(robot.joints)) * _JOINT_JITTER
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
@@ -121,44 +141,61 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         self._step = self._streak = 0
         self._ever = False
-        world.moved()
+        world.update()
         mujoco.mj_forward(world.model, data)
 
-    def _drawn_variation(self) -> F64:
-        """What the episode that begins has, (v,)."""
-        return self.scene.nominal
+    def _begin(self, seed: int, drawn: Drawn) -> None:
+        """Make ready for an episode with these values."""
+        self.drawn = drawn
+        self._events = Events.of(self.world, drawn, seed)
+        self._noise = rng_for(seed, "observation noise")
+        self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Apply one action for one control step."""
+        """Apply one action (n,) for one control step."""
+        self.begin_step()
         self.advance(action)
         return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
 
-    def advance(self, action: NDArray[Any]) -> None:
-        """`step` without making an observation. Raises `NotFiniteError`, `MismatchError`."""
+    def begin_step(self) -> None:
+        """Apply the events of the control step that begins: a knock, a perturbation.
+
+        After a perturbation the steps within the tolerance count from the beginning.
+        """
+        if self._events is not None and self._events.before(self._step):
+            self._streak = 0
+
+    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Apply one action (n,) for one control step; returns it as it reached the robot.
+
+        Raises `NotFiniteError`, `MismatchError`.
+        """
         world, scene = self.world, self.scene
-        action = scene.actions.clip(action, self._step)
+        executed = action if self._events is None else self._events.action(action, self._step)
+        action = scene.actions.clip(executed, self._step)
         data = world.data
         data.ctrl[scene.arm_ctrl] = action[scene.actions.arm]
         data.ctrl[scene.gripper.ctrl] = scene.gripper.command(action[scene.actions.gripper])
         mujoco.mj_step(world.model, data, self.config.physics_steps)
-        world.moved()  # positions as of now, not of the last physics step's start
+        world.update()  # positions as of now, not of the last physics step's start
         self._step += 1
         self._streak = self._streak + 1 if self.distance() < self.config.tolerance else 0
         self._ever = self._ever or self.solved
+        return executed
 
     @property
     def solved(self) -> bool:
-        """Within the tolerance for the required steps in a row, now."""
+        """State of the task: within the tolerance for the required steps in a row, now."""
         return self._streak >= self.config.success_steps
 
     def distance(self) -> float:
         """Return how far the task is from being solved [m]."""
-        return self.scene.task.error(self.world)
+        return self._task.error(self.world)
 
     @property
     def progress(self) -> float:
-        """How much of the task is done, 0 to 1."""
-        return min(1.0, max(0.0, self.scene.task.progress(self.world)))
+        """Share of the task that is done, 0 to 1."""
+        return min(1.0, max(0.0, self._task.progress(self.world)))
 
     def get_state(self) -> State:
         """Return everything that the future depends on; `set_state` restores it bit for bit."""
@@ -170,9 +207,30 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._step, self._streak, self._ever = state.step, state.streak, state.ever
 
     def observe(self) -> Observation:
-        """What a learner sees now (pictures only where the environment has cameras)."""
-        images = self._pictures(self._view) if self._view else {}
-        return Observation(joint_state(self.world), environment_state(self.world), images)
+        """Return what a policy observes now, late and noisy where the episode has it so; call it once a control step.
+
+        It has pictures only where the environment has cameras.
+        """
+        world, images = self._measured(), self._pictures(self._view) if self._view else {}
+        self._observed.append(Observation(joint_state(world), environment_state(world), images))
+        return self._observed[0]
+
+    def _measured(self) -> World:
+        """The world with noise on joints and object positions, and on all that follows from them."""
+        joints, position = self.drawn.number("joint_noise"), self.drawn.number("position_noise")
+        if not joints and not position:
+            return self.world
+        scene, world = self.scene, self._sensed
+        world.restore(self.world.physics(), self.world.variation)
+        world.data.qpos[scene.arm_q] += self._noise.normal(0.0, joints, len(scene.arm_q))
+        for one in scene.objects.values():
+            world.data.qpos[one.q : one.q + 3] += self._noise.normal(0.0, position, 3)
+        world.update()
+        return world
+
+    @cached_property
+    def _sensed(self) -> World:
+        return World(self.scene)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return a picture from the front camera, uint8 (480, 640, 3)."""
@@ -181,7 +239,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras, self.appearance)
+        return pictures(self.config.robot, self.config.task, self.data, cameras, self.drawn)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}
@@ -205,8 +263,31 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return gymnasium.spaces.Dict(spaces)
 
 
+def joint_state(world: World) -> F32:
+    """Return measured joint positions [rad] and gripper opening [m], float32 (n,)."""
+    scene, data = world.scene, world.data
+    return scene.actions.join(data.qpos[scene.arm_q], world.opening).astype(np.float32)
+
+
+def environment_state(world: World) -> F32:
+    """Return the numbers that the task observes, float32 (k,)."""
+    values = get_task(world.scene.task).observe(world).values()
+    return np.concatenate([np.atleast_1d(np.asarray(value)) for value in values]).astype(np.float32)
+
+
+@cache
+def environment_state_names(scene: Scene) -> tuple[str, ...]:
+    """Return names of the vector's k entries; lengths in [m]."""
+    world = World(scene)
+    world.update()
+    names: list[str] = []
+    for name, value in get_task(scene.task).observe(world).items():
+        names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
+    return tuple(names)
+
+
 def _bounded(low: F64, high: F64) -> gymnasium.spaces.Box:
-    """The space of actions; a joint that turns freely is told nothing beyond two turns."""
+    """The space of actions; a joint that turns freely is bounded by two turns."""
     limits = np.vstack([low, high])
     finite = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi).astype(np.float32)
     return gymnasium.spaces.Box(finite[0], finite[1], dtype=np.float32)

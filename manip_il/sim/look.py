@@ -1,4 +1,4 @@
-"""What pictures are made of: which cameras, how large, and in what light."""
+"""Settings of pictures: which cameras, how large, and in what light."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BRIGHTNESS = (0.1, 2.0)
 
 @dataclass(frozen=True)
 class Look:
-    """How a scene is lit; part of a dataset's fingerprint, and what re-rendering may vary.
+    """Light of a scene; part of a dataset's fingerprint, and what re-rendering may vary.
 
     shadows: of the main lamp; two to six times the price of a picture. brightness: factor on every lamp.
     light_turn: of the lamps about the vertical through the world's origin, -180 to 180 [deg].
@@ -64,23 +64,3 @@ class CameraConfig:
     def size(self) -> tuple[int, int]:
         """Height and width."""
         return self.height, self.width
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """How one episode looks different from the model: what a camera sees and physics does not.
-
-    edge: of the cube [m], None for the model's. colour: red, green and blue of the cube, 0 to 1. camera_shift [m] and
-    camera_turn (a rotation vector [deg]): (camera, (x, y, z)), in the camera's own frame. brightness: factor on every
-    lamp; light_turn: of the lamps about the vertical through the world's origin [deg].
-    """
-
-    edge: float | None = None
-    colour: tuple[float, ...] | None = None
-    camera_shift: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    camera_turn: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    brightness: float = 1.0
-    light_turn: float = 0.0
-
-
-PLAIN = Appearance()

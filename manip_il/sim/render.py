@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
-from manip_il.sim.dress import Wardrobe
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.look import CAMERAS, PLAIN, Appearance, CameraConfig, Look
+from manip_il.sim.look import CAMERAS, CameraConfig, Look
 from manip_il.sim.scene import build_scene, camera_id
-from manip_il.sim.view import view_model
+from manip_il.sim.view import ViewModel
 
 Picture = NDArray[np.uint8]
 _FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
@@ -23,15 +23,15 @@ _MAX_GEOMS = 1_000
 
 
 def pictures(
-    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, appearance: Appearance = PLAIN
+    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, drawn: Drawn = NOMINAL_VALUES
 ) -> dict[str, Picture]:
-    """What every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
+    """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    A picture depends on `qpos`, the goal and the appearance alone: whoever asks, in any order, gets the same bytes.
+    A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
     Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(robot, task, cameras.look)
-    renderer.pose(data, appearance)
+    renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
 
@@ -44,9 +44,8 @@ class _Renderer:
     """Draws one scene in one look, in pictures of any size. Needs a current OpenGL context."""
 
     def __init__(self, robot: str, task: str, look: Look):
-        self._model = view_model(robot, task, look)
-        objects = build_scene(robot, task).objects.values()
-        self._wardrobe = Wardrobe(self._model, [one.geom for one in objects])
+        self._view = ViewModel(robot, task, look)
+        self._model = self._view.model
         self._data = mujoco.MjData(self._model)
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
@@ -57,9 +56,9 @@ class _Renderer:
         if self._context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN:
             raise RuntimeError("it has no off-screen buffers")
 
-    def pose(self, data: mujoco.MjData, appearance: Appearance) -> None:
-        """Put everything where `data` has it, and make it look as `appearance` says."""
-        self._wardrobe.wear(appearance)
+    def pose(self, data: mujoco.MjData, drawn: Drawn) -> None:
+        """Put everything where `data` has it, and apply what the episode draws."""
+        self._view.apply(drawn)
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -87,7 +86,7 @@ class _Renderer:
 
 
 class _Process:
-    """This process's OpenGL context and the renderer that was asked for last."""
+    """This process's OpenGL context and the renderer that was used last."""
 
     def __init__(self) -> None:
         self._gl: Any = None

@@ -61,7 +61,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """Id of a camera, of the world's or on the robot. Raises `UnknownName`."""
+    """Return the id of a camera of the world or on the robot. Raises `UnknownName`."""
     for prefix in ("", PREFIX):
         camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, prefix + name)
         if camera >= 0:
@@ -77,7 +77,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
     _check_objects(robot, task, model, objects, gripper)
     return Scene(
         robot=robot,
-        task=task,
+        task=task.name,
         model=model,
         gripper=gripper,
         actions=_action_space(robot, joints, gripper),

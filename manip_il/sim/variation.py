@@ -1,4 +1,4 @@
-"""What a model may be made to differ in from episode to episode, as numbers that a state holds.
+"""Parameters of the model that may differ from episode to episode, as numbers that a state holds.
 
 Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction.
 """
@@ -41,7 +41,7 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 
 
 def check(variation: F64, like: F64) -> None:
-    """Raise `MismatchError` for a variation of another length than the scene's, `ManipError` for one that cannot be."""
+    """Raise `MismatchError` for a variation of another length than the scene's (v,), `ManipError` for a wrong one."""
     if variation.shape != like.shape:
         raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
     if (variation[like > 0] <= 0).any():
@@ -49,7 +49,7 @@ def check(variation: F64, like: F64) -> None:
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return a variation with what was drawn by the names of `Condition`: size (edge [m]), mass [kg], friction."""
+    """Return a variation (v,) with values by the names of `Condition`: size (edge [m]), mass [kg], friction."""
     rows = base.copy().reshape(-1, PER_OBJECT)
     if "size" in drawn:
         rows[:, _SIZE] *= (drawn["size"] / 2 / rows[:, _SIZE].max(axis=1))[:, None]
@@ -61,9 +61,9 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
 
 
 def apply(model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], variation: F64) -> None:
-    """Give the objects of a model that nobody else uses the lengths, masses and frictions of `variation`.
+    """Give the objects of a model that nobody else uses the lengths, masses and frictions of `variation` (v,).
 
-    plain: the model as compiled. What follows from masses is `mj_setConst`'s to work out.
+    plain: the model as compiled. Call `mj_setConst` afterwards, for what follows from masses.
     """
     changed: Any = model
     for one, row in zip(objects.values(), variation.reshape(-1, PER_OBJECT), strict=True):

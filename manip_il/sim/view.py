@@ -1,11 +1,14 @@
 """The model that pictures are drawn from: the physics model's copy with few faces, lit by a `Look`.
 
+It is changed by what one episode draws, and as it was again for the next.
+
 A software renderer pays for every triangle, and the Panda's meshes have 136,040 for an arm that is 60 pixels tall.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -13,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.dress import light_up
-from manip_il.sim.look import Look
-from manip_il.sim.scene import build_scene
+from manip_il.sim.conditions import PICTURED, Drawn
+from manip_il.sim.look import CAMERAS, Look
+from manip_il.sim.scene import build_scene, camera_id
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -24,13 +27,73 @@ _LEAST_CELL = 0.008  # what a pixel spans at 128 x 128 [m]
 _PLAIN_FACES = 1_600  # meshes up to here stay as they are
 _PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
 _LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
+_OBJECT_AND_CAMERAS = ("geom_size", "geom_matid", "geom_rgba", "cam_pos", "cam_quat")
+_LAMPS = ("light_ambient", "light_diffuse", "light_specular")
+_CHANGED = (*_OBJECT_AND_CAMERAS, "light_pos", "light_dir", *_LAMPS)
 
 
-def view_model(robot: str, task: str, look: Look) -> mujoco.MjModel:
-    """Return a model to draw from, not to simulate: every name, address and pose is the physics model's."""
-    model = copy.copy(_with_few_faces(robot, task))
-    _light(model, look)
-    return model
+class ViewModel:
+    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics model's."""
+
+    def __init__(self, robot: str, task: str, look: Look):
+        self.model: Any = copy.copy(_with_few_faces(robot, task))
+        self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
+        if not look.shadows:
+            self.model.vis.quality.shadowsize = 0
+        self._geoms = [one.geom for one in build_scene(robot, task).objects.values()]
+        self._light(look.brightness, look.light_turn)
+        self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
+        self._headlight = [colour.copy() for colour in self._headlight_colours()]
+        self._applied: dict[str, Any] = {}
+
+    def apply(self, drawn: Drawn) -> None:
+        """Apply what an episode draws to the next pictures. None of it lies on the graphics card."""
+        values = {name: drawn.values[name] for name in ("size", *PICTURED) if name in drawn.values}
+        if values == self._applied:
+            return
+        for name, plain in self._plain.items():
+            getattr(self.model, name)[:] = plain
+        for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
+            colour[:] = plain
+        self._change_objects(values.get("size"), values.get("colour"))
+        for camera in CAMERAS:
+            self._move_camera(camera, values.get("camera_shift", {}), values.get("camera_turn", {}))
+        self._light(drawn.number("brightness", 1.0), drawn.number("light_turn"))
+        self._applied = values
+
+    def _headlight_colours(self) -> list[Any]:
+        lamp = self.model.vis.headlight
+        return [lamp.ambient, lamp.diffuse, lamp.specular]
+
+    def _change_objects(self, edge: float | None, colour: Sequence[float] | None) -> None:
+        for geom in self._geoms:
+            if edge is not None:
+                self.model.geom_size[geom] *= edge / 2 / self.model.geom_size[geom].max()
+            if colour is not None:
+                self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
+                self.model.geom_rgba[geom] = [*colour, 1.0]
+
+    def _move_camera(self, name: str, shifts: Mapping[str, Any], turns: Mapping[str, Any]) -> None:
+        camera = camera_id(self.model, name)
+        quat, turn, moved = self.model.cam_quat[camera].copy(), np.empty(4), np.empty(3)
+        if name in shifts:
+            mujoco.mju_rotVecQuat(moved, np.asarray(shifts[name]), quat)
+            self.model.cam_pos[camera] += moved
+        if name in turns:
+            vector = np.deg2rad(turns[name])
+            angle = float(np.linalg.norm(vector))
+            mujoco.mju_axisAngle2Quat(turn, vector / angle if angle else np.array([1.0, 0, 0]), angle)
+            mujoco.mju_mulQuat(self.model.cam_quat[camera], quat, turn)
+
+    def _light(self, brightness: float, light_turn: float) -> None:
+        """Multiply every lamp by a factor, and turn those that stand in the world about the vertical [deg]."""
+        for colour in (*self._headlight_colours(), *(getattr(self.model, name) for name in _LAMPS)):
+            colour[:] *= brightness
+        turn = np.deg2rad(light_turn)
+        rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        in_world = self.model.light_bodyid == 0
+        for vectors in (self.model.light_pos, self.model.light_dir):
+            vectors[in_world] = vectors[in_world] @ rotation.T
 
 
 @cache
@@ -109,12 +172,3 @@ def _sums(groups: Indices, values: F64, count: int) -> F64:
 
 def _rows(array: NDArray[Any], start: int, count: int) -> NDArray[Any]:
     return array[start : start + count]
-
-
-def _light(model: mujoco.MjModel, look: Look) -> None:
-    """Lamps and shadow map as `look` has them; antialiasing is the renderer's affair."""
-    quality = model.vis.quality
-    quality.offsamples = 0
-    if not look.shadows:
-        quality.shadowsize = 0
-    light_up(model, look.brightness, look.light_turn)

@@ -1,4 +1,4 @@
-"""A compiled scene in one state, answered by name: what tasks, ladders and the expert look at.
+"""A compiled scene, and its physics in one state, read by name: what tasks, ladders and the expert work with.
 
 Lengths in [m], angles in [rad], everything in the world's frame: z = 0 is the table's top, x away from the robot.
 """
@@ -9,7 +9,7 @@ import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import mujoco
 import numpy as np
@@ -20,11 +20,8 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
-from manip_il.sim import variation as varied
+from manip_il.sim import variation as variations
 from manip_il.sim.variation import Object
-
-if TYPE_CHECKING:
-    from manip_il.tasks.task import Task
 
 F64 = NDArray[np.float64]
 T = TypeVar("T")
@@ -33,7 +30,7 @@ GOAL = "goal"  # the mocap body that shows where things are to go
 
 
 class Pose(NamedTuple):
-    """Where a body or frame is: position (3,) [m], rotation matrix (3, 3)."""
+    """Position (3,) [m] and rotation matrix (3, 3) of a body or frame."""
 
     position: F64
     rotation: F64
@@ -41,14 +38,14 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A robot and a task as one compiled model, and the addresses of what is named in it.
+    """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
-    arm_q, arm_v, arm_ctrl: indices of the arm's joints into qpos, qvel and ctrl. objects: free bodies by name. ee_site:
-    id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
+    task: its name. arm_q, arm_v, arm_ctrl: indices of the arm's joints into qpos, qvel and ctrl. objects: free bodies
+    by name. ee_site: id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
     """
 
     robot: Robot
-    task: Task
+    task: str
     model: mujoco.MjModel
     gripper: Gripper
     actions: ActionSpace
@@ -61,7 +58,7 @@ class Scene:
 
     @cached_property
     def qpos_slice(self) -> slice:
-        """Where qpos stands in `State.physics`."""
+        """Part of `State.physics` that is qpos."""
         start = mujoco.mj_stateSize(self.model, int(mujoco.mjtState.mjSTATE_TIME))
         return slice(start, start + self.model.nq)
 
@@ -72,13 +69,13 @@ class Scene:
 
     @cached_property
     def reach(self) -> Reach:
-        """Where the hand gets to."""
+        """Map of the points that the hand, pointing down, gets to."""
         return reach_of(self.robot)
 
     @property
     def name(self) -> str:
         """Robot and task, for messages."""
-        return f"{self.robot.name} {self.task.name}"
+        return f"{self.robot.name} {self.task}"
 
     def model_bytes(self) -> bytes:
         """Return the compiled model, byte for byte: what a fingerprint hashes."""
@@ -88,10 +85,10 @@ class Scene:
 
 
 class World:
-    """One scene's physics, and named questions to it.
+    """One scene's physics, and what can be read from it by name.
 
     model and data change their identity with the variation: the shared model as compiled, or one of this world's own.
-    What is asked needs kinematics to be up to date (`moved`).
+    Poses need kinematics to be up to date (`update`).
     """
 
     def __init__(self, scene: Scene):
@@ -100,17 +97,17 @@ class World:
         self.model, self.data = scene.model, mujoco.MjData(scene.model)
         self._plain = self.model, self.data
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
-        self._known: dict[Any, Any] = {}  # until the world moves
+        self._cache: dict[Any, Any] = {}  # until the world moves
         self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
 
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Make the model what `variation` (v,) says. Raises what `variation.check` raises."""
+        """Give the model the sizes, masses and frictions of `variation` (v,). Raises what `variation.check` raises."""
         if variation.tobytes() == self.variation.tobytes():
             return
-        varied.check(variation, self.scene.nominal)
-        self._known.clear()
+        variations.check(variation, self.scene.nominal)
+        self._cache.clear()
         self._extents.clear()
         self.variation = variation.copy()
         if np.array_equal(variation, self.scene.nominal):
@@ -120,7 +117,7 @@ class World:
             model = copy.copy(self.scene.model)  # physics reads masses and sizes from there
             self._own = model, mujoco.MjData(model)
         self.model, self.data = self._own
-        varied.apply(self.model, self.scene.model, self.scene.objects, variation)
+        variations.apply(self.model, self.scene.model, self.scene.objects, variation)
         mujoco.mj_setConst(self.model, self.data)  # what follows from masses
 
     def physics(self) -> F64:
@@ -130,21 +127,21 @@ class World:
         return physics
 
     def restore(self, physics: F64, variation: F64) -> None:
-        """Be as a state says, bit for bit. Raises `MismatchError` for a state of another scene."""
+        """Restore physics (p,) and variation (v,), bit for bit. Raises `MismatchError` for those of another scene."""
         size = self.scene.state_size
         if len(physics) != size:
             raise MismatchError("size of the physics state", "the state", len(physics), self.scene.name, size)
         self.vary(variation)
         mujoco.mj_setState(self.model, self.data, physics, STATE_KIND)
-        self.moved()
+        self.update()
 
-    def moved(self) -> None:
-        """Bring positions up to date after qpos or mocap poses changed."""
-        self._known.clear()
+    def update(self) -> None:
+        """Compute poses from qpos and mocap poses after those changed."""
+        self._cache.clear()
         mujoco.mj_kinematics(self.model, self.data)
 
     def place(self, name: str, position: F64, quaternion: F64) -> None:
-        """Put an object at rest, or a mocap body, at a pose: (3,) [m], wxyz (4,). Call `moved` afterwards."""
+        """Put an object at rest, or a mocap body, at a pose: (3,) [m], wxyz (4,). Call `update` afterwards."""
         if name in self.scene.objects:
             one = self.scene.objects[name]
             self.data.qpos[one.q : one.q + 7] = [*position, *quaternion]
@@ -155,38 +152,39 @@ class World:
             raise ManipError(f"{name!r} is neither an object nor a mocap body; it cannot be placed")
         self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = position, quaternion
 
-    # Questions
+    # Readings
 
-    def remember(self, key: Any, work_out: Callable[[], T]) -> T:
-        """What `work_out` gives, worked out once until the world changes."""
-        if key not in self._known:
-            self._known[key] = work_out()
-        return self._known[key]
+    def remember(self, key: Any, compute: Callable[[], T]) -> T:
+        """Return what `compute` gives, computed once until the world changes."""
+        if key not in self._cache:
+            self._cache[key] = compute()
+        return self._cache[key]
 
     @property
     def ee(self) -> Pose:
         """The frame between the fingertips: z out of the hand, y along the fingers' motion."""
-        return self.remember("ee", self._ee)
+        at = self.scene.ee_site
+        return self.remember("ee", lambda: Pose(self.data.site_xpos[at], self.data.site_xmat[at].reshape(3, 3)))
 
     def pose(self, name: str) -> Pose:
-        """Of a body. Raises `UnknownName`."""
+        """Return the pose of a body. Raises `UnknownName`."""
         one = self.scene.objects.get(name)
         body = one.body if one is not None else self._body(name).id
         return Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
 
     @property
     def goal(self) -> F64:
-        """Where the goal marker is, (3,)."""
+        """Position of the goal marker, (3,)."""
         return self.data.mocap_pos[self._mocap_goal]
 
     @property
     def opening(self) -> float:
-        """Between the gripper's pads."""
-        return self.remember("opening", self._opening)
+        """Opening between the gripper's pads."""
+        return self.remember("opening", lambda: self.scene.gripper.opening(self.data.qpos))
 
     @property
     def most_opening(self) -> float:
-        """Between the gripper's pads when it is open."""
+        """Opening between the pads of the open gripper."""
         return self.scene.gripper.most
 
     def extents(self, name: str) -> tuple[float, ...]:
@@ -194,7 +192,7 @@ class World:
         if name not in self._extents:
             geom = self.scene.objects[name].geom
             kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
-            self._extents[name] = tuple(varied.extents(kind, size).tolist())
+            self._extents[name] = tuple(variations.extents(kind, size).tolist())
         return self._extents[name]
 
     def touched(self, name: str) -> bool:
@@ -204,15 +202,8 @@ class World:
 
     @property
     def reach(self) -> Reach:
-        """Where the hand gets to, pointing down."""
+        """Map of the points that the hand, pointing down, gets to."""
         return self.scene.reach
-
-    def _ee(self) -> Pose:
-        site = self.scene.ee_site
-        return Pose(self.data.site_xpos[site], self.data.site_xmat[site].reshape(3, 3))
-
-    def _opening(self) -> float:
-        return self.scene.gripper.opening(self.data.qpos)
 
     @cached_property
     def has_goal(self) -> bool:

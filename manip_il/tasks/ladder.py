@@ -1,8 +1,8 @@
-"""What ladders share: how a hand gets around an object, holds it and carries it, as pure geometry of a world.
+"""Rungs that tasks share: how a hand gets around an object, holds it and carries it, as pure geometry of a world.
 
 Within a rung targets are continuous in the state, and the approach is one funnel rather than waypoints: the nearer the
-hand is to being over the object, the lower it may go. Labels of neighbouring states are then neighbours, which is what
-a learner can fit. Whether an object is held is read off the fingers that touch it: nothing is remembered.
+hand is to being over the object, the lower it may go. Neighbouring states then have neighbouring labels, which a
+learner can fit. Whether an object is held is read off the fingers that touch it; nothing is stored.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Grasp(NamedTuple):
 
 
 def grasp_of(world: World, name: str) -> Grasp:
-    """Return how the hand stands to an object; worked out once for a state."""
+    """Return the pose of an object relative to the hand; computed once a state."""
     return world.remember(("grasp", name), partial(_grasp, world, name))
 
 
@@ -103,21 +103,21 @@ def _grasp(world: World, name: str) -> Grasp:
 
 
 def held(world: World, name: str) -> bool:
-    """Return the object is between the fingers, and each of them touches it."""
+    """Return whether the object is between the fingers and each of them touches it."""
     g = grasp_of(world, name)
     x, y, z = IN_HAND
     return _inside(g.offset, (g.width / 2 + x, y, g.half + z)) and world.touched(name)
 
 
 def at_grasp(world: World, name: str) -> bool:
-    """Closing the fingers now would hold the object; once they have begun to close, they go on more readily."""
+    """Return whether closing the fingers now would hold the object; with hysteresis once they have begun to close."""
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
     return _inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.tilt < MAX_TILT
 
 
 def approach(world: World, name: str) -> Target:
-    """Over the object and down around it, the fingers open; straight up where the hand is too low beside it."""
+    """Approach from above: over the object and down around it, fingers open; straight up if too low beside it."""
     g, (ee_x, ee_y, ee_z) = grasp_of(world, name), world.ee.position.tolist()
     x, y, z = g.at
     height = g.height if g.open_enough and g.tilt < MAX_TILT else max(g.height, g.half + CLEAR)
@@ -128,13 +128,13 @@ def approach(world: World, name: str) -> Target:
 
 
 def close_on(world: World, name: str) -> Target:
-    """Closed fingers where the object is."""
+    """Close the fingers at the object's position."""
     g = grasp_of(world, name)
     return Target(np.array(g.at), hand_down(g.yaw), CLOSED)
 
 
 def carry(world: World, name: str, to: F64) -> Target:
-    """Return the held object's centre to a point (3,), over its height first and then down to it."""
+    """Carry the held object's centre to a point (3,) [m], above it first and then down."""
     way = to - world.pose(name).position
     lift = carry_lift(math.hypot(way[0], way[1]))
     position = world.ee.position + way + [0.0, 0.0, lift]
@@ -184,7 +184,7 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
 
 
 def pick_progress(world: World, name: str) -> float:
-    """Of grasping an object and carrying it to the goal, 0 to 1: by the way still to go along the ladder's path."""
+    """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the way left on that path."""
     if held(world, name):
         way = world.goal - world.pose(name).position
         along = math.hypot(way[0], way[1])
@@ -196,7 +196,7 @@ def pick_progress(world: World, name: str) -> float:
 
 
 def nearness(rest: float) -> float:
-    """1 within `AT_GOAL` [m], and less the longer the way still to go is."""
+    """Return 1 within `AT_GOAL` [m], and less the longer the way still to go is."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))
 
 
@@ -207,7 +207,7 @@ def hand_down(yaw: float) -> F64:
 
 
 def grasp_yaw(object_yaw: float, hand: F64) -> float:
-    """Return the one of a cube's four grasps that is nearest to the hand's yaw, and a little to none [rad].
+    """Return the yaw of a cube's four grasps that is nearest to the hand's, with a small preference for 0 [rad].
 
     hand: rotation of `ee`, (3, 3). Nearest to the hand, not to zero: a learner that averages both sides of the boundary
     between two grasps then leaves it by any turn, and does not stand still in the middle.
@@ -235,7 +235,7 @@ def cube_yaw(rotation: F64) -> tuple[float, float]:
 
 
 def angle_from_down(rotation: F64, yaw: float) -> float:
-    """What `angle_between` gives for a rotation and `hand_down(yaw)` [rad]."""
+    """Return `angle_between` a rotation (3, 3) and `hand_down(yaw)` [rad]."""
     (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
     trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
     return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))

@@ -1,4 +1,4 @@
-"""What tasks put into the world: cubes, and the marker of a goal."""
+"""Objects that tasks share: cubes, and the marker of a goal."""
 
 from __future__ import annotations
 

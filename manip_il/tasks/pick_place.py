@@ -11,7 +11,7 @@ import numpy as np
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.ladder import cube_yaw, pick_progress, pick_rungs
 from manip_il.tasks.objects import add_cube, add_goal
-from manip_il.tasks.reach import see_hand
+from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_resting, draw_yaw, resting_height
 from manip_il.tasks.task import Observed, Rung, Start
 
@@ -39,24 +39,24 @@ class PickPlace:
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Hand, goal, cube, and the ways between them; the cube's yaw four times itself, as its faces are alike."""
-        return see_cube(world, OBJECT)
+        """Return hand, goal, cube, and the ways between them; four times the cube's yaw, as its faces are alike."""
+        return observe_cube(world, OBJECT)
 
     def error(self, world: World) -> float:
-        """Of the cube's centre from the goal [m]."""
+        """Return the distance of the cube's centre from the goal [m]."""
         return math.dist(world.pose(OBJECT).position, world.goal)
 
     def progress(self, world: World) -> float:
-        """By the way that is left along the ladder's path."""
+        """Return progress by the way that is left along the ladder's path."""
         return pick_progress(world, OBJECT)
 
 
-def see_cube(world: World, name: str) -> Observed:
-    """`environment_state` of a task with one cube and a goal for it."""
+def observe_cube(world: World, name: str) -> Observed:
+    """Return `environment_state` of a task with one cube and a goal for it."""
     pose, ee, goal = world.pose(name), world.ee.position, world.goal
     yaw, tilt = cube_yaw(pose.rotation)
     return {
-        **see_hand(world),
+        **observe_hand(world),
         "goal": goal,
         name: pose.position,
         f"{name}.cos4yaw": math.cos(4 * yaw),

@@ -43,19 +43,19 @@ class ReachGoal:
         return Start({GOAL: (draw_goal(rng, world, CUBE_HALF, in_air=1.0), UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
-        """Hand, goal, and the way from one to the other."""
-        return {**see_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
+        """Return hand, goal, and the way from one to the other."""
+        return {**observe_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
 
     def error(self, world: World) -> float:
-        """Of `ee` from the goal [m]."""
+        """Return the distance of `ee` from the goal [m]."""
         return math.dist(world.ee.position, world.goal)
 
     def progress(self, world: World) -> float:
-        """By the distance that is left."""
+        """Return progress by the distance that is left."""
         return nearness(self.error(world))
 
 
-def see_hand(world: World) -> Observed:
-    """Return where the hand is and which way it points: the beginning of every `environment_state`."""
+def observe_hand(world: World) -> Observed:
+    """Return the hand's position and axes: the beginning of every `environment_state`."""
     ee = world.ee
     return {"ee": ee.position, "ee.axis_y": ee.rotation[:, 1], "ee.axis_z": ee.rotation[:, 2]}

@@ -1,4 +1,4 @@
-"""Draws of starts within an arm's reach."""
+"""Random starts within an arm's reach."""
 
 from __future__ import annotations
 
@@ -45,18 +45,16 @@ def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
 
 
 def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
-    """Draw until it fits. Raises `UsageError` after a thousand draws."""
+    """Draw until it fits, (3,). Raises `UsageError` after a thousand draws."""
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):
             return drawn
-    raise UsageError(
-        f"task {world.scene.task.name}: no place for {what} in reach of {world.scene.robot.name} was found"
-    )
+    raise UsageError(f"task {world.scene.task}: no place for {what} in reach of {world.scene.robot.name} was found")
 
 
 def resting_height(world: World, name: str) -> float:
-    """Of an object's centre over the table when it lies as it was made [m]."""
+    """Return the height of an object's centre over the table when it lies as it was made [m]."""
     return world.extents(name)[2] / 2
 
 

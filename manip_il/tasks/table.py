@@ -1,4 +1,4 @@
-"""The tasks: one literal table."""
+"""The tasks by name."""
 
 from __future__ import annotations
 

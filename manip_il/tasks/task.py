@@ -1,24 +1,23 @@
-"""What a task is: one file that says its objects, its starts, what is seen of it, and how the expert solves it."""
+"""The interface of a task: its objects, its starts, what is observed of it, and how the expert solves it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from manip_il.sim.world import World
+from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
 Observed = Mapping[str, "F64 | float"]
 
 
 class Target(NamedTuple):
-    """What the expert aims for: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
+    """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
     max_step: how far ahead of the hand its target may run [m]; max_turn: [rad].
     """
@@ -42,7 +41,7 @@ class Rung:
 
 @dataclass(frozen=True)
 class Start:
-    """What a task draws for an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies."""
+    """Drawn start of an episode: (position (3,) [m], quaternion wxyz (4,)) of objects and mocap bodies."""
 
     poses: Mapping[str, tuple[F64, F64]]
 
@@ -56,12 +55,12 @@ class Task(Protocol):
 
     @property
     def name(self) -> str:
-        """How options call it."""
+        """Name in options."""
         ...
 
     @property
     def instruction(self) -> str:
-        """What a policy that reads language is told."""
+        """Text for policies that read language."""
         ...
 
     @property
@@ -83,7 +82,7 @@ class Task(Protocol):
         ...
 
     def observe(self, world: World) -> Observed:
-        """`environment_state` by names, in its order: numbers, and vectors of x, y and z."""
+        """Return `environment_state` by names, in its order: numbers, and vectors of x, y and z."""
         ...
 
     def error(self, world: World) -> float:

@@ -7,7 +7,7 @@ import pytest
 from manip_il.algorithms.beta import BetaSchedule
 from manip_il.algorithms.config import RunConfig, check_cameras, check_labels
 from manip_il.algorithms.table import check_method
-from manip_il.engine.query import QueryRule
+from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.look import CameraConfig

@@ -16,8 +16,8 @@ from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.run import Watch, round_folder
 from manip_il.algorithms.table import run_algorithm
 from manip_il.data.lerobot_read import dataset_info, read_table, read_tables
+from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
-from manip_il.engine.query import QueryRule
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig

@@ -10,7 +10,7 @@ from pathlib import Path
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.folders import append_jsonl
 from manip_il.cli.groups import EnvGroup, TaskGroup, save_options
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta

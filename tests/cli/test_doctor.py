@@ -13,7 +13,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import build
 from manip_il.data.journal import write_episode
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 

@@ -15,13 +15,13 @@ from manip_il.cli.kept_episodes import FILE_NAME as KEPT
 from manip_il.cli.main import main
 from manip_il.cli.suites import CONDITIONS, SUITES, suite_conditions
 from manip_il.data import schema
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.sim.conditions import NOMINAL, draw
-from manip_il.sim.disturb import STANDARD
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.events import STANDARD
 
 from ..learn.tiny_policies import write_checkpoint
 from .made_runs import mark
@@ -67,10 +67,7 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
 
 def test_knocked_is_the_disturbance_that_dagger_collects_under():
     [knocked] = suite_conditions("knocked", "pick_place", sees=False)
-    assert knocked.knock == STANDARD.knock
-    assert knocked.action_noise == (STANDARD.action_noise, STANDARD.action_noise)
-    first, beyond = STANDARD.knock_steps
-    assert knocked.knock_step == (first, beyond - 1)
+    assert knocked.ranges == STANDARD.ranges
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
@@ -97,7 +94,7 @@ def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, 
     }
     conditions = suite_conditions("all", "pick_place", sees=False)
     for episode in data["episodes"]:
-        assert episode["drawn"] == dict(draw(conditions, episode["seed"]).drawn)
+        assert episode["drawn"] == dict(draw(conditions, episode["seed"]).values)
     assert data["settings"]["suite"] == "all"
     out = capsys.readouterr().out
     for name in data["by_condition"]:
@@ -221,7 +218,7 @@ def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(her
 
 def test_too_little_memory_is_said_before_the_first_episode(here, capsys, monkeypatch):
     monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
-    monkeypatch.setattr("manip_il.engine.memory.needed_memory", lambda *_, **__: 10**15)
+    monkeypatch.setattr("manip_il.engine.local.needed_memory", lambda *_, **__: 10**15)
     assert evaluate("e", *REACH, "--eval.n_episodes=1") == 1
     assert "memory" in error(capsys)
     assert not Path("e").exists()

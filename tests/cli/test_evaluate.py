@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import RenderError
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta

@@ -107,6 +107,6 @@ def test_processes_that_cannot_share_a_lock_are_said(undrawn, monkeypatch, capsy
 
 def test_little_free_memory_is_told_but_no_fault(undrawn, monkeypatch, capsys):
     """Beside a large evaluation little is free, and the container is well."""
-    monkeypatch.setattr("manip_il.engine.memory.available_memory", lambda: 10**8)
+    monkeypatch.setattr("manip_il.engine.local.available_memory", lambda: 10**8)
     assert main(["health"]) == 0
     assert "0.1 GB of memory free" in capsys.readouterr().out

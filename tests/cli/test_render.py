@@ -11,7 +11,7 @@ from manip_il.cli import groups
 from manip_il.cli.main import main
 from manip_il.data.lerobot_read import read_provenance, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.sim import render
 from manip_il.sim.env import EnvConfig

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.engine.describe import env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig

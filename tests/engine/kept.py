@@ -1,14 +1,31 @@
-"""What workers do with an episode in these tests; imported by name in their processes."""
+"""What workers do with an episode in these tests (imported by name in their processes), and what is left of it."""
 
 from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from manip_il.data.journal import JournalKeep
+from manip_il.data.journal import JournalKeep, list_episodes
+from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob
 from manip_il.mdp import Episode
+
+
+def journal(folder: Path, job: RolloutJob) -> JournalKeep:
+    """Store the episodes of a job in a folder."""
+    return JournalKeep(folder, env_spec(job.env), env_fingerprint(job.env))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in list_episodes(folder)}
+
+
+def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
+    """Seed -> column -> bytes."""
+    return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
 
 
 @dataclass(frozen=True)

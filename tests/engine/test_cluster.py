@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 import ray
-from kept import DeadlyKeep
+from kept import DeadlyKeep, contents, journal
 from ray.cluster_utils import Cluster
 
-from manip_il.data.journal import JournalKeep, list_episodes
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError
@@ -26,19 +24,11 @@ SEEDS = stream_seeds("certificate", 16)
 JOB = RolloutJob(EnvConfig("fetch"), "expert", hold=3)
 
 
-def journal(folder, job: RolloutJob = JOB) -> JournalKeep:
-    return JournalKeep(folder, env_spec(job.env), env_fingerprint(job.env))
-
-
-def contents(folder) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in list_episodes(folder)}
-
-
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> dict[str, bytes]:
     """What this process alone writes."""
     folder = tmp_path_factory.mktemp("here")
-    list(Engine().run(JOB, SEEDS, journal(folder)))
+    list(Engine().run(JOB, SEEDS, journal(folder, JOB)))
     return contents(folder)
 
 
@@ -61,7 +51,7 @@ def cluster() -> Iterator[Cluster]:
 
 def test_a_cluster_writes_what_this_process_writes(cluster, tmp_path, expected):
     with Engine(None, "ray") as engine:
-        assert len(list(engine.run(JOB, SEEDS, journal(tmp_path)))) == len(SEEDS)
+        assert len(list(engine.run(JOB, SEEDS, journal(tmp_path, JOB)))) == len(SEEDS)
     assert contents(tmp_path) == expected
 
 
@@ -76,7 +66,7 @@ def test_a_policy_acts_the_same_on_a_cluster(cluster, checkpoint):
 
 def test_a_seed_that_kills_its_worker_is_left_out_there_too(cluster, tmp_path, expected):
     (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[2],), times=1000)
     with Engine(2, "ray") as engine:
         done = {episode.seed for episode in engine.run(JOB, SEEDS[:5], keep)}
         assert engine.given_up == [SEEDS[2]]
@@ -94,7 +84,7 @@ def test_a_node_that_is_killed_costs_no_episode(cluster, tmp_path, expected):
     node = cluster.add_node(num_cpus=2)
     cluster.wait_for_nodes()
     with Engine(4, "ray") as engine:
-        for count, _ in enumerate(engine.run(JOB, SEEDS, journal(tmp_path))):
+        for count, _ in enumerate(engine.run(JOB, SEEDS, journal(tmp_path, JOB))):
             if count == 3:
                 cluster.remove_node(node, allow_graceful=False)
         assert engine.given_up == []

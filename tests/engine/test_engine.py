@@ -12,10 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from kept import DeadlyKeep, FailingKeep
+from kept import DeadlyKeep, FailingKeep, contents, journal
 
-from manip_il.data.journal import JournalKeep, list_episodes, list_seeds
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.data.journal import list_seeds
 from manip_il.engine.engine import Engine, _tasks
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError
@@ -26,19 +25,11 @@ SEEDS = stream_seeds("certificate", 6)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=3)
 
 
-def journal(folder: Path, job: RolloutJob = JOB) -> JournalKeep:
-    return JournalKeep(folder, env_spec(job.env), env_fingerprint(job.env))
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in list_episodes(folder)}
-
-
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> dict[str, bytes]:
     """What this process alone writes."""
     folder = tmp_path_factory.mktemp("here")
-    assert len(list(Engine().run(JOB, SEEDS, journal(folder)))) == len(SEEDS)
+    assert len(list(Engine().run(JOB, SEEDS, journal(folder, JOB)))) == len(SEEDS)
     return contents(folder)
 
 
@@ -60,7 +51,7 @@ def test_every_seed_is_in_one_task_and_no_worker_idles(seeds: int, workers: int)
 
 @pytest.mark.slow
 def test_an_episode_is_on_disk_before_it_arrives(two_processes, tmp_path, expected):
-    for episode in two_processes.run(JOB, SEEDS, journal(tmp_path)):
+    for episode in two_processes.run(JOB, SEEDS, journal(tmp_path, JOB)):
         assert episode.seed in list_seeds(tmp_path)
     assert contents(tmp_path) == expected
 
@@ -68,7 +59,7 @@ def test_an_episode_is_on_disk_before_it_arrives(two_processes, tmp_path, expect
 @pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_its_seed_runs_again(two_processes, tmp_path, expected):
     (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[1], SEEDS[4]), times=2)
+    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[1], SEEDS[4]), times=2)
     episodes = list(two_processes.run(JOB, SEEDS, keep))
     assert sorted(episode.seed for episode in episodes) == list(SEEDS)
     assert contents(tmp_path / "journals") == expected
@@ -79,7 +70,7 @@ def test_a_worker_that_dies_is_replaced_and_its_seed_runs_again(two_processes, t
 @pytest.mark.slow
 def test_a_seed_that_kills_its_worker_three_times_is_left_out_and_named(tmp_path, expected):
     (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[2],), times=1000)
     with Engine(2) as engine:
         episodes = list(engine.run(JOB, SEEDS, keep))
         assert engine.given_up == [SEEDS[2]]
@@ -103,7 +94,7 @@ def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tm
 def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
     (tmp_path / "deaths").mkdir()
     seeds = stream_seeds("certificate", 40)
-    keep = DeadlyKeep(journal(tmp_path / "journals"), tmp_path / "deaths", tuple(seeds), times=1000)
+    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", tuple(seeds), times=1000)
     with Engine(2) as engine, pytest.raises(ManipError, match=r"rollout workers died one after the other.*SIGKILL"):
         list(engine.run(JOB, seeds, keep))
 
@@ -125,7 +116,7 @@ def test_workers_end_with_the_process_that_started_them():
         "from manip_il.sim.env import EnvConfig\n"
         "engine = Engine(2)\n"
         "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
-        "    pids = [worker._process.pid for worker in engine._place._busy.values()]\n"
+        "    pids = [worker._process.pid for worker in engine._pool._busy.values()]\n"
         "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
         "    print(pids, flush=True)\n"
     )

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from kept import written
 
 from manip_il.data.schema import fitted_columns
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine, default_workers
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
-from manip_il.mdp import Actor, Episode
+from manip_il.mdp import Actor
 from manip_il.seeding import stream_seeds
-from manip_il.sim.disturb import STANDARD, Disturbance
+from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.events import STANDARD
 
 SEEDS = stream_seeds("certificate", 6)
 EXPERT = RolloutJob(EnvConfig("fetch"), "expert", hold=3)
-
-
-def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
-    return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
 
 
 def test_hold_ends_an_episode_so_many_steps_after_success():
@@ -39,7 +37,7 @@ def test_without_hold_an_episode_goes_to_the_horizon():
     assert [len(episode) for episode in run_job(job, SEEDS[:2])] == [37, 37]
 
 
-@pytest.mark.parametrize("job", [EXPERT, replace(EXPERT, driver="random"), replace(EXPERT, disturbance=STANDARD)])
+@pytest.mark.parametrize("job", [EXPERT, replace(EXPERT, driver="random"), replace(EXPERT, conditions=(STANDARD,))])
 def test_an_episode_has_the_schemas_columns(job: RolloutJob):
     for episode in run_job(replace(job, round=4, beta=0.25), SEEDS[:2]):
         columns = fitted_columns(episode, env_spec(job.env))
@@ -49,28 +47,28 @@ def test_an_episode_has_the_schemas_columns(job: RolloutJob):
 
 
 def test_an_episode_does_not_depend_on_the_others_of_its_job():
-    for job in (replace(EXPERT, disturbance=STANDARD), replace(EXPERT, driver="random", env=EnvConfig(horizon=10))):
+    for job in (replace(EXPERT, conditions=(STANDARD,)), replace(EXPERT, driver="random", env=EnvConfig(horizon=10))):
         together = written(run_job(job, SEEDS[:3]))
         assert written(run_job(job, SEEDS[1:2]))[SEEDS[1]] == together[SEEDS[1]]
         assert written(run_job(job, SEEDS[2::-1])) == together
 
 
 def test_disturbances_are_drawn_from_the_seed():
-    job = replace(EXPERT, disturbance=STANDARD)
+    job = replace(EXPERT, conditions=(STANDARD,))
     seeds = SEEDS[:2]
     first, plain = written(run_job(job, seeds)), written(run_job(EXPERT, seeds))
     assert written(run_job(job, seeds)) == first
     assert all(first[seed]["executed_action"] != plain[seed]["executed_action"] for seed in seeds)
-    assert written(run_job(replace(job, disturbance=Disturbance()), seeds)) == plain
+    assert written(run_job(replace(job, conditions=()), seeds)) == plain
 
 
 def test_under_action_noise_the_actor_is_the_noisy_expert_and_labels_stay_the_experts():
-    job = replace(EXPERT, disturbance=Disturbance(action_noise=0.1))
+    job = replace(EXPERT, conditions=(Condition("noisy", action_noise=(0.1, 0.1)),))
     for episode in run_job(job, SEEDS[:2]):
         columns = episode.columns
         assert set(columns["actor"].ravel()) == {Actor.NOISY_EXPERT}
         assert (columns["executed_action"] != columns["action"]).any(axis=1).all()
-    for episode in run_job(replace(EXPERT, disturbance=Disturbance(knock=(0.05, 0.08))), SEEDS[:2]):
+    for episode in run_job(replace(EXPERT, conditions=(Condition("knocked", knock=(0.05, 0.08)),)), SEEDS[:2]):
         columns = episode.columns
         assert set(columns["actor"].ravel()) == {Actor.EXPERT}
         np.testing.assert_array_equal(columns["executed_action"], columns["action"])
@@ -93,15 +91,6 @@ def test_labels_of_the_last_step_alone_tell_the_phase_at_the_end():
 def test_no_seeds_give_no_episodes():
     assert list(run_job(EXPERT, [])) == []
     assert list(Engine().run(EXPERT, [])) == []
-
-
-def test_an_environments_description_names_what_it_is():
-    spec, fingerprint = env_spec(EnvConfig("fetch", "lift", control_hz=25)), env_fingerprint(EnvConfig("fetch"))
-    assert (spec.robot, spec.task, spec.fps) == ("fetch", "lift", 25)
-    assert spec.joint_names[-1] == "gripper"
-    assert env_fingerprint(EnvConfig("fetch")) == fingerprint
-    assert env_fingerprint(EnvConfig("panda")) != fingerprint
-    assert env_fingerprint(EnvConfig("fetch", tolerance=0.05)) != fingerprint
 
 
 def test_an_engine_wants_a_worker():

@@ -10,15 +10,15 @@ import pytest
 
 from manip_il.data.episodes import parts
 from manip_il.data.schema import fitted_columns
-from manip_il.engine.describe import env_spec
+from manip_il.engine.drivers import QueryRule
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.query import QueryRule
 from manip_il.errors import UsageError
 from manip_il.expert.expert import Expert
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.disturb import STANDARD
 from manip_il.sim.env import EnvConfig
+from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
 
 SEEDS = stream_seeds("round/1", 4)
@@ -124,7 +124,7 @@ def test_an_expert_that_takes_over_solves_what_it_took_over(job: RolloutJob):
 
 
 def test_a_takeover_in_a_disturbed_world_is_cut_where_the_expert_took_over(job: RolloutJob):
-    noisy = replace(job, label="takeover", query=QueryRule("one"), disturbance=STANDARD)
+    noisy = replace(job, label="takeover", query=QueryRule("one"), conditions=(STANDARD,))
     for episode in run(noisy).values():
         rolled_in, recovery = parts(episode)
         assert (rolled_in.columns["actor"] == Actor.LEARNER).all()

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from kept import written
 from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.data.journal import JournalKeep, list_episodes, read_journal
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.sight import drawn_cameras, policy_cameras
+from manip_il.engine.environments import env_fingerprint, env_spec, policy_cameras
+from manip_il.engine.jobs import RolloutJob, observed_cameras, run_job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import CheckpointMeta
-from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig, Look
@@ -49,10 +47,6 @@ def seeing_policy(folder: Path, cameras: CameraConfig = DIM) -> Path:
     look = {"brightness": cameras.look.brightness}
     meta = CheckpointMeta.of(spec, env_fingerprint(ENV, cameras), observation="images", look=look)
     return write_checkpoint(folder, "act", spec, "images", meta=meta)
-
-
-def written(episodes: Iterable[Episode]) -> dict[int, dict[str, bytes]]:
-    return {e.seed: {key: column.tobytes() for key, column in e.columns.items()} for e in episodes}
 
 
 def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None = None) -> np.ndarray:
@@ -133,10 +127,10 @@ def test_a_checkpoint_says_what_it_must_be_shown(act, seeing, tmp_path):
 
 def test_what_is_recorded_must_hold_what_the_policy_looks_at(act, seeing):
     job = RolloutJob(ENV, "policy", policy=seeing)
-    assert drawn_cameras(job) == DIM
+    assert observed_cameras(job) == DIM
     wide = CameraConfig(("wrist", "front"), 32, 32)
-    assert drawn_cameras(replace(job, cameras=wide)) == wide
-    assert drawn_cameras(replace(job, policy=act)) is None
+    assert observed_cameras(replace(job, cameras=wide)) == wide
+    assert observed_cameras(replace(job, policy=act)) is None
     for cameras, words in ((replace(wide, names=("wrist",)), "cameras"), (replace(wide, width=64), "size of pictures")):
         with pytest.raises(MismatchError, match=rf"{words} differs"):
             list(run_job(replace(job, cameras=cameras), SEEDS[:1]))

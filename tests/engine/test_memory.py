@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.engine.memory import available_memory, check_memory, needed_memory
+from manip_il.engine.local import available_memory, check_memory, needed_memory
 from manip_il.errors import ManipError
 
 GB = 10**9

@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from manip_il.engine.query import (
+from manip_il.engine.drivers import (
     QueryRule,
     action_gap,
     at_drawn_step,
     by_chance,
     drawn_step,
-    where_disputed,
-    where_unsafe,
-    where_unsure,
+    on_disagreement,
+    on_gap,
+    on_low_likelihood,
 )
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Label, Observation, State
@@ -38,6 +38,8 @@ class Teacher:
 
 class Constant:
     """A policy of one answer."""
+
+    cameras = ()
 
     def __init__(self, *action: float):
         self.action, self.begun = np.array(action), []
@@ -94,21 +96,21 @@ def test_differences_are_measured_in_steps_of_the_worst_dimension():
 def test_safety_asks_where_expert_and_learner_differ_by_more_than_the_bound():
     teacher = Teacher([0.0, 0.0, 0.08])
     turns = [turn(teacher=teacher), turn(teacher=teacher)]
-    gate = where_unsafe(0.5, SCALE)
+    gate = on_gap(0.5, SCALE)
     assert gate(turns, [np.array([0.04, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])]) == [False, True]
     assert [one.label for one in turns] == [None, None]  # knowing is not keeping
 
 
 def test_an_ensemble_asks_where_its_members_spread():
     others = [Constant(0.0, 0.0, 0.08), Constant(0.0, 0.0, 0.08)]
-    gate = where_disputed(0.2, others, (), SCALE)
+    gate = on_disagreement(0.2, others, SCALE)
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
     assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
     assert [member.begun for member in others] == [[7], [7]]  # a policy with a memory must know who begins
 
 
 def test_an_unsure_learner_asks():
-    assert where_unsure(-1.0, Doubtful())([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
+    assert on_low_likelihood(-1.0, Doubtful())([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
 
 
 def test_chance_asks_in_its_share_of_the_steps_and_the_same_for_a_seed():
@@ -131,7 +133,7 @@ def test_one_step_of_an_episode_is_drawn_evenly():
 def test_a_turn_asks_once_and_only_where_there_is_an_expert():
     teacher = Teacher([0.0, 0.0, 0.0])
     one = turn(teacher=teacher)
-    assert one.ask() is one.ask() is one.label
+    assert one.query() is one.query() is one.label
     assert teacher.asked == 1
     with pytest.raises(ManipError, match="episode 4: nobody to ask for a label at step 9"):
-        turn(4, 9).ask()
+        turn(4, 9).query()

@@ -11,7 +11,7 @@ import pytest
 from manip_il.data import schema
 from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_provenance, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.engine.render import open_source, render_dataset, render_episodes, render_states
 from manip_il.errors import ManipError, MismatchError

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.drivers import drawn_step
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.query import drawn_step
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled
 from manip_il.evaluation.certificate_table import align, certificate_lines
@@ -23,7 +23,8 @@ from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.perturb import NOTICEABLE, Perturbation, Perturber
+from manip_il.sim.events import NOTICEABLE, Perturbation
+from manip_il.sim.scene import build_scene
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -118,15 +119,15 @@ def test_columns_are_aligned():
 
 @pytest.mark.parametrize("kind", ["random", "opposite", "gripper"])
 def test_costs_are_those_of_stepping_the_simulator_by_hand(measured: Certificate, kind: str):
-    env = ManipEnv("fetch", "pick_place")
-    expert = Expert(env.scene)
+    expert = Expert(build_scene("fetch", "pick_place"))
 
     def steps_to_go(seed: int, moment: int, perturbed: bool) -> int | None:
-        intruder = Perturber(env, Perturbation(kind, {seed: moment if perturbed else 10_000}), seed)
+        perturbation = Perturbation(kind, {seed: moment if perturbed else 10_000})
+        env = ManipEnv("fetch", "pick_place", conditions=[perturbation])
         env.start(seed)
         for step in range(moment + env.config.horizon):
-            intruder.before(step)
-            env.advance(intruder.action(expert.label(env.get_state()).action))
+            env.begin_step()
+            env.advance(expert.label(env.get_state()).action)
             if env.solved:
                 return step + 1 - moment
         return None

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from manip_il.data import schema
-from manip_il.engine.describe import env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4, film, make_film, paths, run_states, shown_steps, strip

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from manip_il.cli.suites import suite_conditions
-from manip_il.engine.describe import env_spec
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
 from manip_il.evaluation import runner
@@ -19,7 +19,6 @@ from manip_il.evaluation.runner import episode_result, evaluate
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.varied import VariedEnv
 
 from ..learn.tiny_policies import write_checkpoint
 
@@ -85,11 +84,11 @@ def test_an_episode_of_a_suite_is_that_of_its_condition_alone(act):
 
 def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
     result = evaluate(Engine(1), job_of(act, conditions=ALL), SEEDS, "it", suite="all")
-    env = VariedEnv(ALL, config=ENV)
+    env = ManipEnv(conditions=ALL, config=ENV)
     for episode in result.episodes:
         env.start(episode.seed)
-        assert episode.detail["drawn"] == dict(env.circumstances.drawn)
-        assert episode.detail["condition"] == env.circumstances.condition
+        assert episode.detail["drawn"] == dict(env.drawn.values)
+        assert episode.detail["condition"] == env.drawn.condition
     assert {episode.detail["condition"] for episode in result.episodes} == {"nominal", "knocked", "sensing", "object"}
     assert result.settings.suite == "all"
     assert result.settings.conditions == ALL

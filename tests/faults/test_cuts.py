@@ -11,8 +11,8 @@ from manip_il.data.build import build
 from manip_il.data.journal import JournalKeep, list_episodes
 from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder
-from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig

@@ -26,7 +26,7 @@ def make_mlp(folder: Path) -> None:
 
 
 def _fit(folder: Path, *, resume: bool, init_from: Path | None = None) -> None:
-    from manip_il.engine.describe import env_fingerprint, env_spec
+    from manip_il.engine.environments import env_fingerprint, env_spec
     from manip_il.learn.fit_config import FitConfig
     from manip_il.learn.train import fit
 
@@ -65,7 +65,7 @@ def _load(folder: Path) -> None:
 
 def _describe(folder: Path) -> None:
     from manip_il.cli.groups import find_policy
-    from manip_il.engine.describe import policy_sha256
+    from manip_il.engine.environments import policy_sha256
     from manip_il.learn.pretrained import read_interface
     from manip_il.store.cards import card_for
 

@@ -41,12 +41,12 @@ def with_cube(robot: str, opening: float, offset: tuple[float, float, float] = (
     world = world_of(robot)
     gripper = world.scene.gripper
     world.data.qpos[gripper.q] = gripper.command(opening)
-    world.moved()
+    world.update()
     quat, turned, both = np.empty(4), np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), np.empty(4)
     mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
     mujoco.mju_mulQuat(both, quat, turned)
     world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, both)
-    world.moved()
+    world.update()
     return world
 
 
@@ -68,7 +68,7 @@ def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
     gripper = world.scene.gripper
     for opening in np.linspace(gripper.least + 0.005, gripper.most, 9):
         world.data.qpos[gripper.q] = gripper.command(opening)
-        world.moved()
+        world.update()
         gap = min(
             mujoco.mj_geomDistance(world.model, world.data, one, other, 1.0, None)
             for one in gripper.pads[0]
@@ -132,7 +132,7 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
     top = float(table.pos[2] + table.size[2])
     for opening in (gripper.least, gripper.most):
         world.data.qpos[gripper.q] = gripper.command(opening)
-        world.moved()
+        world.update()
         lowest = min(_lowest(world, geom) for geom in gripper.geoms)
         assert lowest - (float(world.ee.position[2]) - LOWEST_EE) > top + 1e-3
 

@@ -234,15 +234,6 @@ def test_a_models_own_world_is_left_out_without_a_warning(tmp_path: Path, monkey
 
 
 @every_robot
-def test_everything_of_the_robots_has_its_prefix(robot: str):
-    scene = build_scene(robot, "reach")
-    for name in (*scene.robot.joints, *scene.robot.gripper.joints):
-        assert scene.model.joint(PREFIX + name).id >= 0
-    arm = [i for i in range(scene.model.njnt) if scene.model.joint(i).name.startswith(PREFIX)]
-    assert len(arm) == len(scene.robot.joints) + len(scene.robot.gripper.joints)
-
-
-@every_robot
 def test_the_arm_alone_has_its_joints_and_no_others(robot: str):
     the_robot = get_robot(robot)
     alone = arm_model(the_robot)

@@ -6,6 +6,7 @@ import pytest
 
 from manip_il.expert.expert import Expert
 from manip_il.sim.env import ManipEnv
+from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import phases
 
 
@@ -14,7 +15,7 @@ def drive_until() -> Callable[[ManipEnv, str], None]:
     """Let the expert drive until its label is of a phase."""
 
     def drive(env: ManipEnv, phase: str) -> None:
-        expert, names = Expert(env.scene), phases(env.scene.task)
+        expert, names = Expert(env.scene), phases(TASKS[env.task])
         for _ in range(60):
             label = expert.label(env.get_state())
             if names[label.phase] == phase:

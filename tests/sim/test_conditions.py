@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.sim.conditions import NOMINAL, Condition, changes_object, draw
-from manip_il.sim.disturb import NONE, disturbance_of
-from manip_il.sim.look import CAMERAS, PLAIN
+from manip_il.sim.conditions import NOMINAL, Condition, draw
+from manip_il.sim.look import CAMERAS
 
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 OBJECT = Condition("object", mass=(0.05, 0.3), size=(0.04, 0.06), colour=(0.1, 0.9))
@@ -20,21 +19,17 @@ VIEW = Condition("view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightne
 def test_a_seed_draws_the_same_in_whatever_order():
     drawn = [draw([KNOCKED, VIEW], seed) for seed in range(20)]
     assert [draw([KNOCKED, VIEW], seed) for seed in range(19, -1, -1)] == drawn[::-1]
-    assert len({json.dumps(dict(one.drawn)) for one in drawn}) == 20
+    assert len({json.dumps(dict(one.values)) for one in drawn}) == 20
 
 
 def test_conditions_take_turns_by_seed():
-    assert [draw([NOMINAL, KNOCKED, VIEW], seed).condition for seed in range(3, 8)] == [
-        "nominal",
-        "knocked",
-        "view",
-        "nominal",
-        "knocked",
-    ]
+    turns = [draw([NOMINAL, KNOCKED, VIEW], seed).condition for seed in range(3, 8)]
+    assert turns == ["nominal", "knocked", "view", "nominal", "knocked"]
+    assert draw([], 4) == draw([NOMINAL], 4)
 
 
 def test_every_draw_is_within_its_range_and_reaches_both_ends():
-    drawn = [draw([KNOCKED], seed).drawn for seed in range(300)]
+    drawn = [draw([KNOCKED], seed).values for seed in range(300)]
     assert {one["knock_step"] for one in drawn} == {5, 6, 7, 8, 9}
     knocks = [one["knock"] for one in drawn]
     assert min(knocks) >= 0.05
@@ -46,43 +41,29 @@ def test_every_draw_is_within_its_range_and_reaches_both_ends():
 def test_another_range_leaves_the_other_draws_as_they_were():
     wider = Condition("object", mass=(0.01, 3), size=(0.04, 0.06), colour=(0.1, 0.9), friction=(0.5, 1.0))
     for seed in range(5):
-        one, other = draw([OBJECT], seed).drawn, draw([wider], seed).drawn
+        one, other = draw([OBJECT], seed).values, draw([wider], seed).values
         assert one["mass"] != other["mass"]
         assert (one["size"], one["colour"]) == (other["size"], other["colour"])
 
 
 def test_a_draw_is_plain_json():
     for condition in (KNOCKED, OBJECT, VIEW):
-        drawn = dict(draw([condition], 3).drawn)
+        drawn = dict(draw([condition], 3).values)
         assert json.loads(json.dumps(drawn)) == drawn
 
 
 def test_a_camera_moves_by_a_drawn_length_in_any_direction():
-    shifts = np.array([draw([VIEW], seed).drawn["camera_shift"]["front"] for seed in range(200)])
+    shifts = np.array([draw([VIEW], seed).values["camera_shift"]["front"] for seed in range(200)])
     lengths = np.linalg.norm(shifts, axis=1)
     assert lengths.min() >= 0.01 - 1e-12
     assert lengths.max() <= 0.05 + 1e-12
     assert (np.abs((shifts > 0).mean(axis=0) - 0.5) < 0.15).all()
-    assert set(draw([VIEW], 0).drawn["camera_shift"]) == set(CAMERAS)
+    assert set(draw([VIEW], 0).values["camera_shift"]) == set(CAMERAS)
 
 
-def test_only_what_cameras_see_changes_the_appearance():
-    assert draw([KNOCKED], 0).appearance == PLAIN
-    assert draw([NOMINAL], 0).appearance == PLAIN
-    seen = draw([OBJECT], 0)
-    assert seen.appearance.edge == seen.drawn["size"]
-    assert seen.appearance.colour == tuple(seen.drawn["colour"])
-    assert changes_object(seen.drawn)
-    assert not changes_object(draw([VIEW], 0).drawn)
-
-
-def test_a_knock_becomes_a_disturbance_of_that_distance_and_step():
-    drawn = draw([KNOCKED], 7)
-    disturbance = disturbance_of(drawn)
-    step, distance = drawn.drawn["knock_step"], drawn.drawn["knock"]
-    assert (disturbance.knock, disturbance.knock_steps) == ((distance, distance), (step, step + 1))
-    assert disturbance.action_noise == 0.1
-    assert disturbance_of(draw([VIEW], 7)) == NONE
+def test_only_mass_size_and_friction_change_the_model():
+    assert OBJECT.changes_model()
+    assert not VIEW.changes_model()
 
 
 def test_what_nobody_notices_is_left_out():
@@ -110,6 +91,8 @@ def test_a_condition_is_its_json_again():
         ({"mass": "heavy"}, "expected a number, or [low, high]"),
         ({"mass": True}, "expected a number, or [low, high]"),
         ({"delay": [0, 1.5]}, "whole numbers of control steps"),
+        ({"action_noise": -0.1}, "action_noise is [-0.1, -0.1]; expected low <= high within 0 to 1"),
+        ({"action_noise": [0.1, 1.5]}, "action_noise is [0.1, 1.5]; expected low <= high within 0 to 1"),
     ],
 )
 def test_a_range_that_cannot_be_is_one_line(tree, words):

@@ -1,3 +1,5 @@
+"""Settings of pictures refuse what no video or lamp can be, and have one canonical text."""
+
 from __future__ import annotations
 
 import dataclasses

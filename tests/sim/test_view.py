@@ -10,7 +10,7 @@ from manip_il.sim import render, view
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.look import CAMERAS, Look
 from manip_il.sim.scene import build_scene
-from manip_il.sim.view import cluster, view_model
+from manip_il.sim.view import ViewModel, cluster
 
 from ..tables import every_robot
 
@@ -64,7 +64,7 @@ def test_merging_keeps_a_boxs_edges_sharp():
 def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
     scene = build_scene(robot, "pick_place")
     before = scene.model_bytes()
-    drawn = view_model(robot, "pick_place", Look())
+    drawn = ViewModel(robot, "pick_place", Look()).model
     data, shown = mujoco.MjData(scene.model), mujoco.MjData(drawn)
     data.qpos[scene.arm_q] = shown.qpos[scene.arm_q] = scene.robot.home
     for model, one in ((scene.model, data), (drawn, shown)):
@@ -95,11 +95,11 @@ def test_few_faces_look_like_all_of_them(robot, monkeypatch):
 
 
 def test_a_turn_moves_the_lamps_about_the_vertical_and_brightness_scales_them():
-    plain, other = (view_model("panda", "reach", look) for look in (Look(), Look(brightness=0.5, light_turn=90)))
+    plain, other = (ViewModel("panda", "reach", look).model for look in (Look(), Look(brightness=0.5, light_turn=90)))
     quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(other.light_pos, plain.light_pos @ quarter.T, atol=1e-12)
     np.testing.assert_allclose(other.light_dir, plain.light_dir @ quarter.T, atol=1e-12)
     np.testing.assert_allclose(other.light_diffuse, plain.light_diffuse / 2)
     np.testing.assert_allclose(other.vis.headlight.ambient, np.divide(plain.vis.headlight.ambient, 2))
     assert plain.vis.quality.shadowsize == other.vis.quality.shadowsize == 0
-    assert view_model("panda", "reach", Look(shadows=True)).vis.quality.shadowsize > 0
+    assert ViewModel("panda", "reach", Look(shadows=True)).model.vis.quality.shadowsize > 0

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError, UnknownName
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
@@ -18,14 +17,13 @@ from manip_il.tasks.starts import UPRIGHT
 
 from ..tables import every_scene, every_scene_with_an_object
 
-SEED = 5_000_000
 HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 
 
 @pytest.fixture
 def world() -> World:
     world = World(build_scene("fetch", "pick_place"))
-    world.moved()
+    world.update()
     return world
 
 
@@ -110,29 +108,6 @@ def test_physics_has_what_the_variation_says(edge: float, mass: float, friction:
     assert model.geom_rbound[one.geom] == pytest.approx(np.sqrt(3) * edge / 2)
 
 
-def test_a_varied_model_is_the_model_compiled_with_those_numbers():
-    drawn = {"size": 0.064, "mass": 0.21}
-    world = World(build_scene("fetch", "lift"))
-    world.vary(with_drawn(world.scene.nominal, drawn))
-    compiled = compiled_with(half=0.032, mass=0.21)
-    for name in ("body_mass", "body_inertia", "body_subtreemass", "dof_invweight0", "geom_size", "geom_rbound",
-                 "geom_aabb", "geom_friction", "bvh_aabb", "body_invweight0"):  # fmt: skip
-        np.testing.assert_allclose(
-            getattr(world.model, name), getattr(compiled, name), rtol=1e-9, atol=1e-12, err_msg=name
-        )
-
-
-def compiled_with(half: float, mass: float) -> mujoco.MjModel:
-    """Lift's scene with a cube that was made so."""
-    from manip_il.sim.scene import scene_spec
-
-    scene = build_scene("fetch", "lift")
-    spec = scene_spec(scene.robot, scene.task)
-    spec.geom(OBJECT).size, spec.geom(OBJECT).mass = [half] * 3, mass
-    spec.body(OBJECT).pos = scene.model.body(OBJECT).pos
-    return spec.compile()
-
-
 def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
     world.vary(with_drawn(world.scene.nominal, {"friction": 0.4}))
     fall(world, 600)
@@ -147,7 +122,7 @@ def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, e
     world.vary(with_drawn(world.scene.nominal, {"size": edge}))
     world.place(OBJECT, np.array([0.6, 0.1, edge / 2 + 0.01]), UPRIGHT)
     mujoco.mj_step(world.model, world.data, 400)
-    world.moved()
+    world.update()
     assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
 
 
@@ -180,7 +155,7 @@ def test_a_restored_world_is_the_one_that_was_saved(world: World):
     other = World(world.scene)
     world.vary(with_drawn(world.scene.nominal, HEAVY))
     fall(world, 30)
-    world.moved()
+    world.update()
     other.restore(world.physics(), world.variation)
     assert other.physics().tobytes() == world.physics().tobytes()
     for name in (OBJECT, "robot/robot0:gripper_link"):
@@ -201,10 +176,10 @@ def test_what_was_worked_out_is_known_until_the_world_moves(world: World):
         return len(asked)
 
     assert [world.remember("answer", work_out) for _ in range(3)] == [1, 1, 1]
-    world.moved()
+    world.update()
     assert world.remember("answer", work_out) == 2
     world.vary(with_drawn(world.scene.nominal, HEAVY))
-    world.moved()
+    world.update()
     assert world.remember("answer", work_out) == 3
     world.restore(world.physics(), world.variation)
     assert world.remember("answer", work_out) == 4
@@ -217,7 +192,7 @@ def test_answers_follow_the_world(world: World):
         world.place(OBJECT, np.array([x, 0.1, 0.2]), UPRIGHT)
         world.place("goal", np.array([x, 0.0, 0.3]), UPRIGHT)
         world.data.qpos[world.scene.arm_q] = np.asarray(world.scene.robot.home) + (x - 0.6)
-        world.moved()
+        world.update()
         assert world.opening == pytest.approx(opening)
         assert world.pose(OBJECT).position[0] == world.goal[0] == pytest.approx(x)
         np.testing.assert_array_equal(world.ee.position, world.data.site("robot/ee").xpos)
@@ -226,7 +201,7 @@ def test_answers_follow_the_world(world: World):
 def test_placing_puts_an_object_at_rest(world: World):
     world.data.qvel[:] = 1.0
     world.place(OBJECT, np.array([0.5, 0.1, 0.3]), UPRIGHT)
-    world.moved()
+    world.update()
     np.testing.assert_array_equal(world.pose(OBJECT).position, [0.5, 0.1, 0.3])
     np.testing.assert_allclose(world.pose(OBJECT).rotation, np.eye(3))
     assert not world.data.joint(OBJECT).qvel.any()
@@ -240,12 +215,3 @@ def test_what_cannot_be_placed_is_refused_by_name(world: World):
         world.pose("gaol")
     with pytest.raises(ManipError, match="'robot/robot0:gripper_link' is neither an object nor a mocap body"):
         world.place("robot/robot0:gripper_link", np.zeros(3), UPRIGHT)
-
-
-@every_scene
-def test_an_environments_state_holds_its_variation(robot: str, task: str):
-    env = ManipEnv(robot, task)
-    env.start(SEED)
-    state = env.get_state()
-    np.testing.assert_array_equal(state.variation, env.scene.nominal)
-    assert state.to_vector().size == env.scene.state_size + len(env.scene.nominal) + 4

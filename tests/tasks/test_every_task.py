@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 
 from manip_il.data.schema import EXPERT_PHASE
-from manip_il.engine import describe
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine import environments
+from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName
 from manip_il.expert.expert import Expert
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import NOMINAL, Condition
-from manip_il.sim.disturb import STANDARD, Disturbance
+from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
-from manip_il.sim.varied import VariedEnv
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
@@ -55,7 +54,7 @@ def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
 @every_scene
 def test_what_a_task_grasps_and_where_it_goes_are_in_its_scene(robot: str, task: str):
     scene = build_scene(robot, task)
-    assert set(scene.task.grasped) <= set(scene.objects)
+    assert set(TASKS[task].grasped) <= set(scene.objects)
     assert scene.model.body_mocapid[scene.model.body(GOAL).id] >= 0
 
 
@@ -69,9 +68,9 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
         for name in scene.objects:
             turn = rng.normal(size=4)
             world.place(name, rng.uniform(-1, 1, 3), turn / np.linalg.norm(turn))
-        world.moved()
-        assert scene.task.rungs[-1].holds(world)
-        for rung in scene.task.rungs:
+        world.update()
+        assert TASKS[task].rungs[-1].holds(world)
+        for rung in TASKS[task].rungs:
             target = rung.target(world)
             assert np.isfinite([*target.position, *target.rotation.ravel(), target.opening]).all()
             np.testing.assert_allclose(target.rotation @ target.rotation.T, np.eye(3), atol=1e-9)
@@ -80,19 +79,19 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
 @every_scene
 def test_every_rung_of_the_ladder_occurs(robot: str, task: str):
     seen = set[int]()
-    for driver, disturbance in (("expert", STANDARD), ("random", Disturbance())):
-        job = RolloutJob(EnvConfig(robot, task, horizon=45), driver, hold=2, disturbance=disturbance)
+    for driver, conditions in (("expert", (STANDARD,)), ("random", ())):
+        job = RolloutJob(EnvConfig(robot, task, horizon=45), driver, hold=2, conditions=conditions)
         for episode in run_job(job, SEEDS):
             seen |= set(episode.columns[EXPERT_PHASE].ravel().tolist())
     assert seen - {0} == set(range(1, len(phases(TASKS[task]))))
 
 
 @cache
-def expert_path(robot: str, task: str, varied: bool) -> list[tuple[list[float], ManipEnv]]:
+def expert_path(robot: str, task: str, other_cubes: bool) -> list[tuple[list[float], ManipEnv]]:
     """Progress along the expert's path, solved episodes each with the environment as it ended."""
     paths = []
     for seed in SEEDS:
-        env = VariedEnv([SIZES if varied else NOMINAL], robot=robot, task=task)
+        env = ManipEnv(robot, task, conditions=[SIZES] if other_cubes else [])
         expert, path = Expert(env.scene), []
         env.start(seed)
         while not env.solved and len(path) < env.config.horizon:
@@ -130,19 +129,19 @@ def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
         rng = np.random.default_rng(seed)
         for _ in range(30):
             env.advance(env.scene.actions.random_near(env.observe().state, rng))
-            assert 0 <= env.scene.task.progress(env.world) <= 1
+            assert 0 <= TASKS[task].progress(env.world) <= 1
 
 
 @every_scene
 def test_what_is_solved_is_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
     for _, env in expert_path(robot, task, False):
         assert env.solved
-        assert env.scene.task.error(env.world) == env.distance() < env.config.tolerance
+        assert TASKS[task].error(env.world) == env.distance() < env.config.tolerance
         fresh = ManipEnv(robot, task)
         fresh.set_state(env.get_state())
         at = fresh.world.goal + [0.0, 0.0, 0.1]
         fresh.world.place(GOAL, at, UPRIGHT)
-        fresh.world.moved()
+        fresh.world.update()
         fresh.advance(fresh.scene.actions.join(fresh.data.ctrl[fresh.scene.arm_ctrl], 0.0))
         assert fresh.distance() > fresh.config.tolerance
         assert not fresh.solved
@@ -153,7 +152,7 @@ def test_what_is_solved_is_within_the_tolerance_and_what_is_not_is_not(robot: st
 def test_a_solved_task_is_one_whose_things_are_at_the_goal(robot: str, task: str):
     for _, env in expert_path(robot, task, False):
         world = env.world
-        thing = world.pose(OBJECT).position if OBJECT in env.scene.task.grasped else world.ee.position
+        thing = world.pose(OBJECT).position if OBJECT in TASKS[task].grasped else world.ee.position
         assert np.linalg.norm(thing - world.goal) < env.config.tolerance
 
 
@@ -174,8 +173,8 @@ def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: s
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
-    monkeypatch.setattr(describe, "build_scene", lambda *_: replace(scene, model=model))
-    after = describe._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
+    monkeypatch.setattr(environments, "build_scene", lambda *_: replace(scene, model=model))
+    after = environments._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 
 
@@ -195,7 +194,7 @@ def test_a_datasets_words_fit_the_scene(robot: str, task: str):
     assert len(spec.joint_names) == len(seen.state) == len(env.scene.actions)
     assert len(spec.environment_state_names) == len(seen.environment_state)
     assert spec.sim_state_size == len(state.to_vector())
-    assert spec.phases == phases(env.scene.task)
+    assert spec.phases == phases(TASKS[task])
     assert spec.instruction == env.task_description
 
 

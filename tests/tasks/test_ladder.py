@@ -281,12 +281,6 @@ def test_nearness_grows_as_the_way_gets_shorter(one: float, other: float):
     assert 0 < far <= near <= 1
 
 
-def test_a_ladder_says_its_rungs_by_different_names_and_ends_with_one_that_always_holds():
-    for rungs in (RUNGS, ReachGoal().rungs):
-        assert len({one.name for one in rungs}) == len(rungs)
-        assert rungs[-1].holds(at(0.5, 0.5, 0.5))
-
-
 @given(st.floats(-np.pi / 4, np.pi / 4), st.floats(-np.pi, np.pi))
 def test_a_grasp_is_one_of_the_cubes_own_and_no_far_turn(object_yaw: float, hand_yaw: float):
     yaw = grasp_yaw(object_yaw, hand_down(hand_yaw))

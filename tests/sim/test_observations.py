@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.observe import environment_state, environment_state_names, joint_state
+from manip_il.sim.env import ManipEnv, environment_state, environment_state_names, joint_state
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 
@@ -57,7 +56,7 @@ def test_the_cubes_numbers_are_what_their_names_say(robot: str):
 def test_a_learner_is_shown_how_wide_the_cube_is():
     env = ManipEnv("fetch", "lift")
     env.world.vary(with_drawn(env.scene.nominal, {"size": 0.07}))
-    env.world.moved()
+    env.world.update()
     assert values_of(env)["object.width"] == pytest.approx(0.07)
 
 

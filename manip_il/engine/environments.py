@@ -1,0 +1,106 @@
+"""What datasets, checkpoints and evaluations say of an environment and of the policy in it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.fingerprint import canonical_json, environment_fingerprint
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.learn.checkpoint import META_FILE, read_meta
+from manip_il.learn.pretrained import read_interface
+from manip_il.mdp import STATE_EXTRAS, State
+from manip_il.sim.env import EnvConfig, environment_state_names
+from manip_il.sim.look import CAMERAS, CameraConfig, Look
+from manip_il.sim.scene import build_scene
+from manip_il.sim.world import World
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import phases
+
+_FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
+
+
+@cache
+def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
+    """Return names, sizes and rate that a dataset or policy for this environment must share."""
+    scene, task = build_scene(config.robot, config.task), get_task(config.task)
+    return RobotTaskSpec(
+        robot=scene.robot.name,
+        task=config.task,
+        fps=config.control_hz,
+        joint_names=scene.robot.joint_names,
+        environment_state_names=environment_state_names(scene),
+        sim_state_size=scene.state_size + len(scene.nominal) + STATE_EXTRAS,
+        instruction=task.instruction,
+        phases=phases(task),
+        cameras=cameras.names if cameras else (),
+        image_size=(cameras.height, cameras.width) if cameras else (0, 0),
+    )
+
+
+def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
+    """Return versions, and hashes of the compiled model and of the environment's and the cameras' settings."""
+    look = {"cameras_sha256": hashlib.sha256(canonical_json(cameras).encode()).hexdigest()} if cameras else {}
+    return {**_fingerprint(config), **look}
+
+
+@cache
+def _fingerprint(config: EnvConfig) -> dict[str, str]:
+    return environment_fingerprint(build_scene(config.robot, config.task).model_bytes(), asdict(config))
+
+
+def policy_sha256(policy: Path) -> str:
+    """Return the SHA-256 of everything in a policy's folder that decides how it acts, but not of where it lies."""
+    digest = hashlib.sha256()
+    for path in sorted(policy.iterdir()):
+        if path.is_file() and path.name not in _FOR_PEOPLE:
+            digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def policy_cameras(policy: Path) -> CameraConfig | None:
+    """Return cameras, size and light of the pictures that a checkpoint was trained with; None for one without.
+
+    The light is the default where the checkpoint does not say. Raises `MismatchError` for cameras that environments do
+    not have or whose pictures differ in size, `ManipError` for a folder or a size that cannot be.
+    """
+    pictures, meta = read_interface(policy).pictures, read_meta(policy)
+    if not pictures:
+        return None
+    if not set(pictures) <= set(CAMERAS):
+        raise MismatchError("cameras", str(policy), ", ".join(pictures), "the environment", ", ".join(CAMERAS))
+    if len(set(pictures.values())) > 1:
+        sizes = ", ".join(f"{camera} {size}" for camera, size in pictures.items())
+        raise MismatchError("size of pictures", str(policy), sizes, "the environment", "one size for all cameras")
+    as_recorded = meta is not None and set(meta.cameras) == set(pictures)
+    names = meta.cameras if meta is not None and as_recorded else tuple(pictures)
+    height, width = next(iter(pictures.values()))
+    try:
+        return CameraConfig(names, height, width, Look(**(meta.look or {}) if meta else {}))
+    except (UsageError, TypeError) as error:
+        raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
+
+
+def positions(robot: str, task: str, sim_state: NDArray[np.float64]) -> dict[str, list[float]]:
+    """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects and, where there is one, `goal`.
+
+    The first object that is grasped is called `object`.
+    """
+    world, state = _world(robot, task), State.from_vector(sim_state)
+    world.restore(state.physics, state.variation)
+    found = {"hand": world.ee.position} | ({"goal": world.goal} if world.has_goal else {})
+    for name in world.scene.objects:
+        found["object" if name in get_task(task).grasped[:1] else name] = world.pose(name).position
+    return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
+
+
+@cache
+def _world(robot: str, task: str) -> World:
+    return World(build_scene(robot, task))

@@ -1,0 +1,280 @@
+"""What happens to the world during an episode: knocks, noise on actions, and one perturbation at a given step.
+
+Functions that change the world do it in place, and draw from the generator that they are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.seeding import rng_for
+from manip_il.sim.conditions import Condition, Drawn
+from manip_il.sim.world import World
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import Task
+
+F64 = NDArray[np.float64]
+Change = Callable[[World, np.random.Generator], object]
+WrongAction = Callable[[F64, World, np.random.Generator], F64]
+
+JOLT = 0.2  # of every arm joint at most [rad]
+SHIFT = (0.0, 0.1)  # of the object, sideways [m]
+DROP = 0.1  # of the object, upwards [m]
+NOTICEABLE = 1e-3  # a perturbation that moves nothing by this much is undone [rad or m]
+_MAX_DRAWS = 100
+_OVERLAP = -0.004  # contact distance at which a moved object stands inside something [m]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One entry of `KINDS`: a change of the world (`change`), or of one action (`wrong`)."""
+
+    words: str
+    change: Change | None = None
+    wrong: WrongAction | None = None
+    needs_object: bool = True
+
+
+def noisy(action: F64, world: World, share: float, rng: np.random.Generator) -> F64:
+    """Return `action` (n,) with Gaussian noise: `share` of its full range, as in Meta-World's tests of its experts.
+
+    The range of a joint is twice its longest step, that of the gripper its whole opening.
+    """
+    actions = world.scene.actions
+    spread = np.where(actions.relative, 2, 1) * actions.scale
+    return action + rng.normal(0.0, share, len(action)) * spread
+
+
+def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
+    """Draw an action within one longest joint step of the measured joints, with any gripper opening; (n,)."""
+    return world.scene.actions.random_near(_measured(world), rng)
+
+
+def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
+    """Return the joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
+    mirrored = 2 * _measured(world) - action
+    return np.where(world.scene.actions.relative, mirrored, _opposite_opening(action, world))
+
+
+def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
+    """Return `action` (n,) with the opposite gripper command."""
+    return np.where(world.scene.actions.relative, action, _opposite_opening(action, world))
+
+
+def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> bool:
+    """Move the first object that is grasped sideways by a drawn distance [m], at rest, to where the arm reaches it.
+
+    height: how far up it is moved [m]; above 0 it is turned at random, too, and falls. Draws in which it would stand
+    inside something else are drawn again; returns whether there was an object and such a place.
+    """
+    grasped = get_task(world.scene.task).grasped
+    if not grasped:
+        return False
+    name = grasped[0]
+    one = world.scene.objects[name]
+    start, half = world.data.qpos[one.q : one.q + 7].copy(), world.extents(name)[2] / 2
+    for _ in range(_MAX_DRAWS):
+        angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(*distance)
+        pose = start.copy()
+        pose[:2] += length * np.array([np.cos(angle), np.sin(angle)])
+        pose[2] = max(pose[2] + height, half)
+        if height > 0:
+            turn = rng.normal(size=4)
+            pose[3:] = turn / np.linalg.norm(turn)
+        if world.reach.has([*pose[:2], half]) and _is_on_table(world, pose) and _place(world, name, pose):
+            return True
+    _place(world, name, start)
+    return False
+
+
+def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> bool:
+    """Turn every arm joint by up to `largest` [rad]; an object between the fingers moves with the hand.
+
+    Draws in which something would stand inside something else are drawn again; returns whether one was found.
+    """
+    scene, data = world.scene, world.data
+    low, high = scene.actions.low[scene.actions.arm], scene.actions.high[scene.actions.arm]
+    before = data.qpos.copy()
+    for _ in range(_MAX_DRAWS):
+        q = before[scene.arm_q] + rng.uniform(-largest, largest, len(scene.arm_q))
+        _move_arm(world, before, np.clip(q, low, high))
+        data.qvel[:] = 0.0
+        _settle(world)
+        if all(contact.dist > _OVERLAP for contact in data.contact):
+            return True
+    data.qpos[:] = before
+    _settle(world)
+    return False
+
+
+def set_fingers(world: World, opening: float) -> None:
+    """Command an opening [m] and put the gripper there, unless the object is in the way."""
+    gripper, data = world.scene.gripper, world.data
+    before = data.qpos[gripper.q].copy()
+    data.qpos[gripper.q] = data.ctrl[gripper.ctrl] = gripper.command(opening)
+    _settle(world)
+    if any(contact.dist <= _OVERLAP for contact in data.contact):
+        data.qpos[gripper.q] = before
+        _settle(world)
+
+
+KINDS: dict[str, Kind] = {
+    "jolt": Kind(
+        "joints off by up to 0.2 rad", change=lambda world, rng: jolt_joints(world, rng, JOLT), needs_object=False
+    ),
+    "moved": Kind("object moved up to 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT)),
+    "dropped": Kind("object dropped from 10 cm", change=lambda world, rng: move_object(world, rng, SHIFT, DROP)),
+    "closed": Kind("gripper wrongly closed", change=lambda world, rng: set_fingers(world, 0.0)),
+    "open": Kind("gripper wrongly open", change=lambda world, rng: set_fingers(world, world.most_opening)),
+    "random": Kind("random action", wrong=random_action, needs_object=False),
+    "opposite": Kind("opposite action", wrong=opposite_action, needs_object=False),
+    "gripper": Kind("right arm, opposite gripper", wrong=wrong_gripper),
+}
+
+
+def kinds_for(task: Task) -> dict[str, Kind]:
+    """Return the entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
+    return {name: kind for name, kind in KINDS.items() if task.grasped or not kind.needs_object}
+
+
+class Perturbation(Condition):
+    """A condition under which one of `KINDS` happens once. moments: seed -> the control step at which it does."""
+
+    moments: Mapping[int, int]
+
+    def __init__(self, kind: str, moments: Mapping[int, int]):
+        super().__init__(kind)
+        if kind not in KINDS:
+            raise UnknownName("perturbation", kind, KINDS)
+        if any(step < 0 for step in moments.values()):
+            raise UsageError(f"a perturbation at step {min(moments.values())}; expected 0 or later")
+        vars(self).update(moments=moments)
+
+    def draw(self, seed: int) -> Drawn:
+        """Return the step at which it happens. Raises `UsageError` where none is given for the seed."""
+        if seed not in self.moments:
+            raise UsageError(f"perturbation {self.name!r} has no moment for seed {seed}; give one")
+        return Drawn(self.name, {self.name: self.moments[seed]})
+
+
+class _Training(Condition):
+    """A condition whose knock is drawn when it happens, as in all rollouts that were recorded so far."""
+
+    def draw(self, seed: int) -> Drawn:
+        late = {name: self.ranges[name] for name in ("knock", "knock_step")}
+        return Drawn(self.name, {**super().draw(seed).values, **late})
+
+
+STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))
+
+
+class Events:
+    """Events of one episode: which, how much and when is in `drawn`, the rest is drawn from the seed.
+
+    Raises `UsageError` for a perturbation that needs an object in a task without one.
+    """
+
+    def __init__(self, world: World, drawn: Drawn, seed: int):
+        self._world, self._share = world, drawn.number("action_noise")
+        self._noise, self._knock_rng = rng_for(seed, "action noise"), rng_for(seed, "knock")
+        self._knock = _ends(drawn.values["knock"]) if "knock" in drawn.values else None
+        low, high = _ends(drawn.values.get("knock_step", -1))
+        self._knock_step = int(self._knock_rng.integers(low, high, endpoint=True)) if self._knock else -1
+        name = next((name for name in drawn.values if name in KINDS), "")
+        self._kind, self._kind_step = KINDS.get(name), int(drawn.number(name, -1))
+        if self._kind is not None and name not in kinds_for(get_task(world.scene.task)):
+            raise UsageError(f"perturbation {name!r} needs an object; {world.scene.task} has none")
+        self._kind_rng = rng_for(seed, f"perturbation {name}")
+
+    @staticmethod
+    def of(world: World, drawn: Drawn, seed: int) -> Events | None:
+        """Return what happens in an episode; None for nothing."""
+        return Events(world, drawn, seed) if drawn.values.keys() & {"knock", "action_noise", *KINDS} else None
+
+    def before(self, step: int) -> bool:
+        """Apply the events of a step to the world; returns whether a perturbation changed it.
+
+        A perturbation that finds no place, or changes nothing (fingers that are open already), leaves the world as it
+        was, bit for bit.
+        """
+        world = self._world
+        if self._knock is not None and step == self._knock_step:
+            move_object(world, self._knock_rng, self._knock)
+        if self._kind is None or self._kind.change is None or step != self._kind_step:
+            return False
+        before, qpos = world.physics(), world.data.qpos.copy()
+        self._kind.change(world, self._kind_rng)
+        if np.abs(world.data.qpos - qpos).max() >= NOTICEABLE:
+            return True
+        world.restore(before, world.variation)
+        return False
+
+    def action(self, action: F64, step: int) -> F64:
+        """Return the action of a step as it reaches the robot, (n,)."""
+        if self._kind is not None and self._kind.wrong is not None and step == self._kind_step:
+            return self._kind.wrong(action, self._world, self._kind_rng)
+        return noisy(action, self._world, self._share, self._noise) if self._share else action
+
+
+def _ends(value: Any) -> tuple[Any, Any]:
+    return value if isinstance(value, tuple) else (value, value)
+
+
+def _measured(world: World) -> F64:
+    """Joint positions [rad] and opening [m], (n,)."""
+    return world.scene.actions.join(world.data.qpos[world.scene.arm_q], world.opening)
+
+
+def _opposite_opening(action: F64, world: World) -> float:
+    """The end of the gripper's range that the command in `action` is farther from [m]."""
+    gripper = world.scene.gripper
+    return gripper.most if action[world.scene.actions.gripper] < (gripper.least + gripper.most) / 2 else gripper.least
+
+
+def _settle(world: World) -> None:
+    """Compute everything that follows from positions, contacts too."""
+    world.update()
+    mujoco.mj_forward(world.model, world.data)
+
+
+def _move_arm(world: World, before: F64, q: F64) -> None:
+    """Put the arm at `q` [rad], and what was between the fingers at `before` (qpos) with it."""
+    scene, data = world.scene, world.data
+    data.qpos[:] = before
+    world.update()
+    ee, rotation = world.ee.position.copy(), world.ee.rotation.copy()
+    held = [
+        one
+        for one in scene.objects.values()
+        if np.abs(rotation.T @ (before[one.q : one.q + 3] - ee)).max() <= max(world.extents(one.name)) / 2
+    ]
+    data.qpos[scene.arm_q] = q
+    world.update()
+    turned = world.ee.rotation
+    for one in held:
+        start = before[one.q : one.q + 7]
+        turn, quat = np.empty(4), np.empty(4)
+        mujoco.mju_mat2Quat(turn, (turned @ rotation.T).ravel())
+        mujoco.mju_mulQuat(quat, turn, start[3:])
+        at = world.ee.position + turned @ (rotation.T @ (start[:3] - ee))
+        data.qpos[one.q : one.q + 7] = [*at, *quat]
+
+
+def _is_on_table(world: World, pose: F64) -> bool:
+    table = world.scene.model.geom("table")
+    return bool(np.all(np.abs(pose[:2] - table.pos[:2]) < table.size[:2] - 0.05))
+
+
+def _place(world: World, name: str, pose: F64) -> bool:
+    """Put an object at rest at `pose` (7,); false where it would stand inside something."""
+    world.place(name, pose[:3], pose[3:])
+    _settle(world)
+    geom = world.scene.objects[name].geom
+    return all(contact.dist > _OVERLAP for contact in world.data.contact if geom in (contact.geom1, contact.geom2))

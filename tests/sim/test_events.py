@@ -1,0 +1,284 @@
+"""Events change what they say by what they say, once, and leave a world that can be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.robots.robot import ROBOTS
+from manip_il.sim.conditions import Condition, Drawn, draw
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.events import (
+    DROP,
+    JOLT,
+    KINDS,
+    SHIFT,
+    STANDARD,
+    Events,
+    Perturbation,
+    jolt_joints,
+    kinds_for,
+    move_object,
+    noisy,
+    set_fingers,
+)
+from manip_il.tasks.objects import CUBE_HALF
+from manip_il.tasks.table import TASKS
+
+SEED, MOMENT = 5_000_000, 7
+KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
+
+
+@pytest.fixture(params=list(ROBOTS))
+def env(request) -> ManipEnv:
+    env = ManipEnv(request.param)
+    env.start(SEED)
+    return env
+
+
+def cube(env: ManipEnv) -> np.ndarray:
+    return env.data.joint("object").qpos[:3].copy()
+
+
+def arm(env: ManipEnv) -> np.ndarray:
+    return env.data.qpos[env.scene.arm_q].copy()
+
+
+def opening(env: ManipEnv) -> float:
+    return float(env.observe().state[env.scene.actions.gripper])
+
+
+def bits(env: ManipEnv) -> bytes:
+    return env.get_state().to_vector().tobytes()
+
+
+def deepest(env: ManipEnv) -> float:
+    mujoco.mj_forward(env.world.model, env.data)
+    return min((contact.dist for contact in env.data.contact), default=0.0)
+
+
+def events(env: ManipEnv, kind: str, seed: int = SEED) -> Events:
+    return Events(env.world, Drawn(kind, {kind: MOMENT}), seed)
+
+
+def wrong(env: ManipEnv, kind: str, action: np.ndarray, seed: int = SEED) -> np.ndarray:
+    return events(env, kind, seed).action(action, MOMENT)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_knock_moves_the_object_alone_and_by_its_distance(env: ManipEnv, seed: int):
+    before, q = cube(env), arm(env)
+    assert move_object(env.world, np.random.default_rng(seed), (0.05, 0.08))
+    moved = cube(env) - before
+    assert 0.05 <= np.hypot(*moved[:2]) <= 0.08
+    assert cube(env)[2] == pytest.approx(CUBE_HALF, abs=1e-3)
+    assert env.world.reach.has(cube(env))
+    np.testing.assert_array_equal(arm(env), q)
+    assert deepest(env) > -0.004
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_dropped_object_falls_onto_the_table(env: ManipEnv, seed: int):
+    assert move_object(env.world, np.random.default_rng(seed), (0.05, 0.1), 0.1)
+    assert cube(env)[2] == pytest.approx(CUBE_HALF + 0.1, abs=1e-3)
+    hold = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], 0.04)
+    for _ in range(40):
+        env.advance(hold)
+    assert 0 < cube(env)[2] < 0.1
+
+
+def test_a_scene_without_an_object_has_none_to_knock():
+    env = ManipEnv("panda", "reach")
+    env.start(SEED)
+    before = bits(env)
+    assert not move_object(env.world, np.random.default_rng(0), (0.05, 0.08))
+    assert bits(env) == before
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_jolt_turns_every_joint_by_at_most_its_size(env: ManipEnv, seed: int):
+    before, at = arm(env), cube(env)
+    assert jolt_joints(env.world, np.random.default_rng(seed), 0.2)
+    turned = np.abs(arm(env) - before)
+    assert turned.min() > 0
+    assert turned.max() <= 0.2
+    np.testing.assert_array_equal(cube(env), at)
+    assert deepest(env) > -0.004
+
+
+def test_a_held_object_goes_with_the_jolted_hand(env: ManipEnv, drive_until):
+    def in_hand() -> np.ndarray:
+        return env.world.ee.rotation.T @ (cube(env) - env.world.ee.position)
+
+    drive_until(env, "carry")
+    before = in_hand()
+    assert jolt_joints(env.world, np.random.default_rng(0), 0.1)
+    np.testing.assert_allclose(in_hand(), before, atol=1e-9)
+
+
+@pytest.mark.parametrize("wanted", [0.0, 0.05])
+def test_fingers_are_put_where_they_are_wanted(env: ManipEnv, wanted: float):
+    set_fingers(env.world, wanted)
+    gripper = env.scene.gripper
+    assert opening(env) == pytest.approx(max(wanted, gripper.least), abs=1e-6)
+    np.testing.assert_allclose(env.data.ctrl[gripper.ctrl], gripper.command(wanted))
+
+
+def test_fingers_do_not_close_through_an_object(env: ManipEnv, drive_until):
+    drive_until(env, "grasp")
+    before = opening(env)
+    set_fingers(env.world, 0.0)
+    assert opening(env) == before
+    assert deepest(env) > -0.004
+    np.testing.assert_array_equal(env.data.ctrl[env.scene.gripper.ctrl], env.scene.gripper.command(0.0))
+
+
+def test_noise_is_a_share_of_the_actions_range(env: ManipEnv):
+    actions = env.scene.actions
+    rng, action = np.random.default_rng(0), np.linspace(-1, 1, len(actions))
+    draws = np.array([noisy(action, env.world, 0.1, rng) - action for _ in range(4_000)])
+    gripper = env.scene.gripper
+    expected = 0.1 * actions.join(2 * actions.scale[actions.arm], gripper.most - gripper.least)
+    np.testing.assert_allclose(draws.std(axis=0), expected, rtol=0.06)  # five standard errors
+    assert np.abs(draws.mean(axis=0) / expected).max() < 0.08
+
+
+def run(env: ManipEnv, condition: Condition, seed: int) -> tuple[bytes, dict[int, float]]:
+    """What 26 steps of zeros do, and the knocks on the way: step -> distance [m]."""
+    env.start(SEED)
+    happening, knocks, done = Events(env.world, condition.draw(seed), seed), {}, b""
+    for step in range(26):
+        before = cube(env)
+        assert not happening.before(step)  # no perturbation
+        if not np.array_equal(before, cube(env)):
+            knocks[step] = float(np.linalg.norm(cube(env) - before))
+        done += happening.action(np.zeros(len(env.scene.actions)), step).tobytes() + cube(env).tobytes()
+    return done, knocks
+
+
+@pytest.mark.parametrize("condition", [STANDARD, KNOCKED], ids=str)
+def test_knocks_and_noise_are_a_function_of_the_seed(env: ManipEnv, condition: Condition):
+    first, second = run(env, condition, 1), run(env, condition, 2)
+    assert first == run(env, condition, 1)
+    assert first[0] != second[0]
+    for _, knocks in (first, second):
+        [(step, distance)] = knocks.items()
+        assert 5 <= step < 25
+        assert 0.05 <= distance <= 0.08
+
+
+def test_a_knock_has_the_drawn_step_and_distance(env: ManipEnv):
+    drawn = draw([KNOCKED], 7).values
+    [(step, distance)] = run(env, KNOCKED, 7)[1].items()
+    assert (step, distance) == (drawn["knock_step"], pytest.approx(drawn["knock"]))
+
+
+def test_without_noise_the_action_is_not_touched_and_nothing_may_happen(env: ManipEnv):
+    action = np.zeros(len(env.scene.actions))
+    knocked = Condition(knock=(0.05, 0.08)).draw(1)
+    assert Events(env.world, knocked, 1).action(action, 3) is action
+    assert Events.of(env.world, Condition("heavy", mass=(0.2, 0.2), delay=(1, 1)).draw(1), 1) is None
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_perturbation_happens_at_its_step_alone(env: ManipEnv, kind: str):
+    one, action = events(env, kind), env.scene.actions.join(arm(env), 0.0)
+    touched = []
+    for step in range(MOMENT + 5):
+        gripper = env.scene.gripper
+        env.data.qpos[gripper.q] = gripper.command(0.03)  # neither open nor closed
+        before = bits(env)
+        changed = one.before(step)
+        assert changed == (bits(env) != before)
+        if changed or one.action(action, step) is not action:
+            touched.append(step)
+    assert touched == [MOMENT]
+
+
+@pytest.mark.parametrize("seed", range(SEED, SEED + 4))
+def test_the_world_is_changed_by_as_much_as_the_kind_says(env: ManipEnv, seed: int):
+    def changed(kind: str) -> tuple[np.ndarray, np.ndarray, float]:
+        env.start(seed)
+        q, at = arm(env), cube(env)
+        events(env, kind, seed).before(MOMENT)
+        return arm(env) - q, cube(env) - at, opening(env)
+
+    turned, _, _ = changed("jolt")
+    assert 0 < np.abs(turned).max() <= JOLT
+    _, moved, _ = changed("moved")
+    assert 0 < np.hypot(*moved[:2]) <= SHIFT[1]
+    _, dropped, _ = changed("dropped")
+    assert np.hypot(*dropped[:2]) <= SHIFT[1]
+    assert dropped[2] == pytest.approx(DROP, abs=CUBE_HALF / 10)
+    assert changed("closed")[2] == pytest.approx(max(0.0, env.scene.gripper.least), abs=1e-6)
+    assert changed("open")[2] == pytest.approx(env.scene.gripper.most, abs=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "streak"), [("open", 3), ("closed", 0)])
+def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, drive_until, kind: str, streak: int):
+    drive_until(env, "descend")  # with open fingers
+    env.set_state(replace(env.get_state(), streak=3))
+    state = env.get_state()
+    perturbed = ManipEnv(env.config.robot, conditions=(Perturbation(kind, {SEED: state.step}),))
+    perturbed.start(SEED)
+    perturbed.set_state(state)
+    perturbed.begin_step()
+    assert (bits(perturbed) == bits(env)) == (kind == "open")
+    assert perturbed.get_state().streak == streak
+
+
+def test_a_random_action_is_any_that_a_learner_may_choose(env: ManipEnv):
+    actions, gripper, q = env.scene.actions, env.scene.gripper, arm(env)
+    drawn = np.array([wrong(env, "random", np.zeros(len(actions)), seed) for seed in range(200)])
+    steps, openings = drawn[:, actions.arm] - q, drawn[:, actions.gripper]
+    longest, room = env.scene.robot.max_joint_step, gripper.most - gripper.least
+    assert np.abs(steps).max() <= longest
+    assert np.abs(steps).max() > 0.95 * longest
+    assert gripper.least <= openings.min() < gripper.least + 0.05 * room
+    assert gripper.most - 0.05 * room < openings.max() <= gripper.most
+
+
+@pytest.mark.parametrize(("command", "opposite"), [(0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (1.0, 0.0)])
+def test_opposite_actions_mirror_the_step_and_turn_the_gripper_round(env: ManipEnv, command: float, opposite: float):
+    q, actions, gripper = arm(env), env.scene.actions, env.scene.gripper
+    step = np.linspace(-0.1, 0.1, len(q))
+
+    def at(share: float) -> float:
+        return gripper.least + share * (gripper.most - gripper.least)
+
+    action = actions.join(q + step, at(command))
+    mirrored, other = actions.join(q - step, at(opposite)), actions.join(q + step, at(opposite))
+    np.testing.assert_allclose(wrong(env, "opposite", action), mirrored, atol=1e-12)
+    np.testing.assert_allclose(wrong(env, "gripper", action), other, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", ["jolt", "moved", "dropped", "random"])
+def test_what_is_drawn_follows_from_the_seed(env: ManipEnv, kind: str):
+    def outcome(seed: int) -> bytes:
+        env.start(SEED)
+        one = events(env, kind, seed)
+        one.before(MOMENT)
+        return bits(env) + one.action(np.zeros(len(env.scene.actions)), MOMENT).tobytes()
+
+    assert outcome(1) == outcome(1)
+    assert outcome(1) != outcome(2)
+
+
+def test_without_an_object_neither_it_nor_the_gripper_matters():
+    assert list(kinds_for(TASKS["reach"])) == ["jolt", "random", "opposite"]
+    assert kinds_for(TASKS["lift"]) == kinds_for(TASKS["pick_place"]) == KINDS
+
+
+def test_a_perturbation_that_cannot_be_is_refused():
+    with pytest.raises(UnknownName, match="did you mean 'jolt'"):
+        Perturbation("jolts", {})
+    with pytest.raises(UsageError, match="step -1"):
+        Perturbation("jolt", {1: 3, 2: -1})
+    with pytest.raises(UsageError, match="'moved' needs an object; reach has none"):
+        ManipEnv("panda", "reach", conditions=(Perturbation("moved", {1: 3}),)).start(1)
+    with pytest.raises(UsageError, match="no moment for seed 2"):
+        Perturbation("jolt", {1: 3}).draw(2)
