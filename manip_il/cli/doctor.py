@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.groups import option
-from manip_il.cli.paths import hub_hint, require_folder
+from manip_il.cli.inputs import hub_hint, require_folder
 from manip_il.cli.progress import progress, say
 from manip_il.errors import ManipError
+from manip_il.option import option
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,7 +30,7 @@ class DoctorOptions:
     """
 
     example: ClassVar[str] = "manip-il doctor datasets/demos"
-    dataset: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset", "positional": True})
+    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
     repair: bool = option(False, "repair what can be repaired, and keep a copy")
 
     def check(self) -> None:

@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.groups import DEFAULT_ROBOT, DEFAULT_TASK
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, RenderError
 
@@ -103,7 +102,7 @@ def _draw() -> str:
     world.start(0)
 
     def draw() -> Mapping[str, Picture]:
-        return pictures(DEFAULT_ROBOT, DEFAULT_TASK, world.data, cameras)
+        return pictures(world.config.robot, world.config.task, world.data, cameras)
 
     check_pictures(draw())
     begin = time.perf_counter()

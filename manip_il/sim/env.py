@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -10,44 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UsageError
-from manip_il.mdp import LONGEST_EPISODE, Observation, State
+from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
+from manip_il.sim.config import EnvConfig
 from manip_il.sim.look import PLAIN, CameraConfig, Look
 from manip_il.sim.observe import environment_state, environment_state_names, joint_state
 from manip_il.sim.render import Picture, pictures
-from manip_il.sim.scene import DT_SIM, build_scene
+from manip_il.sim.scene import build_scene
 from manip_il.sim.world import Scene, World
 
 F64 = NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """What makes one environment; every field is part of the fingerprint."""
-
-    robot: str = "panda"
-    task: str = "pick_place"
-    control_hz: int = 20
-    tolerance: float = 0.02  # of object (or hand) to goal [m]
-    success_steps: int = 5  # control steps in a row within the tolerance
-    horizon: int = 100  # control steps
-
-    def __post_init__(self) -> None:
-        if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
-            raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
-        if not 0 < self.tolerance < 1:
-            raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
-        if self.horizon > LONGEST_EPISODE:
-            raise UsageError(f"horizon is {self.horizon}; expected at most {LONGEST_EPISODE} control steps")
-        if self.success_steps < 1 or self.horizon < self.success_steps:
-            raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
-
-    @property
-    def physics_steps(self) -> int:
-        """MuJoCo steps in one control step."""
-        return round(1 / (DT_SIM * self.control_hz))
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):

@@ -7,9 +7,9 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from manip_il.cli.common_options import EnvGroup, TaskGroup
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.folders import append_jsonl
-from manip_il.cli.groups import EnvGroup, TaskGroup, save_options
+from manip_il.cli.outputs import append_jsonl, save_options
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD

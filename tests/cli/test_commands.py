@@ -16,13 +16,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from manip_il.cli import groups, story
+from manip_il.cli import films
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.main import load, main
-from manip_il.cli.options import from_yaml, options_of, parse
+from manip_il.cli.options import command_line, options_of
+from manip_il.cli.parsing import from_yaml, parse
 from manip_il.data.lerobot_io import dataset_info, read_provenance, read_table
 from manip_il.evaluation.results import EvalResult
-from manip_il.sim.env import EnvConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "datasets" / "sample"
@@ -81,10 +81,6 @@ def killed(start, tmp_path) -> Callable[[list[str], Path], None]:
         process.join()
 
     return run
-
-
-def test_option_defaults_are_those_of_the_environment():
-    assert groups.EnvGroup().config(groups.DEFAULT_ROBOT, groups.DEFAULT_TASK) == EnvConfig()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
@@ -274,8 +270,8 @@ def test_a_killed_dagger_run_resumes_to_the_same_metrics(killed, tmp_path, capsy
 
 
 @pytest.mark.slow
-def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(story, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
+def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(films, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
     words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0
@@ -290,4 +286,4 @@ def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys, monkeypatc
 
 def test_a_command_line_can_be_copied_from_a_report():
     options = DaggerOptions(rounds=2, output_dir=Path("runs/a b"))
-    assert groups.command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
+    assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.candidates import read_candidate
 from manip_il.cli.dagger import learning_curve
 from manip_il.cli.main import main
-from manip_il.cli.sides import read_side
 from manip_il.evaluation import runner
 
 from .made_runs import ENV, OPTIONS, make_eval, make_policy, make_run, mark
@@ -84,7 +84,7 @@ def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
     out = capsys.readouterr().out
     assert "within 240 labels" in out
     assert f"No difference shown between b and a: {'+0.0 points'}" in out
-    assert "compare a b --suite=disturbed --output_dir=runs/compare_disturbed --checkpoint=last" in out
+    assert "--suite=disturbed --workers=1 --output_dir=runs/compare_disturbed" in out
     assert compare("a", "b", *SIZES, "--overwrite=true") == 0
     pair = result()["training_seeds"][0]
     assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
@@ -145,7 +145,7 @@ def test_a_run_keeps_its_learning_curve_where_a_loss_was_not_finite(here, policy
 def test_a_fit_whose_metrics_have_nan_is_a_policy_to_compare(here, policy):
     shutil.copytree(policy, here / "fit" / "checkpoints" / "last" / "pretrained_model")
     (here / "fit" / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5, "grad_norm": NaN}\n')
-    (source,) = read_side(here / "fit").sources
+    (source,) = read_candidate(here / "fit").sources
     assert source.policy == here / "fit" / "checkpoints" / "last" / "pretrained_model"
 
 

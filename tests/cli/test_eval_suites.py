@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.kept_episodes import FILE_NAME as KEPT
+from manip_il.cli.eval_files import EPISODES_FILE as KEPT
 from manip_il.cli.main import main
-from manip_il.cli.suites import CONDITIONS, SUITES, suite_conditions
+from manip_il.cli.trials import CONDITIONS, SUITES, suite_conditions
 from manip_il.data import schema
 from manip_il.engine.describe import env_fingerprint, env_spec
 from manip_il.errors import UsageError
@@ -74,7 +74,7 @@ def test_knocked_is_the_disturbance_that_dagger_collects_under():
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
-    from manip_il.cli import suites
+    from manip_il.cli import trials
 
     expected = suite_conditions("all", "pick_place", sees=True)
     folder = tmp_path / "share" / "manip_il" / "suites"
@@ -82,7 +82,7 @@ def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch)
     for name in CONDITIONS:
         (folder / f"{name}.yaml").write_bytes((Path("configs/suites") / f"{name}.yaml").read_bytes())
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    monkeypatch.setattr(suites.manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
+    monkeypatch.setattr(trials.manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
     assert suite_conditions("all", "pick_place", sees=True) == expected
 
 

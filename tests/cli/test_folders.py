@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
-from manip_il.cli.groups import CONFIG_FILE, check_same_options
-from manip_il.cli.options import CONFIG_HEADER
+from manip_il.cli.outputs import CONFIG_FILE, append_jsonl, atomic_write, check_same_options, prepare_output, read_jsonl
+from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.data.writing import WriteError
 from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError

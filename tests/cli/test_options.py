@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.cli.options import CONFIG_HEADER, Open, dump_yaml, from_layers, from_yaml, options_of, parse, to_plain
-from manip_il.cli.values import expected, metavar
+from manip_il.cli.options import Open, expected, metavar, options_of, to_plain
+from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli import push as push_command
 from manip_il.cli.main import main
 from manip_il.cli.progress import bytes_text
+from manip_il.cli.push_pull import PushOptions
 
 from ..store.hub_use import DATASET, SAMPLE, a_hub
 
@@ -165,7 +165,7 @@ def test_a_traceback_of_any_error_is_cleaned(
             "PUT https://store/x?X-Amz-Signature=0123456789abcdef with Authorization: Bearer hf_HunterTwo"
         )
 
-    monkeypatch.setattr(push_command.PushOptions, "run", fail)
+    monkeypatch.setattr(PushOptions, "run", fail)
     assert main(["push", str(run), url, "--debug"]) == 1
     error = capsys.readouterr().err
     assert "RuntimeError: PUT https://store/x?X-Amz-Signature=[hidden]" in error

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.cli import groups
 from manip_il.cli.main import main
 from manip_il.data.lerobot_io import read_provenance, read_spec, read_table, write_dataset
 from manip_il.engine.describe import env_fingerprint, env_spec
@@ -29,11 +28,6 @@ def demos(tmp_path, monkeypatch) -> Path:
 
 def files(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-
-
-def test_option_defaults_are_those_of_the_pictures():
-    assert asdict(groups.LookGroup()) == asdict(Look())
-    assert groups.ImageGroup().config(["front"]) == CameraConfig(("front",))
 
 
 @pytest.mark.gl

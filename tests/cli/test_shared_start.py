@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.common_options import TaskGroup
 from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
-from manip_il.cli.folders import read_jsonl
-from manip_il.cli.groups import TaskGroup
-from manip_il.cli.shared_start import ROUND_0, same_start, share_start
+from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.study import ROUND_0, same_start, share_start
 from manip_il.data.lerobot_io import read_tables
 
 

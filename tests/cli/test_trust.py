@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.groups import find_policy
+from manip_il.cli.inputs import find_policy
 from manip_il.cli.main import load, main
-from manip_il.cli.options import dump_yaml, options_of, parse
+from manip_il.cli.options import options_of
+from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.study_file import read_plan
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob

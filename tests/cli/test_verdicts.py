@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from manip_il.cli.dagger import best_verdict
-from manip_il.cli.quickstart import told_verdict
+from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.evaluation.report_data import PolicyRow
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 
@@ -37,5 +37,7 @@ def test_the_best_round_of_many_episodes_is_the_best():
 
 def test_the_quickstart_says_where_nothing_is_shown():
     rows = [PolicyRow.of(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
-    assert told_verdict(rows, shown=False).endswith("no difference between DAgger and cloning with as many labels.")
-    assert told_verdict(rows, shown=True).endswith("with the first demonstrations alone.")
+    assert quickstart_verdict(rows, significant=False).endswith(
+        "no difference between DAgger and cloning with as many labels."
+    )
+    assert quickstart_verdict(rows, significant=True).endswith("with the first demonstrations alone.")

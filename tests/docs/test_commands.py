@@ -13,7 +13,7 @@ from huggingface_hub import constants
 
 from manip_il.cli import story
 from manip_il.cli.main import load
-from manip_il.cli.options import parse
+from manip_il.cli.parsing import parse
 from manip_il.tasks.table import TASKS
 
 from ..store.hub_server import Hub, clean_environment, hub_server

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from manip_il import checks
-from manip_il.cli.folders import read_jsonl
+from manip_il.cli.outputs import read_jsonl
 from manip_il.learn.metrics import json_lines
 
 

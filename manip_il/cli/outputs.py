@@ -5,17 +5,35 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.cli.options import CONFIG_HEADER
-from manip_il.data.atomic import PARTIAL, write_file
+from manip_il.cli.options import options_of, value_of
+from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
+from manip_il.data.atomic import PARTIAL, exclusive, write_file
 from manip_il.data.writing import writing
-from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
 
-_MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a folder
+CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
+_MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
+
+
+@contextmanager
+def open_output(options: Any, free: Iterable[str] = (), may_grow: str | None = None) -> Generator[Path]:
+    """Hold and prepare `options.output_dir`, and write `config.yaml` into it.
+
+    A run that is resumed must have the same options as before, see `check_same_options`.
+    """
+    folder, resume = options.output_dir, getattr(options, "resume", False)
+    with exclusive(folder):
+        prepare_output(folder, resume=resume, overwrite=options.overwrite)
+        if resume:
+            check_same_options(folder, options, free, may_grow)
+        save_options(folder, options)
+        yield folder
 
 
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
@@ -51,6 +69,49 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not overwrite:
         raise FolderExistsError(folder)
     require_ours(folder)
+
+
+def require_output(folder: Path, command: str, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Raise `UsageError` where a command cannot begin to write to `folder`, or has nothing in it to resume."""
+    check_output(folder, resume=resume, overwrite=overwrite)
+    if resume and not (folder.is_dir() and any(folder.iterdir())):
+        raise UsageError(
+            f"--resume=true: nothing to resume in {folder}; expected what an earlier manip-il {command} left there "
+            "(leave out --resume=true to start)"
+        )
+
+
+def require_new(folder: Path, *, overwrite: bool = False) -> None:
+    """Raise `UsageError` where a command that cannot be resumed may not write to `folder`."""
+    try:
+        check_output(folder, resume=False, overwrite=overwrite)
+    except FolderExistsError:
+        raise UsageError(f"{folder} exists already; replace it with --overwrite=true") from None
+
+
+def save_options(folder: Path, options: Any) -> None:
+    """Write the resolved options to `folder/config.yaml`."""
+    atomic_write(folder / CONFIG_FILE, dump_yaml(options))
+
+
+def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow: str | None = None) -> None:
+    """Raise `MismatchError` naming the option unless the run in `folder` was started with the same options.
+
+    free: options that may differ. may_grow: one that may be larger than it was. A folder that is not there or
+    empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
+    """
+    path = folder / CONFIG_FILE
+    # A run that was killed in its first moment leaves at most the half of a file, under a hidden name.
+    if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
+        return
+    if not path.is_file():
+        raise UsageError(f"{folder} holds no {CONFIG_FILE}, so there is no run to continue; choose another folder")
+    before = from_yaml(path, type(options))
+    for known in options_of(type(options)):
+        was, now = value_of(before, known.name), value_of(options, known.name)
+        grown = known.name == may_grow and now >= was
+        if was != now and known.name not in (*free, "resume", "overwrite") and not grown:
+            raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
