@@ -30,7 +30,7 @@ _EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a fol
 
 @dataclass(frozen=True)
 class Source:
-    """One policy to compare, or what was found of one.
+    """One policy to compare, or an evaluation or a run of one.
 
     training_seed: None where nothing says it. result: of an evaluation that is taken as it is. policy: a policy that
     is no run's. history, env, finished: of a run; env is None where its options are not beside it.

@@ -69,7 +69,7 @@ class DoctorOptions:
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Joints and state are those of the robot and task as this program has them; so is the compiled model."""
+    """Compare joints, state and compiled model with those of the robot and task in this program."""
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS
     from manip_il.data.lerobot_read import read_fingerprint

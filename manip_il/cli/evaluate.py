@@ -204,10 +204,10 @@ class EvalOptions:
             return Pictures()
         stages.start("films", len(seeds))
         episodes = {episode.seed: episode for episode in engine.run(replace(job, label="last"), seeds)}
-        shown = [episodes[seed] for seed in seeds]
-        shots = [Shot(job, one, condition_caption(job, one), success=one.success) for one in shown]
+        filmed = [episodes[seed] for seed in seeds]
+        shots = [Shot(job, one, condition_caption(job, one), success=one.success) for one in filmed]
         pictures = film_shots(shots, stages)
-        for film, episode in zip(pictures.films, shown, strict=False):  # of no films where there is no OpenGL
+        for film, episode in zip(pictures.films, filmed, strict=False):  # of no films where there is no OpenGL
             outcome = "success" if episode.success else "failure"
             atomic_write(self.output_dir / FILMS / f"seed_{episode.seed}_{outcome}.mp4", film.mp4)
         return pictures

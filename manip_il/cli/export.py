@@ -74,5 +74,8 @@ class ExportOptions:
 
 def _lines(metadata: Mapping[str, Any]) -> list[str]:
     """The file's inputs and outputs, a line each."""
-    sides = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
-    return [f"{side:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})" for side, one in sides]
+    tensors = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
+    return [
+        f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})"
+        for direction, one in tensors
+    ]

@@ -58,7 +58,7 @@ def hub_hint(path: Path, kind: str = "") -> str:
 
 
 def _inside(root: Path) -> str:
-    """Which datasets lie in a folder that is none itself, where it holds some."""
+    """Name the datasets in a folder that is none itself, where it holds some."""
     found = sorted(path.parents[1].name for path in root.glob("*/meta/info.json")) if root.is_dir() else []
     return f"; it holds the datasets {', '.join(found[:3])}{' ...' if len(found) > 3 else ''}" if found else ""
 
@@ -80,7 +80,7 @@ def find_policy(path: Path) -> Path:
 
 
 def start_policy(settings: Open) -> Open:
-    """`--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means (`find_policy`)."""
+    """Return `--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means."""
     if "path" not in settings:
         return settings
     path = settings["path"]
@@ -115,7 +115,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
 def check_policy(
     path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
 ) -> CameraConfig | None:
-    """Return the cameras that the policy looks at, None for none.
+    """Return the cameras whose pictures the policy takes, None for none.
 
     Warns where it was trained on something else than `env`.
 
@@ -137,9 +137,9 @@ def check_policy(
     warn(_differences(path, meta, env, cameras))
     policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
     # One action now says what else would not fit before a worker does.
-    seen = _first_sight(env, cameras, draw)
-    images = {camera: picture[None] for camera, picture in seen.images.items()}
-    policy.act(seen.state[None], seen.environment_state[None], images)
+    observation = _first_observation(env, cameras, draw)
+    images = {camera: picture[None] for camera, picture in observation.images.items()}
+    policy.act(observation.state[None], observation.environment_state[None], images)
     return cameras
 
 
@@ -158,7 +158,7 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
     return compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
 
 
-def _first_sight(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
+def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
     import numpy as np
 
     from manip_il.sim.env import ManipEnv
@@ -168,14 +168,14 @@ def _first_sight(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Ob
     else:
         world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
     world.start(0)
-    seen = world.observe()
+    observation = world.observe()
     if cameras is not None and not draw:
-        return replace(seen, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
-    return seen
+        return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
+    return observation
 
 
 def observation_text(cameras: CameraConfig, path: Path) -> str:
-    """What a policy of pictures looks at, in words."""
+    """Return in words which pictures a policy takes."""
     from manip_il.learn.observation import observation_of
     from manip_il.learn.pretrained import read_interface
 

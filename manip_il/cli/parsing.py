@@ -244,7 +244,7 @@ def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> Usa
 
 
 def nearest_options(name: str, known: Iterable[str]) -> list[str]:
-    """Options that a name may have meant, the nearest first: `num_episodes` finds `dataset.num_episodes`."""
+    """Return the options that a name may have meant, nearest first: `num_episodes` finds `dataset.num_episodes`."""
     scores = {option: _likeness(name[:_LONGEST].replace("-", "_"), option) for option in known}
     best = max(scores.values(), default=0.0)
     near = [option for option, score in scores.items() if score >= max(_NEAR, best - _AS_NEAR)]
@@ -252,7 +252,7 @@ def nearest_options(name: str, known: Iterable[str]) -> list[str]:
 
 
 def _likeness(name: str, option: str) -> float:
-    """From 0 to 2: of the last words of two dotted names, and of the whole; 1 and more where the last words agree."""
+    """Return the likeness of two dotted names, 0 to 2; 1 and more where their last words are equal."""
     leaf, other = name.rpartition(".")[2], option.rpartition(".")[2]
     whole = SequenceMatcher(None, name, option).ratio()
     if leaf == other:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -23,10 +22,10 @@ _quiet = False
 
 
 class Progress(Protocol):
-    """What `progress` hands out."""
+    """Display of work under way."""
 
     def advance(self, n: int = 1, **fields: object) -> None:
-        """`n` more are done; `fields` (loss=0.12, success=0.9) replace those shown so far."""
+        """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
         ...
 
 
@@ -37,12 +36,12 @@ def set_quiet(quiet: bool) -> None:
 
 
 def say(line: str) -> None:
-    """A line of normal output, on standard output."""
+    """Print a line of normal output, on standard output."""
     print(line, flush=True)
 
 
 def warn(lines: Iterable[str]) -> None:
-    """Warnings on standard error, one line each."""
+    """Print warnings on standard error, one line each."""
     for line in lines:
         print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)
 
@@ -110,7 +109,6 @@ class _Bar:
 
 @contextmanager
 def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]:
-    # Imported here: `manip-il --help` needs none of it.
     from rich import progress as rich_progress
     from rich.console import Console
 
@@ -128,7 +126,7 @@ def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]
 
 
 def bytes_text(count: float) -> str:
-    """As people read it: `1.2 GB`."""
+    """Return a number of bytes as people read it: `1.2 GB`."""
     unit = 0
     while count >= 999.5 and unit < len(_UNITS) - 1:
         count, unit = count / 1000, unit + 1
@@ -145,12 +143,12 @@ def _fields_text(fields: dict[str, object]) -> str:
     )
 
 
-class Ended(Protocol):
+class Outcome(Protocol):
     """An episode that has ended, or its result."""
 
     @property
     def success(self) -> bool:
-        """At some time."""
+        """Whether the task was solved at some time."""
         ...
 
 
@@ -163,7 +161,7 @@ class Stages:
     def __init__(self, kept: str):
         self.kept = kept
         self._stop = StopRequest()
-        self._open = contextlib.ExitStack()
+        self._open = ExitStack()
         self._bar: Progress | None = None
         self._done = self._solved = 0
 
@@ -191,8 +189,8 @@ class Stages:
         self._open.close()
         self._bar = None
 
-    def episode(self, episode: Ended) -> None:
-        """One more episode has ended."""
+    def episode(self, episode: Outcome) -> None:
+        """Count an episode that has ended."""
         self._done += 1
         self._solved += episode.success
         if self._bar is not None:
@@ -200,13 +198,13 @@ class Stages:
         self.check()
 
     def step(self) -> None:
-        """One more of whatever is counted is done."""
+        """Count a step that is done."""
         if self._bar is not None:
             self._bar.advance()
         self.check()
 
     def log(self, record: dict[str, Any]) -> None:
-        """A fit's metrics at a step; {} where there are none."""
+        """Show a fit's metrics at a step; {} where there are none."""
         if not record:
             self.check()
             return
@@ -221,7 +219,7 @@ class Stages:
             raise Interrupted(self.kept)
 
     def watch(self) -> Watch:
-        """What a run reports to."""
+        """Return the callbacks that a run of an algorithm reports to."""
         from manip_il.algorithms.run import Watch
 
         return Watch(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from manip_il.store.remote import Published
     from manip_il.store.url import RemoteUrl
 
-SHOWN_EVERY = 0.1  # between two changes of what is shown [s]
+DISPLAY_EVERY = 0.1  # between two updates of the display [s]
 
 
 @contextmanager
@@ -31,17 +31,17 @@ def show_bytes(total: int, what: str) -> Generator[Callable[[int], None]]:
     if not total:
         yield lambda count: None
         return
-    lock, shown = threading.Lock(), time.monotonic()
+    lock, displayed = threading.Lock(), time.monotonic()
     done = waiting = 0
 
     def advance(count: int) -> None:
-        nonlocal done, waiting, shown
+        nonlocal done, waiting, displayed
         with lock:
             done, waiting = done + count, waiting + count
             now = time.monotonic()
-            if now - shown >= SHOWN_EVERY or done >= total:
+            if now - displayed >= DISPLAY_EVERY or done >= total:
                 bar.advance(waiting)
-                waiting, shown = 0, now
+                waiting, displayed = 0, now
 
     with progress(total, what, of_bytes=True) as bar:
         yield advance

@@ -103,7 +103,7 @@ class TrainOptions:
         return fit.mlp(seed) if fit.is_mlp else fit.other(seed)
 
     def _fit_config(self) -> tuple[FitConfig, int]:
-        """What is asked for, and the seed of weights and batches."""
+        """The options of the fit, and the seed of weights and batches."""
         from manip_il.seeding import stream_base
 
         same = {one.name: getattr(self, one.name) for one in fields(FitConfig) if one.name != "eval_split"}
@@ -157,20 +157,20 @@ class TrainOptions:
 
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
-        """What is told how many pictures more have been decoded; a bar, where there are any."""
+        """Yield a callback for the number of pictures just decoded; a bar is displayed from the first one on."""
         from manip_il.data.lerobot_io import camera_keys, dataset_info
 
         with contextlib.ExitStack() as stack:
             bar = None
 
-            def seen(frames: int) -> None:
+            def decoded(frames: int) -> None:
                 nonlocal bar
                 if bar is None:
                     total = dataset_info(self.dataset.root).frames * len(camera_keys(self.dataset.root))
                     bar = stack.enter_context(progress(total, "decode pictures, once"))
                 bar.advance(frames)
 
-            yield seen
+            yield decoded
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
