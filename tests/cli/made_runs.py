@@ -23,6 +23,11 @@ OPTIONS = DaggerOptions(task=TaskGroup("reach"), env=EnvGroup(horizon=8))
 SUCCESSES = (0.2, 0.6, 0.4)
 
 
+def files(root: Path) -> dict[str, bytes]:
+    """Content of every file by its path in `root`."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
 def make_policy(folder: Path) -> Path:
     """A policy that acts, badly."""
     spec = env_spec(ENV)
