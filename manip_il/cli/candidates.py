@@ -49,8 +49,8 @@ class Source:
         """Path, for tables and errors."""
         return str(self.path)
 
-    def chosen(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
-        """Return the policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
+    def select(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
+        """Return the policy's folder, and the round that `rule` selects of a run; `UsageError` where there is none."""
         if self.policy is not None:
             return self.policy, None
         round_ = choose(rule, self.history, limit, self.name)
@@ -59,24 +59,24 @@ class Source:
     def measure(
         self, rule: Rule, limit: float | None, trial: Trial | None, folder: Path, engine: Engine, stages: Stages
     ) -> Measured:
-        """Return the evaluation that is there already, or that of the policy which `rule` takes, kept in `folder`."""
+        """Return the evaluation itself, or that of the policy that `rule` selects, which is stored in `folder`."""
         if self.result is not None or trial is None:
             return Measured(self.name, self.evaluation, self.path, self.training_seed)
-        policy, round_ = self.chosen(rule, limit)
+        policy, round_ = self.select(rule, limit)
         file = trial.file(folder, policy)
         result = replace(trial.measure(policy, self.name, file, engine, stages), policy=self.name)
         return Measured(self.name, result, file, self.training_seed, policy, round_, self.history)
 
     @property
     def evaluation(self) -> EvalResult:
-        """Evaluation of a source that is one."""
+        """The evaluation, of a source that is one."""
         assert self.result is not None
         return self.result
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """LEFT or RIGHT: one source, or one a training seed (`several`)."""
+    """LEFT or RIGHT: one source, or one for each training seed (`several`)."""
 
     path: Path
     sources: tuple[Source, ...]
@@ -190,7 +190,7 @@ def _read_source(path: Path) -> Source:
         source = Source(path, history=history(records, str(path)), finished=run_finished(path))
         if options is None:
             return source
-        env = options.env.config(options.robot.type, options.task.type)
+        env = options.env_config()
         return replace(source, training_seed=options.seed, env=env)
     if (path / FILE_NAME).is_file():
         return Source(path, result=EvalResult.read(path))
@@ -208,7 +208,7 @@ def _of_seed(folder: Path, seed: int) -> Source:
 
 
 def _run_options(folder: Path) -> DaggerOptions | None:
-    """The options of the DAgger run in `folder`; None where it is none."""
+    """Return the options of the DAgger run in `folder`; None where there is no such run."""
     path = folder / CONFIG_FILE
     if not path.is_file() or f"({DaggerOptions.__name__})" not in path.read_text(errors="replace").partition("\n")[0]:
         return None
@@ -218,7 +218,7 @@ def _run_options(folder: Path) -> DaggerOptions | None:
 def _policy_env(
     source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: str | None
 ) -> EnvConfig:
-    """Of a policy, which knows its robot, task and rate, but neither tolerance nor horizon."""
+    """Return the environment of a policy, whose checkpoint holds robot, task and rate, but no tolerance or horizon."""
     from manip_il.learn.checkpoint import read_meta
 
     meta = read_meta(source.policy or round_policy(source.path, 0))

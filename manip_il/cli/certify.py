@@ -1,4 +1,4 @@
-"""`manip-il certify`: from where the expert recovers, and what a wrong action costs it."""
+"""`manip-il certify`: from which states the expert recovers, and what a wrong action costs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class VisitorGroup:
-    """`--policy.*` of who visits the states that the expert goes on from."""
+    """`--policy.*` of the policy whose visited states the expert takes over in."""
 
     path: Path | None = option(None, "a checkpoint or a run: also let the expert take over from it")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from manip_il.errors import UsageError
@@ -99,6 +99,19 @@ class EnvGroup:
         get_task(task)
         hz = (meta.fps if meta else EnvConfig.control_hz) if self.control_hz is None else self.control_hz
         return EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon)
+
+
+@dataclass
+class EnvOptions:
+    """First options of a command that names robot and task itself."""
+
+    robot: RobotGroup = field(default_factory=RobotGroup)
+    task: TaskGroup = field(default_factory=TaskGroup)
+    env: EnvGroup = field(default_factory=EnvGroup)
+
+    def env_config(self) -> EnvConfig:
+        """Return the environment, see `EnvGroup.config`."""
+        return self.env.config(self.robot.type, self.task.type)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""`manip-il compare`: compare two policies or runs on the same seeds, and how sure that is."""
+"""`manip-il compare`: two policies or runs on the same seeds, and the confidence in their difference."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class CompareOptions:
         self._say(comparison, rule, limit)
 
     def _trial(self, sources: Sequence[Source], rule: Rule, limit: float | None) -> Trial | None:
-        """What is to be run; None where all is evaluated already. All that can be refused is refused here."""
+        """Return the test to run, checked; None where all is evaluated already."""
         from manip_il.seeding import stream_seeds
 
         results = [source for source in sources if source.result is not None]
@@ -106,7 +106,7 @@ class CompareOptions:
         if len(results) == len(sources):
             return None
         env = common_env(sources, self.env, self.robot.type, self.task.type)
-        policies = {source.name: source.chosen(rule, limit)[0] for source in sources if source.result is None}
+        policies = {source.name: source.select(rule, limit)[0] for source in sources if source.result is None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
         for source in results:

@@ -13,10 +13,8 @@ from manip_il.algorithms.config import RunConfig, check_labels, check_sight
 from manip_il.algorithms.sampling import Sampling
 from manip_il.algorithms.table import ALGORITHMS, Method, run_algorithm
 from manip_il.cli.common_options import (
-    EnvGroup,
+    EnvOptions,
     ImageGroup,
-    RobotGroup,
-    TaskGroup,
     engine_option,
     policy_help,
     require_workers,
@@ -51,7 +49,7 @@ FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ w
 
 
 @dataclass
-class DaggerOptions:
+class DaggerOptions(EnvOptions):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
@@ -60,9 +58,6 @@ class DaggerOptions:
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
     method: Method = option_of(RunConfig, "method")
     demonstrations: int = option_of(RunConfig, "demonstrations")
     rounds: int = option_of(RunConfig, "rounds", help_text="DAgger rounds after round 0; a resumed run may have more")
@@ -131,12 +126,12 @@ class DaggerOptions:
         return config
 
     def _config(self) -> RunConfig:
-        """The same, before the policy's own configuration has been made, which takes seconds to import."""
+        """Return the same before the policy's own configuration is checked, which takes seconds to import."""
         from manip_il.algorithms.beta import BetaSchedule
         from manip_il.engine.query import QueryRule
 
         made = {
-            "env": self.env.config(self.robot.type, self.task.type),
+            "env": self.env_config(),
             "fit": self._fit(),
             "cameras": self.image.config(self.cameras),
             "beta": BetaSchedule.parse(self.beta),
@@ -239,7 +234,7 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
-    """Return validation success over labels, episodes and wall-clock, one point a round. name: what made the rounds."""
+    """Return validation success over labels, episodes and wall-clock, one point a round. name: of the algorithm."""
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.evaluation.rounds import curve_points, history
 

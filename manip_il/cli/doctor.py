@@ -1,4 +1,4 @@
-"""`manip-il doctor DATASET`: what is wrong with a dataset, and what can be put right."""
+"""`manip-il doctor DATASET`: find what is wrong with a dataset, and repair it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class DoctorOptions:
 
         findings: list[Finding] = []
         with progress(None, "files examined") as bar:
-            named = self.dataset.name not in ("", "..")  # what stands beside it has its name
+            named = self.dataset.name not in ("", "..")  # journals and copies beside it are named after it
             dataset = Dataset(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
             for finding in examine(dataset, (*CHECKS, check_robot)):
                 say(str(finding))
@@ -96,7 +96,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         found, wanted = getattr(spec, what), getattr(here, what)
         if found != wanted:
             yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
-    # Of the rest, versions are compared already, and tolerance and horizon are not what a dataset says.
+    # Versions are compared elsewhere; tolerance and horizon are not part of a dataset.
     if _MODEL in fingerprint:
         theirs, ours = ({_MODEL: table[_MODEL]} for table in (fingerprint, env_fingerprint(env)))
         for text in compare_fingerprints("the dataset", theirs, "this program", ours):

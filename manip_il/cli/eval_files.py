@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
 EPISODES_FILE = "episodes.jsonl"
-NO_FILES = ("expert", "random")  # drivers of an evaluation that is of no policy
+NO_FILES = ("expert", "random")  # drivers that are no policy, so that nothing is loaded
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class ReplayOptions:
             find_policy(self.policy.path)
 
     def run(self) -> None:
-        """Run it, tell, film, compare."""
+        """Run the episode, print what was drawn, film it, compare the outcome."""
         from manip_il.evaluation.results import EvalResult
 
         result = EvalResult.read(self.file)
@@ -138,7 +138,7 @@ class ReplayOptions:
         say(f"the same as in {self.file}")
 
     def _job(self, result: EvalResult) -> RolloutJob:
-        """Return the rollouts of the evaluation; warn where policy or program are not those of then."""
+        """Return the rollouts of the evaluation; warn where policy or program have changed since."""
         from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.engine.describe import env_fingerprint, policy_sha256
         from manip_il.engine.jobs import RolloutJob

@@ -49,7 +49,7 @@ class MeasuredPolicyGroup:
 
 @dataclass
 class EvalGroup:
-    """`--eval.*`: what is run."""
+    """`--eval.*`: the episodes to run."""
 
     n_episodes: int | None = option(
         None, f"episodes, each with its own seed; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
@@ -83,7 +83,14 @@ class EvalOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        self._check()
+        if (self.policy.path is None) == (self.policy.type is None):
+            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
+        for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("hold", 0), ("batch_size", 1)):
+            value = getattr(self.eval, name)
+            if value is not None and value < lowest:
+                raise UsageError(f"--eval.{name} is {value}; expected at least {lowest}")
+        if self.until_width is not None and not 0 < self.until_width < 1:
+            raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
         self._seeds()
         require_workers(self.workers)
         if self.policy.path is not None:
@@ -97,7 +104,6 @@ class EvalOptions:
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.results import FILE_NAME
 
-        self._check()
         seeds = self._seeds()
         engine = Engine(self.workers, self.engine)
         job = self._job(engine, len(seeds))
@@ -114,16 +120,6 @@ class EvalOptions:
         say(f"report: {self.output_dir / REPORT_FILE}")
         say(f"next: {self._next(result)}")
 
-    def _check(self) -> None:
-        if (self.policy.path is None) == (self.policy.type is None):
-            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
-        for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("hold", 0), ("batch_size", 1)):
-            value = getattr(self.eval, name)
-            if value is not None and value < lowest:
-                raise UsageError(f"--eval.{name} is {value}; expected at least {lowest}")
-        if self.until_width is not None and not 0 < self.until_width < 1:
-            raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
-
     def _seeds(self) -> range:
         from manip_il.seeding import stream_seeds
 
@@ -137,7 +133,7 @@ class EvalOptions:
         path = None if self.policy.path is None else find_policy(self.policy.path)
         self._check_memory(path, episodes)
         if episodes > 1:
-            engine.warm_up(learned=path is not None)  # while the policy is looked at here
+            engine.warm_up(learned=path is not None)  # while the policy is checked here
         meta = cameras = None
         if path is not None:
             from manip_il.learn.checkpoint import read_meta
@@ -153,7 +149,7 @@ class EvalOptions:
         return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
-        """Before anything large is loaded; on a cluster memory is its own affair."""
+        """Raise where memory is too small, before anything large is loaded; a Ray cluster checks for itself."""
         from manip_il.engine.engine import default_workers
         from manip_il.engine.memory import check_memory
 
@@ -207,7 +203,7 @@ class EvalOptions:
         filmed = [episodes[seed] for seed in seeds]
         shots = [Shot(job, one, condition_caption(job, one), success=one.success) for one in filmed]
         pictures = film_shots(shots, stages)
-        for film, episode in zip(pictures.films, filmed, strict=False):  # of no films where there is no OpenGL
+        for film, episode in zip(pictures.films, filmed, strict=False):  # no films without OpenGL
             outcome = "success" if episode.success else "failure"
             atomic_write(self.output_dir / FILMS / f"seed_{episode.seed}_{outcome}.mp4", film.mp4)
         return pictures

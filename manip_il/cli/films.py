@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report_data import Film, Paths, Strip
     from manip_il.mdp import Episode
 
-FILM_EVERY = 2  # control steps a film's frame: half the pictures, and still fluent
+FILM_EVERY = 2  # control steps a frame of film
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One episode to show. success: as the picture is marked, None for no mark."""
+    """One episode to show. success: how the picture is marked, None for no mark."""
 
     job: RolloutJob
     episode: Episode

@@ -45,13 +45,13 @@ def require_eval(path: Path) -> None:
 
 
 def require_folder(path: Path, what: str) -> None:
-    """Raise `UsageError` unless there is such a folder. what: it should be."""
+    """Raise `UsageError` unless there is such a folder. what: its expected content."""
     if not path.is_dir():
         raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
 
 
 def hub_hint(path: Path, kind: str = "") -> str:
-    """Return how to pull what looks like a repo on the Hub, as it is no path here; else nothing. kind: `datasets/`."""
+    """Return how to pull a path that looks like a repo on the Hub; nothing for others. kind: `datasets/`."""
     if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
         return ""
     return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"
@@ -90,7 +90,7 @@ def start_policy(settings: Open) -> Open:
 
 
 def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:
-    """Warn where a dataset was made by something else than this machine would make it by.
+    """Warn where a dataset was made by other versions or another model than this machine has.
 
     Raises `MismatchError` where its numbers mean something else. A robot that is not known here is not compared.
     """
@@ -106,7 +106,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps)
     check_same_spec(str(root), spec, "this program", env_spec(env))
-    # Tolerance and horizon do not matter to what is learnt, and a dataset does not say them; nor do pictures, unseen.
+    # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
     theirs = {key: value for key, value in fingerprint.items() if key not in ("config_sha256", "cameras_sha256")}
     warn(compare_fingerprints(str(root), theirs, "this machine", here))
@@ -136,7 +136,7 @@ def check_policy(
     check_interface(read_interface(path), spec)
     warn(_differences(path, meta, env, cameras))
     policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
-    # One action now says what else would not fit before a worker does.
+    # One action now finds what else does not fit before a worker does.
     observation = _first_observation(env, cameras, draw)
     images = {camera: picture[None] for camera, picture in observation.images.items()}
     policy.act(observation.state[None], observation.environment_state[None], images)
@@ -150,11 +150,11 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
         return [*lines, f"nor how its pictures were lit: {cameras.look} is assumed"] if cameras else lines
-    if meta.task != env.task:  # and with it the model and all that is hashed of it
+    if meta.task != env.task:  # and with it the model and its hash
         return [f"task differs: {path} has {meta.task}, the environment has {env.task}"]
     theirs = dict(meta.fingerprint)
     if cameras is None:
-        theirs.pop("cameras_sha256", None)  # it sees none
+        theirs.pop("cameras_sha256", None)  # it takes no pictures
     return compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
 
 

@@ -227,7 +227,7 @@ def _commands(names: Collection[str]) -> str:
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
-    """words: all that was asked, as a command may tell more of a choice (`more_help`)."""
+    """Help of one command. words: all that was given, as some have help for a choice, too (`more_help`)."""
     options = options_of(cls)
     places = "".join(f" {option.label}" for option in options if option.positional)
     rows = [_row(option) for option in options]
@@ -237,15 +237,9 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     example = getattr(cls, "example", "")
     more = cls.more_help(words) if hasattr(cls, "more_help") else ""
     return (
-        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{_description(name, cls)}\n\n"
+        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
         f"options:\n{lines}{more}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
     )
-
-
-def _description(name: str, cls: type) -> str:
-    text = inspect.cleandoc(cls.__doc__ or "")
-    generated = text.startswith(f"{cls.__name__}(")  # what `dataclass` makes up where there is no docstring
-    return COMMANDS[name].summary if generated or not text else text
 
 
 def _row(option: Option) -> tuple[str, str]:

@@ -44,14 +44,14 @@ def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     """
     check_output(folder, resume=resume, overwrite=overwrite)
     for path in folder.rglob(f".*{PARTIAL}") if resume else ():
-        if path.is_file():  # a folder has a lock of its own, and goes with the next writer
+        if path.is_file():  # a folder has a lock of its own, and is removed by the next writer
             path.unlink()
     if overwrite and folder.exists() and any(folder.iterdir()):
         _delete(folder)
 
 
 def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise what would keep `prepare_output` from its work; nothing is changed.
+    """Raise where `prepare_output` would fail; nothing is changed.
 
     `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
     program did not make.
@@ -101,7 +101,7 @@ def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow
     empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
     """
     path = folder / CONFIG_FILE
-    # A run that was killed in its first moment leaves at most the half of a file, under a hidden name.
+    # A run that was killed at once leaves at most half a file, under a hidden name.
     if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
         return
     if not path.is_file():
@@ -173,7 +173,7 @@ def _is_ours(folder: Path) -> bool:
     config = folder / "config.yaml"
     if config.is_file() and config.read_bytes().startswith(CONFIG_HEADER.encode()):
         return True
-    # Any LeRobot dataset has meta/info.json; one with both actions is from here.
+    # Any LeRobot dataset has meta/info.json; only ours has both actions.
     features = _json_object(folder / "meta" / "info.json").get("features")
     if isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys():
         return True
@@ -181,16 +181,16 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file, or an empty one."""
+    """Return the object in a JSON file, or an empty one."""
     return (_record(path.read_bytes()) or {}) if path.is_file() else {}
 
 
 def _delete(folder: Path) -> None:
-    if folder.is_mount():  # in a container: it can be emptied, not renamed; what marks it as ours goes last
+    if folder.is_mount():  # in a container: it can be emptied, not renamed; the mark of ours is deleted last
         for path in sorted(folder.iterdir(), key=lambda path: path.name in _MARKS):
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         return
-    # Renamed first: a kill on the way leaves no folder that has lost its mark but not its files.
+    # Renamed first: after a kill in between, no folder is left that has files but not the mark of ours.
     doomed = folder.with_name(f".{folder.name}.deleting.{os.getpid()}")
     folder.rename(doomed)
     shutil.rmtree(doomed)
@@ -232,7 +232,7 @@ def _require_record(path: Path, number: int, line: bytes) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numpy scalars and arrays, and paths, as JSON has them."""
+    """Return numpy scalars and arrays, and paths, as JSON values."""
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):

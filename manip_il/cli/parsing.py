@@ -117,7 +117,7 @@ def _place(word: str, option: Option, given: dict[str, _Given]) -> None:
 
 
 def _open_group(name: str, known: Mapping[str, Option]) -> str:
-    """The open group that `name` is an option of, or nothing."""
+    """Return the open group that `name` is an option of, or nothing."""
     if name in known:
         return ""
     return next((option.name for option in known.values() if option.is_open and name.startswith(f"{option.name}.")), "")
@@ -175,7 +175,7 @@ def _leaves(
 
 
 def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
-    """An instance of `cls`: what was given, else `base`'s values, else the class's defaults."""
+    """Return an instance of `cls` of the given values, else `base`'s, else the defaults."""
     arguments: dict[str, Any] = {}
     for field, field_type in typed_fields(cls):
         name, default = prefix + field.name, default_of(field, base)
@@ -212,9 +212,9 @@ def _decode_given(field_type: Any, given: _Given) -> Any:
 
 
 def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: str, command: str) -> UsageError:
-    """Return the error for an option or a key that is not there: the nearest few, and what lists all.
+    """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
 
-    kind: `option`, or which file's key. dashes: what stands before the names. command: empty where no one is known.
+    kind: `option`, or which file's key. dashes: before the names. command: empty where none is known.
     """
     if name in known and known[name].is_open:
         return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")
@@ -267,5 +267,5 @@ def _help(command: str) -> str:
 
 
 def _types(option_type: object) -> tuple[object, ...]:
-    """The members of a union, or the type alone."""
+    """Return the members of a union, or the type alone."""
     return typing.get_args(option_type) or (option_type,)

@@ -1,4 +1,4 @@
-"""How far long work has come: a bar on a terminal, a line every few seconds elsewhere, both on standard error."""
+"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every few seconds)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def warn(lines: Iterable[str]) -> None:
 
 @contextmanager
 def progress(total: int | None, description: str, *, of_bytes: bool = False) -> Generator[Progress]:
-    """Show the progress of `total` steps (None where nobody knows), or bytes, while the `with` lasts."""
+    """Show the progress of `total` steps (None where the number is unknown), or bytes, while the `with` lasts."""
     if _quiet:
         yield _Silent()
     elif sys.stderr.isatty():
@@ -75,7 +75,7 @@ class _Lines:
         self._done = 0
         self._fields: dict[str, object] = {}
         self._start = self._printed = time.monotonic()
-        self._fresh = True  # something to say since the last line
+        self._fresh = True  # advanced since the last line
 
     def advance(self, n: int = 1, **fields: object) -> None:
         self._done += n
@@ -153,9 +153,9 @@ class Outcome(Protocol):
 
 
 class Stages:
-    """One progress bar at a time; use as a context manager. A stop request is honoured at every report.
+    """One progress bar at a time; use as a context manager. A stop request takes effect at the next step.
 
-    kept: what to tell the user is safe on disk, also where the work fails.
+    kept: what is safe on disk, for the message to the user, also where the work fails.
     """
 
     def __init__(self, kept: str):

@@ -1,4 +1,4 @@
-"""`manip-il push` and `manip-il pull`: a dataset or a policy, to somewhere else and back."""
+"""`manip-il push` and `manip-il pull`: upload and download of a dataset or a policy."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DISPLAY_EVERY = 0.1  # between two updates of the display [s]
 
 @contextmanager
 def show_bytes(total: int, what: str) -> Generator[Callable[[int], None]]:
-    """Show a transfer of `total` bytes; the function given adds bytes, from any thread. Nothing is shown for none."""
+    """Show the progress of a transfer of `total` bytes; the callback adds bytes, from any thread."""
     if not total:
         yield lambda count: None
         return
@@ -49,7 +49,7 @@ def show_bytes(total: int, what: str) -> Generator[Callable[[int], None]]:
 
 @contextmanager
 def resumable() -> Generator[None]:
-    """Have Ctrl-C say that the same command, given again, goes on from there."""
+    """Have Ctrl-C answer that the same command resumes the transfer."""
     try:
         yield
     except KeyboardInterrupt:
@@ -77,14 +77,14 @@ class PushOptions:
     private: bool = option(False, "make a new repository on the Hub private")
 
     def check(self) -> None:
-        """Refuse an address that is none, and what is no folder."""
+        """Refuse an invalid address, and a missing folder."""
         from manip_il.store.url import RemoteUrl
 
         RemoteUrl.parse(self.remote)
         require_folder(self.source, "the folder of a dataset, a run or a policy")
 
     def run(self) -> None:
-        """Examine, list, upload, switch over; say what was done."""
+        """Examine, list, upload, switch over; print what was done."""
         from manip_il.store.push import push
         from manip_il.store.url import RemoteUrl, open_remote
 
@@ -139,13 +139,13 @@ class PullOptions:
     overwrite: bool = option(False, "replace an existing dataset or run")
 
     def check(self) -> None:
-        """Refuse an address that is none, and a folder that may not be replaced."""
+        """Refuse an invalid address, and a folder that may not be replaced."""
         self._url()
         if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
             require_ours(self.target)
 
     def run(self) -> None:
-        """Fetch, verify, rename; say what is there now."""
+        """Fetch, verify, rename; print what was pulled."""
         from manip_il.store.pull import pull
         from manip_il.store.url import open_remote
 

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from manip_il import checks
 from manip_il.algorithms.config import RunConfig
 from manip_il.cli.common_options import (
-    EnvGroup,
-    RobotGroup,
-    TaskGroup,
+    EnvOptions,
     engine_option,
     seed_option,
     workers_option,
@@ -60,7 +58,7 @@ class PolicyGroup:
 
 
 @dataclass
-class QuickstartOptions:
+class QuickstartOptions(EnvOptions):
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
@@ -68,9 +66,6 @@ class QuickstartOptions:
     """
 
     example: ClassVar[str] = "manip-il quickstart --output_dir=runs/quickstart"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
     demonstrations: int = option_of(RunConfig, "demonstrations", 100)
     rounds: int = option_of(RunConfig, "rounds", 3)
     episodes_per_round: int = option_of(RunConfig, "episodes_per_round", help_text="rollouts per round")
@@ -111,7 +106,7 @@ class QuickstartOptions:
                 quickstart.run()
 
     def _dagger(self) -> DaggerOptions:
-        """Of the rounds."""
+        """Return the options of the DAgger run."""
         shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "steps")
         shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
         same = {name: getattr(self, name) for name in shared}
@@ -130,7 +125,7 @@ class Contestant:
 
 
 class _Quickstart:
-    """One run of the quickstart: its parts one after the other, each of which skips what is there."""
+    """One run of the quickstart: its parts one after the other, each of which skips what is done."""
 
     def __init__(self, options: QuickstartOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
@@ -183,7 +178,7 @@ class _Quickstart:
         return Trial(self.config.env, seeds, suite, suite_conditions(suite, self.config.env.task, sees=False))
 
     def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
-        """Return folder -> policy -> evaluation; what an earlier run has written is read instead."""
+        """Return folder -> policy -> evaluation; those of an interrupted run are read."""
         from manip_il.seeding import stream_seeds
 
         options, more = self.options, [one for one in contestants if one.key == "cloned_more"]
@@ -255,7 +250,7 @@ class _Quickstart:
 
     @contextmanager
     def _timed(self, part: str) -> Generator[None]:
-        """Add what a part takes, also where it is stopped, to what it took before."""
+        """Add the time of a part, also where it is interrupted, to that of earlier runs."""
         started = time.monotonic()
         try:
             yield
@@ -263,13 +258,13 @@ class _Quickstart:
             self.add_time(part, time.monotonic() - started)
 
     def add_time(self, part: str, seconds: float) -> None:
-        """Add what a part took [s]."""
+        """Add the time of a part [s] and write the file."""
         self.timings[part] = round(self.timings.get(part, 0.0) + seconds, 2)
         atomic_write(self.folder / TIMINGS_FILE, json.dumps(self.timings, indent=1) + "\n")
 
 
 def read_timings(path: Path) -> dict[str, float]:
-    """Return part -> what it took [s]."""
+    """Return the time of every part [s]."""
     timings = checks.read_json(path, f"the {TIMINGS_FILE} of a quickstart")
     return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
 

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
 from manip_il.cli.common_options import (
-    EnvGroup,
+    EnvOptions,
     ImageGroup,
-    RobotGroup,
-    TaskGroup,
     engine_option,
     require_workers,
     seed_option,
@@ -63,16 +61,13 @@ class DatasetGroup:
 
 
 @dataclass
-class RecordOptions:
+class RecordOptions(EnvOptions):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
     Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
     image: ImageGroup = field(default_factory=ImageGroup)
@@ -84,18 +79,20 @@ class RecordOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        self._check()
+        if self.dataset.num_episodes < 1:
+            raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
+        require_repo_id("--dataset.repo_id", self._repo_id())
         require_workers(self.workers)
         root, journals = self._folders()
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
             require_output(journals, "record", resume=self.resume, overwrite=self.overwrite)
-        self.env.config(self.robot.type, self.task.type)
+        self.env_config()
         self.image.config(self.cameras)
 
     def run(self) -> None:
         """Record; the dataset is written as the episodes come."""
-        env, cameras = self.env.config(self.robot.type, self.task.type), self.image.config(self.cameras)
+        env, cameras = self.env_config(), self.image.config(self.cameras)
         if cameras:
             from manip_il.data.lerobot_io import VideoConfig
 
@@ -109,17 +106,12 @@ class RecordOptions:
         with exclusive(root):
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-            if self._is_there(root, journals):
+            if self._is_complete(root, journals):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
                 job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras)
                 self._record(engine, job, root, journals)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
-
-    def _check(self) -> None:
-        if self.dataset.num_episodes < 1:
-            raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
-        require_repo_id("--dataset.repo_id", self._repo_id())
 
     def _repo_id(self) -> str:
         return self.dataset.repo_id or f"local/{self.robot.type}_{self.task.type}"
@@ -128,8 +120,8 @@ class RecordOptions:
         root = self.dataset.root or Path("datasets") / self._repo_id().partition("/")[2]
         return root, root.with_name(f"{root.name}.journals")
 
-    def _is_there(self, root: Path, journals: Path) -> bool:
-        """Whether a resumed recording has nothing to do."""
+    def _is_complete(self, root: Path, journals: Path) -> bool:
+        """Return whether a resumed recording is complete."""
         from manip_il.data.lerobot_io import dataset_info
 
         if not self.resume:
@@ -185,7 +177,7 @@ class BuildOptions:
             require_repo_id("--repo_id", self.repo_id)
 
     def run(self) -> None:
-        """Build."""
+        """Build the dataset; `ManipError` where a journal could not be read."""
         from manip_il.data.atomic import exclusive
         from manip_il.data.build import build
 
@@ -253,7 +245,7 @@ class RenderOptions:
 
 
 def require_repo_id(option: str, value: str) -> None:
-    """Raise `UsageError` unless the value is USER/NAME: a folder is named by it."""
+    """Raise `UsageError` unless the value is USER/NAME: a folder is named after it."""
     try:
         checks.repo_id(option, value)
     except ManipError as error:
@@ -263,7 +255,7 @@ def require_repo_id(option: str, value: str) -> None:
 
 
 def left_out(failed: int) -> str:
-    """Return what became of failed demonstrations, in words."""
+    """Return in words how many demonstrations failed."""
     if failed == 0:
         return "no demonstration failed"
     return f"{failed} failed demonstration{'s' if failed > 1 else ''} left out"

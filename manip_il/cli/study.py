@@ -83,7 +83,7 @@ class StudyOptions:
         self._say(study)
 
     def _learn(self, plan: Plan) -> None:
-        """One run after the other, seed by seed, so that a study that is stopped early has all arms."""
+        """Run one after the other, seed by seed, so that a study that is stopped early has all arms."""
         runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             folder = self._folder(name, seed)
@@ -105,7 +105,7 @@ class StudyOptions:
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]
         limit = limit_of(plan.rule, everything)
-        policies = {source.name: source.chosen(plan.rule, limit)[0] for source in everything}
+        policies = {source.name: source.select(plan.rule, limit)[0] for source in everything}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
         trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values(), self.trust)
         trial.check_policies(policies, self.output_dir, self.engine)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from manip_il.sim.config import EnvConfig
 
 STUDY_FILE = "study.yaml"
-OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
 ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -51,7 +51,7 @@ class StudyFile:
 
 @dataclass(frozen=True)
 class Plan:
-    """A file that has been checked: every arm's options are sound, and all arms share one environment."""
+    """A checked file: the options of every arm are valid, and all arms have one environment."""
 
     file: StudyFile
     arms: Mapping[str, DaggerOptions]
@@ -61,7 +61,7 @@ class Plan:
 
 
 def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
-    """Return the study in `path`; training_seeds: in place of the file's; trust: what the file may not say of its runs.
+    """Return the study in `path`; training_seeds: in place of the file's. trust: of its runs.
 
     Raises `UsageError` in one line for what is not sound.
     """
@@ -146,7 +146,7 @@ def _env(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
 
 @contextmanager
 def _named(path: Path, arm: str) -> Generator[None]:
-    """Have an error name the file and the arm, where it does not name the file yet."""
+    """Add the file and the arm to an error that does not name them."""
     try:
         yield
     except ManipError as error:

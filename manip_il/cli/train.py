@@ -150,7 +150,7 @@ class TrainOptions:
         with threads(config.threads):
             with self._decoding() as decoded:
                 trainer = PolicyTrainer(root, config, self.output_dir, meta, resume=self.resume, on_frames=decoded)
-            self._save_options()  # now, as much of what can be wrong has been found by now
+            self._save_options()  # now, as most mistakes have been found
             with self._stages(config.save_freq) as stages:
                 stages.start(f"train {config.policy.type} on {len(trainer.samples.train):,} samples", config.steps)
                 return trainer.fit(stages.log)

@@ -42,7 +42,7 @@ class TrialGroup:
 
 @dataclass(frozen=True)
 class Trial:
-    """Environment, seeds and conditions in which policies are measured.
+    """Environment, seeds and conditions in which policies are tested.
 
     trust: whether models that their checkpoints name may be loaded.
     """
@@ -101,7 +101,7 @@ class Trial:
         return EvalResult.read(file)
 
     def check_result(self, name: str, result: EvalResult) -> None:
-        """Raise `MismatchError` or `ManipError` unless an evaluation from elsewhere is this test's."""
+        """Raise `MismatchError` or `ManipError` unless a given evaluation is of this trial."""
         settings = EvalSettings.of(self.job(Path()), self.suite)
         wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
         for what, value in wanted.items():
@@ -145,7 +145,7 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
 
 
 def require_suite(suite: str) -> None:
-    """Raise `UnknownName` for a suite that is not there, `UsageError` for a file that is not; none is read."""
+    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
     if _is_file(suite):
         if not Path(suite).is_file():
             raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")

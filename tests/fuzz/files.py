@@ -143,7 +143,7 @@ def _side(folder: Path) -> None:
     for at in ("end", "labels", "seconds"):
         rule = Rule.parse("best", at)
         for source in (side := read_candidate(folder / "run")).sources:
-            source.chosen(rule, limit_of(rule, side.sources))
+            source.select(rule, limit_of(rule, side.sources))
 
 
 def _resume_dagger(folder: Path) -> None:
