@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -167,26 +164,6 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, 
     capsys.readouterr()
     assert evaluate("e", *words, "--resume=true") == 1
     assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
-
-
-@pytest.mark.slow
-def test_a_killed_evaluation_keeps_what_was_done_and_goes_on(start, here):
-    words = ["eval", "--policy.type=expert", "--robot.type=fetch", "--eval.n_episodes=16", "--workers=2"]
-    words += ["--eval.films=0", "--suite=knocked"]
-    process = start(*words, f"--output_dir={here / 'cut'}", log=here / "log", warm=True)
-    kept = here / "cut" / KEPT
-    while not (kept.is_file() and kept.read_bytes().count(b"\n") > 3):
-        assert process.is_alive(), "it ended before it was killed"
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.join()
-    before = kept.read_bytes().count(b"\n")
-    assert 3 < before < 17
-    assert not (here / "cut" / "eval.json").exists()
-    assert main([*words, f"--output_dir={here / 'cut'}", "--resume=true"]) == 0
-    assert kept.read_bytes().count(b"\n") == 17
-    assert main([*words, "--output_dir=whole"]) == 0
-    assert (here / "cut" / "eval.json").read_bytes() == (here / "whole" / "eval.json").read_bytes()
 
 
 def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(here, monkeypatch, error):

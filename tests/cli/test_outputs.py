@@ -16,7 +16,6 @@ from manip_il.cli.outputs import CONFIG_FILE, append_jsonl, atomic_write, check_
 from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
 from manip_il.data.atomic import exclusive
-from manip_il.data.writing import WriteError
 from manip_il.errors import FolderBusyError, FolderExistsError, ManipError, NotFiniteError, UsageError
 
 from .made_runs import make_eval
@@ -115,20 +114,6 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
     with pytest.raises(UsageError, match="git checkout"):
         overwrite(ours)
     assert (ours / "config.yaml").exists()
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "a" / "x.json"
-    atomic_write(path, b"old")
-
-    def full_disk(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(WriteError, match=f"cannot write {path}: No space"):
-        atomic_write(path, "new")
-    assert path.read_bytes() == b"old"
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_records_come_back_in_order(tmp_path):
