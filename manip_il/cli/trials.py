@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 
 import manip_il
 from manip_il.cli.progress import Stages
-from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.evaluation.results import EvalResult, EvalSettings
 from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.results import EvalResult
     from manip_il.sim.conditions import Condition
     from manip_il.sim.config import EnvConfig
 
@@ -74,7 +73,9 @@ class Trial:
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
+        from manip_il.data.fingerprint import canonical_json
         from manip_il.engine.describe import env_fingerprint, policy_sha256
+        from manip_il.evaluation.results import EvalSettings
 
         settings = EvalSettings.of(self.job(policy), self.suite).to_json()
         made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, policy_sha256(policy))
@@ -87,6 +88,7 @@ class Trial:
 
         name: in progress and results. complete: raise `ManipError` where workers died of a seed, which leaves it out.
         """
+        from manip_il.evaluation.results import EvalResult
         from manip_il.evaluation.runner import evaluate
 
         if not file.is_file():
@@ -102,6 +104,8 @@ class Trial:
 
     def check_result(self, name: str, result: EvalResult) -> None:
         """Raise `MismatchError` or `ManipError` unless a given evaluation is of this trial."""
+        from manip_il.evaluation.results import EvalSettings
+
         settings = EvalSettings.of(self.job(Path()), self.suite)
         wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
         for what, value in wanted.items():

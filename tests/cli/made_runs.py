@@ -28,10 +28,10 @@ def files(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def make_policy(folder: Path) -> Path:
+def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
     """A policy that acts, badly."""
-    spec = env_spec(ENV)
-    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(ENV)))
+    spec = env_spec(env)
+    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(env)))
 
 
 def mark(policy: Path, words: str) -> Path:

@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.describe import env_fingerprint, env_spec
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.engine.describe import env_fingerprint
 from manip_il.sim.env import EnvConfig, ManipEnv
 
-from ..learn.tiny_policies import write_checkpoint
+from .made_runs import make_policy
 
 ENV = EnvConfig("fetch", "reach", horizon=60)
 WORDS = ["certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
@@ -21,8 +20,7 @@ WORDS = ["certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60
 @pytest.fixture
 def policy(tmp_path) -> Path:
     """An untrained one for fetch reach."""
-    meta = CheckpointMeta.of(env_spec(ENV), env_fingerprint(ENV))
-    return write_checkpoint(tmp_path / "policy", "act", env_spec(ENV), meta=meta)
+    return make_policy(tmp_path / "policy", ENV)
 
 
 def test_the_file_and_the_tables_say_the_same(tmp_path, capsys):

@@ -12,16 +12,15 @@ from manip_il.cli.eval_files import EPISODES_FILE as KEPT
 from manip_il.cli.main import main
 from manip_il.cli.trials import CONDITIONS, SUITES, suite_conditions
 from manip_il.data import schema
-from manip_il.engine.describe import env_fingerprint, env_spec
+from manip_il.engine.describe import env_spec
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EvalResult
-from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.disturb import STANDARD
 from manip_il.sim.env import EnvConfig
 
 from ..learn.tiny_policies import write_checkpoint
-from .made_runs import make_run, mark
+from .made_runs import make_policy, make_run, mark
 
 ENV = EnvConfig("fetch", "pick_place", horizon=10)
 SMALL = ["--robot.type=fetch", "--env.horizon=10", "--workers=1", "--eval.films=0"]
@@ -30,9 +29,7 @@ REACH = ["--policy.type=expert", "--task.type=reach", *SMALL]
 
 @pytest.fixture(scope="module")
 def act(tmp_path_factory) -> Path:
-    spec = env_spec(ENV)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
-    return write_checkpoint(tmp_path_factory.mktemp("act"), "act", spec, meta=meta)
+    return make_policy(tmp_path_factory.mktemp("act") / "act", ENV)
 
 
 def evaluate(folder: str, *words: str) -> int:

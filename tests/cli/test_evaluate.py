@@ -16,6 +16,7 @@ from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig, Look
 
 from ..learn.tiny_policies import edit_config, write_checkpoint
+from .made_runs import make_policy
 
 ENV = EnvConfig("panda", "reach", horizon=8)
 DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
@@ -28,9 +29,7 @@ def evaluate(policy: Path, folder: Path, *words: str) -> int:
 
 @pytest.fixture
 def act(tmp_path) -> Path:
-    spec = env_spec(ENV)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
-    return write_checkpoint(tmp_path / "policy", "act", spec, meta=meta)
+    return make_policy(tmp_path / "policy", ENV)
 
 
 @pytest.fixture
