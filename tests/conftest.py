@@ -24,10 +24,8 @@ settings.load_profile("manip_il")
 # imports torch and LeRobot anew, six seconds each.
 IMPORTED_ONCE = [
     "manip_il.cli.record",
-    "manip_il.cli.stages",
     "manip_il.cli.dagger",
     "manip_il.cli.evaluate",
-    "manip_il.cli.shown",
     "manip_il.cli.study",
     "manip_il.algorithms.run",
     "manip_il.recording",

@@ -10,8 +10,9 @@ from manip_il.algorithms.sampling import Sampling
 from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.option import option
 from manip_il.seeding import MAX_ROUNDS
-from manip_il.sim.env import EnvConfig
+from manip_il.sim.config import EnvConfig
 from manip_il.sim.look import CameraConfig
 
 _AT_LEAST_1 = (
@@ -39,22 +40,27 @@ class RunConfig:
 
     env: EnvConfig = field(default_factory=EnvConfig)
     method: str = "dagger"
-    demonstrations: int = 50
-    rounds: int = 5
-    episodes_per_round: int = 50
-    label_budget: int | None = None
+    demonstrations: int = option(50, "successful expert episodes of round 0")
+    rounds: int = option(5, "DAgger rounds after round 0")
+    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
+    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
     beta: BetaSchedule = _LEARNER_ALONE
-    label: Literal["per_state", "takeover", "branch"] = "per_state"
+    label: Literal["per_state", "takeover", "branch"] = option(
+        "per_state",
+        "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
+    )
     query_rule: QueryRule | None = None
-    branch_steps: int | None = None
-    ensemble: int = 1
+    branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
+    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND")
     sampling: Sampling = field(default_factory=Sampling)
-    refit: Literal["scratch", "warm"] = "scratch"
-    refit_steps: int | None = None
+    refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
+    refit_steps: int | None = option(None, "gradient steps in later rounds, with --refit=warm; by default as many")
     fit: FitConfig = field(default_factory=FitConfig)
-    validation_episodes: int = 200
-    hold: int = 10
-    disturbed_share: float = 0.5
+    validation_episodes: int = option(200, "unseen episodes that choose the best round")
+    hold: int = option(10, "control steps of a rollout after success")
+    disturbed_share: float = option(
+        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
+    )
     cameras: CameraConfig | None = None
     seed: int = 0
 

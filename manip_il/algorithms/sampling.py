@@ -13,6 +13,7 @@ from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
 from manip_il.engine.drivers import action_gap
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor
+from manip_il.option import option
 
 F64 = NDArray[np.float64]
 COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
@@ -27,9 +28,9 @@ class Sampling:
     than `CORRECTION`. rollouts: the others of later rounds.
     """
 
-    demonstrations: float = 1.0
-    corrections: float = 1.0
-    rollouts: float = 1.0
+    demonstrations: float = option(1.0, "weight of a frame of round 0")
+    corrections: float = option(1.0, "weight of a later frame where the expert drove or would have acted differently")
+    rollouts: float = option(1.0, "weight of the other later frames")
 
     def __post_init__(self) -> None:
         for one in fields(self):

@@ -1,4 +1,4 @@
-"""`manip-il certify`: from where the expert recovers, and what a wrong action costs it."""
+"""`manip-il certify`: from which states the expert recovers, and what a wrong action costs."""
 
 from __future__ import annotations
 
@@ -6,39 +6,31 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import (
-    DEFAULT_HZ,
-    DEFAULT_ROBOT,
-    DEFAULT_TASK,
-    ENGINE_HELP,
-    WORKERS_HELP,
+from manip_il.cli.common_options import (
     EnvGroup,
     MaybeRobotGroup,
     MaybeTaskGroup,
-    find_policy,
-    option,
-    save_options,
+    engine_option,
+    require_workers,
+    seed_option,
     trust_option,
+    workers_option,
 )
-from manip_il.cli.paths import require_new, require_workers
-from manip_il.cli.policy_check import check_policy
+from manip_il.cli.inputs import check_policy, find_policy
+from manip_il.cli.outputs import open_output, require_new
 from manip_il.cli.progress import progress, say
-from manip_il.errors import FolderExistsError, UsageError
+from manip_il.errors import UsageError
+from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
-    from manip_il.evaluation.certificate import Certificate
-    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.config import EnvConfig
 
 
 @dataclass
 class VisitorGroup:
-    """`--policy.*` of who visits the states that the expert goes on from."""
+    """`--policy.*` of the policy whose visited states the expert takes over in."""
 
-    path: Path | None = field(
-        default=None, metadata={"help": "a checkpoint or a run: also let the expert take over from it"}
-    )
+    path: Path | None = option(None, "a checkpoint or a run: also let the expert take over from it")
 
 
 @dataclass
@@ -51,11 +43,11 @@ class CertifyOptions:
     policy: VisitorGroup = field(default_factory=VisitorGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
     cases: int = option(500, "episodes of each kind")
-    seed: int = option(0, "shifts every random stream, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    seed: int = seed_option()
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     trust: bool = trust_option()
-    output_dir: Path = field(default=Path("runs/certificate"), metadata={"help": "folder of certificate.json"})
+    output_dir: Path = option(Path("runs/certificate"), "folder of certificate.json")
     overwrite: bool = option(False, "replace an existing certificate")
 
     def check(self) -> None:
@@ -66,48 +58,36 @@ class CertifyOptions:
         if self.policy.path is not None:
             find_policy(self.policy.path)
         require_new(self.output_dir, overwrite=self.overwrite)
-        self.env.config(self.robot.type or DEFAULT_ROBOT, self.task.type or DEFAULT_TASK)
+        self.env.config(self.robot.type, self.task.type)
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
-        env, policy = self._who()
-        from manip_il.data.atomic import exclusive
+        env, policy = self._env_and_policy()
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.certificate import FILE_NAME
         from manip_il.evaluation.certificate_table import certificate_lines
+        from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.seeding import stream_seeds
 
-        stream_seeds("certificate", self.cases, self.seed)  # numbers out of range are said before a folder is made
+        stream_seeds("certificate", self.cases, self.seed)  # refuses numbers out of range before a folder is made
         engine = Engine(self.workers, self.engine)
-        with exclusive(self.output_dir):
-            try:
-                prepare_output(self.output_dir, resume=False, overwrite=self.overwrite)
-            except FolderExistsError:
-                raise UsageError(f"{self.output_dir} exists already; replace it with --overwrite=true") from None
-            save_options(self.output_dir, self)
-            certificate = self._certify(engine, env, policy)
-            certificate.write(self.output_dir / FILE_NAME)
+        count = count_episodes(env, self.cases, policy)
+        with open_output(self) as folder:
+            with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
+                advance = bar.advance
+                certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
+            certificate.write(folder / FILE_NAME)
         for line in certificate_lines(certificate):
             say(line)
-        say(f"result: {self.output_dir / FILE_NAME}")
+        say(f"result: {folder / FILE_NAME}")
 
-    def _who(self) -> tuple[EnvConfig, Path | None]:
+    def _env_and_policy(self) -> tuple[EnvConfig, Path | None]:
         if self.policy.path is None:
-            return self.env.config(self.robot.type or DEFAULT_ROBOT, self.task.type or DEFAULT_TASK), None
+            return self.env.config(self.robot.type, self.task.type), None
         from manip_il.learn.checkpoint import read_meta
 
         path = find_policy(self.policy.path)
         meta = read_meta(path)
-        robot = self.robot.type or (meta.robot if meta else DEFAULT_ROBOT)
-        task = self.task.type or (meta.task if meta else DEFAULT_TASK)
-        env = self.env.config(robot, task, meta.fps if meta else DEFAULT_HZ)
+        env = self.env.config(self.robot.type, self.task.type, meta)
         check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
         return env, path
-
-    def _certify(self, engine: Engine, env: EnvConfig, policy: Path | None) -> Certificate:
-        from manip_il.evaluation.certify import certify, count_episodes
-
-        count = count_episodes(env, self.cases, policy)
-        with progress(count, f"certify {env.robot} {env.task}") as bar, engine:
-            advance = bar.advance
-            return certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)

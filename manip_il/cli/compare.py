@@ -1,56 +1,45 @@
-"""`manip-il compare`: compare two policies or runs on the same seeds, and how sure that is."""
+"""`manip-il compare`: two policies or runs on the same seeds, and the confidence in their difference."""
 
 from __future__ import annotations
 
-import functools
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import (
-    ENGINE_HELP,
-    WORKERS_HELP,
+from manip_il.cli.candidates import (
+    Candidate,
+    Source,
+    common_env,
+    limit_of,
+    match_seeds,
+    read_candidate,
+    require_candidate,
+)
+from manip_il.cli.common_options import (
     EnvGroup,
     MaybeRobotGroup,
     MaybeTaskGroup,
-    check_same_options,
-    command_line,
-    option,
-    save_options,
+    engine_option,
+    require_workers,
     trust_option,
-    warn,
+    workers_option,
 )
-from manip_il.cli.measure import TEST_EPISODES, Trial, check_policies, measured, rule_json
-from manip_il.cli.options import options_of, to_plain
-from manip_il.cli.paths import require_output, require_workers
-from manip_il.cli.progress import say
-from manip_il.cli.sides import Side, Source, common_env, limit_of, matched, read_side, require_side
-from manip_il.cli.suites import SUITE_HELP, require_suite
+from manip_il.cli.dagger import FREE
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
+from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.trials import SUITE_HELP, Trial, TrialGroup, require_suite
 from manip_il.errors import UsageError
-from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, Measured, require_same_episodes, write_json
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, require_same_episodes, write_json
 from manip_il.evaluation.rounds import Rule
+from manip_il.option import option
 
-if TYPE_CHECKING:
-    from manip_il.cli.stages import Stages
-    from manip_il.engine.engine import Engine
-
-REPORT_FILE = "report.html"
-FREE = ("workers", "engine", "output_dir", "trust")
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes or seconds (up to what every run reached; seconds of "
     "collecting and fitting), or an amount, as in labels:5000"
 )
-
-
-@dataclass
-class TrialGroup:
-    """`--eval.*`: what both sides are tested on."""
-
-    n_episodes: int = option(TEST_EPISODES, "test episodes, the same for both sides")
 
 
 @dataclass
@@ -62,8 +51,8 @@ class CompareOptions:
     """
 
     example: ClassVar[str] = "manip-il compare runs/cloning runs/dagger --at=labels --output_dir=runs/compare"
-    left: Path = field(metadata={"help": "one side", "positional": True})
-    right: Path = field(metadata={"help": "the other side", "positional": True})
+    left: Path = option(MISSING, "one side", positional=True)
+    right: Path = option(MISSING, "the other side", positional=True)
     checkpoint: Literal["best", "last"] = option("best", "of a run: best on validation, or the last round")
     at: str = option("end", AT_HELP)
     eval: TrialGroup = field(default_factory=TrialGroup)
@@ -72,10 +61,10 @@ class CompareOptions:
     task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
     seed: int = option(0, "shifts the stream of test seeds, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     trust: bool = trust_option()
-    output_dir: Path = field(default=Path("runs/compare"), metadata={"help": "folder of compare.json"})
+    output_dir: Path = option(Path("runs/compare"), "folder of compare.json")
     resume: bool = option(False, "continue an interrupted comparison")
     overwrite: bool = option(False, "replace an existing comparison")
 
@@ -85,7 +74,7 @@ class CompareOptions:
         if self.eval.n_episodes < 1:
             raise UsageError(f"--eval.n_episodes is {self.eval.n_episodes}; expected at least 1")
         for side in (self.left, self.right):
-            require_side(side)
+            require_candidate(side)
         if self.left.resolve() == self.right.resolve():
             raise UsageError(f"{self.left} is compared with itself; give two different ones")
         require_workers(self.workers)
@@ -95,29 +84,20 @@ class CompareOptions:
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         rule = Rule.parse(self.checkpoint, self.at)
-        left, right, lines = matched(read_side(self.left), read_side(self.right))
-        warn([*lines, *_unfinished((*left.sources, *right.sources))])
-        from manip_il.data.atomic import exclusive
-
-        with exclusive(self.output_dir):
-            self._run(rule, left, right)
-
-    def _run(self, rule: Rule, left: Side, right: Side) -> None:
-        limit = limit_of(rule, (*left.sources, *right.sources))
-        trial = self._trial((*left.sources, *right.sources), rule, limit)
-        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        if self.resume:
-            check_same_options(self.output_dir, self, FREE)
-        save_options(self.output_dir, self)
-        left_arm, right_arm = self._measure((left, right), rule, limit, trial)
-        comparison = Comparison(left_arm, right_arm)
-        content = comparison.to_json() | {"rule": rule_json(rule, limit), **_test_json(comparison)}
-        write_json(self.output_dir / FILE_NAME, content)
-        self._report(comparison, rule, limit)
+        left, right, lines = match_seeds(read_candidate(self.left), read_candidate(self.right))
+        sources = (*left.sources, *right.sources)
+        warn([*lines, *_unfinished(sources)])
+        limit = limit_of(rule, sources)
+        trial = self._trial(sources, rule, limit)
+        with open_output(self, FREE) as folder:
+            comparison = Comparison(*self._measure((left, right), rule, limit, trial))
+            content = comparison.to_json() | {"rule": rule_json(rule, limit), **_test_json(comparison)}
+            write_json(folder / FILE_NAME, content)
+            self._report(comparison, rule, limit)
         self._say(comparison, rule, limit)
 
     def _trial(self, sources: Sequence[Source], rule: Rule, limit: float | None) -> Trial | None:
-        """What is to be run; None where all is evaluated already. All that can be refused is refused here."""
+        """Return the test to run, checked; None where all is evaluated already."""
         from manip_il.seeding import stream_seeds
 
         results = [source for source in sources if source.result is not None]
@@ -126,34 +106,23 @@ class CompareOptions:
         if len(results) == len(sources):
             return None
         env = common_env(sources, self.env, self.robot.type, self.task.type)
-        policies = {source.name: source.chosen(rule, limit)[0] for source in sources if source.result is None}
+        policies = {source.name: source.select(rule, limit)[0] for source in sources if source.result is None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)
         for source in results:
-            trial.check_result(source.name, _result(source))
-        check_policies(trial, policies, self.output_dir, self.engine)
+            trial.check_result(source.name, source.evaluation)
+        trial.check_policies(policies, self.output_dir, self.engine)
         return trial
 
-    def _measure(self, sides: Sequence[Side], rule: Rule, limit: float | None, trial: Trial | None) -> list[Arm]:
-        from manip_il.cli.stages import Stages
+    def _measure(
+        self, candidates: Sequence[Candidate], rule: Rule, limit: float | None, trial: Trial | None
+    ) -> list[Arm]:
         from manip_il.engine.engine import Engine
 
         kept = f"every finished evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            return [
-                Arm(
-                    str(side.path),
-                    tuple(self._measured(one, rule, limit, trial, engine, stages) for one in side.sources),
-                )
-                for side in sides
-            ]
-
-    def _measured(
-        self, source: Source, rule: Rule, limit: float | None, trial: Trial | None, engine: Engine, stages: Stages
-    ) -> Measured:
-        if source.result is not None or trial is None:
-            return Measured(source.name, _result(source), source.path, source.training_seed)
-        return measured(source, rule, limit, trial, self.output_dir, engine, stages)
+            last = (rule, limit, trial, self.output_dir, engine, stages)
+            return [Arm(str(one.path), tuple(source.measure(*last) for source in one.sources)) for one in candidates]
 
     def _report(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
         from manip_il.evaluation.compare_report import CompareReport, compare_page
@@ -185,21 +154,16 @@ class CompareOptions:
         if None in policies:
             return "manip-il study --help  (does it hold for other training seeds?)"
         if self.suite == "nominal":
-            return self._disturbed()
+            output_dir = Path(f"{self.output_dir}_disturbed")
+            return command_line("compare", replace(self, suite="disturbed", output_dir=output_dir))
         loser = comparison.left if comparison.difference > 0 else comparison.right
         folder = f"--output_dir={self.output_dir}_films"
         return shlex.join(["manip-il", "eval", f"--policy.path={loser.members[0].policy}", "--eval.films=3", folder])
 
-    def _disturbed(self) -> str:
-        """This comparison once more, in a rougher world."""
-        places = {"left", "right", "suite", "output_dir", "resume", "overwrite"}
-        words = ["manip-il", "compare", str(self.left), str(self.right), "--suite=disturbed"]
-        words += [f"--output_dir={self.output_dir}_disturbed"]
-        for known in options_of(type(self)):
-            value = functools.reduce(getattr, known.name.split("."), self)
-            if known.name not in places and value != known.default:
-                words.append(f"--{known.name}={str(value).lower() if isinstance(value, bool) else value}")
-        return shlex.join(words)
+
+def rule_json(rule: Rule, limit: float | None) -> dict[str, Any]:
+    """Return the rule as `compare.json` and `study.json` hold it."""
+    return {"checkpoint": rule.checkpoint, "at": str(rule), "limit": limit}
 
 
 def _test_json(comparison: Comparison) -> dict[str, Any]:
@@ -225,12 +189,7 @@ def _require_same(left: Source, right: Source) -> None:
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.evaluation.results import compare_results
 
-    ours, theirs = _result(left), _result(right)
+    ours, theirs = left.evaluation, right.evaluation
     compare_results(ours, theirs, (left.name, right.name))
     require_same_episodes(left.name, ours, right.name, theirs)
     warn(compare_fingerprints(left.name, ours.fingerprint, right.name, theirs.fingerprint))
-
-
-def _result(source: Source) -> EvalResult:
-    assert source.result is not None
-    return source.result

@@ -9,51 +9,47 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
+from manip_il.algorithms.config import RunConfig, check_cameras, check_labels
+from manip_il.algorithms.sampling import Sampling
 from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
-from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
-from manip_il.cli.groups import (
-    ENGINE_HELP,
-    WORKERS_HELP,
-    EnvGroup,
+from manip_il.cli.common_options import (
+    EnvOptions,
     ImageGroup,
-    RobotGroup,
-    TaskGroup,
-    check_same_options,
-    command_line,
-    option,
+    engine_option,
     policy_help,
-    save_options,
-    start_policy,
+    require_workers,
+    seed_option,
     trust_option,
+    workers_option,
 )
-from manip_il.cli.options import Open, to_plain
-from manip_il.cli.paths import require_output, require_workers
-from manip_il.cli.progress import say
-from manip_il.learn.fit_config import BATCH_SIZE, MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, FitConfig
+from manip_il.cli.inputs import start_policy
+from manip_il.cli.options import Open, command_line, to_plain
+from manip_il.cli.outputs import (
+    CONFIG_FILE,
+    REPORT_FILE,
+    append_jsonl,
+    atomic_write,
+    open_output,
+    read_jsonl,
+    require_output,
+)
+from manip_il.cli.parsing import from_yaml
+from manip_il.cli.progress import Stages, say
+from manip_il.errors import ManipError
+from manip_il.learn.fit_config import MLP_STEPS, FitConfig
+from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.config import RunConfig
     from manip_il.algorithms.rounds import RoundResult
-    from manip_il.cli.stages import Stages
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report_data import LearningCurve, Report
 
-METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
-METHOD_HELP = f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
-FREE = ("workers", "engine", "output_dir", "trust")
+METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
+FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
 
 
 @dataclass
-class SamplingGroup:
-    """`--sampling.*`: how often frames are learnt from, relative to each other."""
-
-    demonstrations: float = option(1.0, "weight of a frame of round 0")
-    corrections: float = option(1.0, "weight of a later frame where the expert drove or would have acted differently")
-    rollouts: float = option(1.0, "weight of the other later frames")
-
-
-@dataclass
-class DaggerOptions:
+class DaggerOptions(EnvOptions):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
@@ -62,50 +58,42 @@ class DaggerOptions:
     """
 
     example: ClassVar[str] = "manip-il dagger --rounds=5 --episodes_per_round=50 --output_dir=runs/dagger"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
-    method: Method = field(default="dagger", metadata={"help": METHOD_HELP})
-    demonstrations: int = option(50, "successful expert episodes of round 0")
-    rounds: int = option(5, "DAgger rounds after round 0; a resumed run may have more")
-    episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
-    label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")
-    disturbed_share: float = option(
-        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
+    method: Method = option(
+        "dagger", f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
     )
+    demonstrations: int = option_of(RunConfig, "demonstrations")
+    rounds: int = option_of(RunConfig, "rounds", help_text="DAgger rounds after round 0; a resumed run may have more")
+    episodes_per_round: int = option_of(RunConfig, "episodes_per_round")
+    label_budget: int | None = option_of(RunConfig, "label_budget")
+    disturbed_share: float = option_of(RunConfig, "disturbed_share")
     beta: str = option("constant:0", "share of steps that the expert drives: constant:B, linear:ROUNDS, exponential:B")
-    label: Literal["per_state", "takeover", "branch"] = option(
-        "per_state",
-        "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
-    )
+    label: Literal["per_state", "takeover", "branch"] = option_of(RunConfig, "label")
     query: str | None = option(
         None,
         "when it is queried: every, one, probability:P, ensemble:BOUND, likelihood:NATS or safety:BOUND; "
         "by default every, for takeover one, for branch probability:1/STEPS",
     )
-    branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
-    ensemble: int = option(1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND")
-    sampling: SamplingGroup = field(default_factory=SamplingGroup)
-    policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
-    observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy observes besides its joints; by default images if it is cnn, else state"
-    )
-    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both, for a policy on images"})
+    branch_steps: int | None = option_of(RunConfig, "branch_steps")
+    ensemble: int = option_of(RunConfig, "ensemble")
+    sampling: Sampling = field(default_factory=Sampling)
+    policy: Open = option_of(FitConfig, "policy")
+    observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
+    cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
     image: ImageGroup = field(default_factory=ImageGroup)
-    refit: Literal["scratch", "warm"] = option("scratch", "how each round's policy starts")
+    refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
-    refit_steps: int | None = option(None, "gradient steps in later rounds, with --refit=warm; by default as many")
-    batch_size: int | None = option(None, f"frames per step; by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}")
-    lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
-    optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
-    scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
-    validation_episodes: int = option(200, "unseen episodes that choose the best round")
-    hold: int = option(10, "control steps of a rollout after success")
-    seed: int = option(0, "shifts every random stream, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    refit_steps: int | None = option_of(RunConfig, "refit_steps")
+    batch_size: int | None = option_of(FitConfig, "batch_size")
+    lr: float | None = option_of(FitConfig, "lr")
+    optimizer: Open = option_of(FitConfig, "optimizer")
+    scheduler: Open = option_of(FitConfig, "scheduler")
+    validation_episodes: int = option_of(RunConfig, "validation_episodes")
+    hold: int = option_of(RunConfig, "hold")
+    seed: int = seed_option()
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     trust: bool = trust_option()
-    output_dir: Path = field(default=Path("runs/dagger"), metadata={"help": "folder of the run"})
+    output_dir: Path = option(Path("runs/dagger"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
 
@@ -113,64 +101,46 @@ class DaggerOptions:
         """Refuse what paths and values show to be wrong."""
         require_workers(self.workers)
         require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
-        self._draft()
+        self._config()
 
     def run(self) -> None:
         """Run, or go on with, all rounds."""
         config = self.config()
-        from manip_il.data.atomic import exclusive
+        with open_output(self, FREE, may_grow="rounds") as folder:
+            from manip_il.engine.engine import Engine
+            from manip_il.evaluation.report import write_report
 
-        with exclusive(self.output_dir):
-            self._run(config)
-
-    def _run(self, config: RunConfig) -> None:
-        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        if self.resume:
-            check_same_options(self.output_dir, self, FREE, may_grow="rounds")
-        save_options(self.output_dir, self)
-        from manip_il.cli.stages import Stages
-        from manip_il.engine.engine import Engine
-        from manip_il.evaluation.report import write_report
-
-        kept = f"every finished episode and round, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            engine.warm_up(learned=True)
-            results = run_rounds(config, self.output_dir, engine, stages)
-        write_report(self.output_dir / REPORT_FILE, _report(self, config, results))
-        best = self.output_dir / "best" / "pretrained_model"
+            kept = f"every finished episode and round, in {folder}"
+            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+                engine.warm_up(learned=True)
+                results = run_rounds(config, folder, engine, stages)
+            write_report(folder / REPORT_FILE, _report(self, config, results))
+        best = folder / "best" / "pretrained_model"
         say(f"best policy: {best}")
-        say(f"all rounds' labels as one dataset: {self.output_dir / 'dataset'}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
-        say(f"next: manip-il eval --policy.path={best} --output_dir={self.output_dir}/test")
+        say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
+        say(f"report: {folder / REPORT_FILE}")
+        say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
-        """What `run_algorithm` takes. Raises `UsageError` for what does not go together."""
-        config = self._draft()
-        from manip_il.algorithms.config import check_labels
-
+        """Return what `run_algorithm` takes; `UsageError` for what does not go together."""
+        config = self._config()
         check_labels(config)
         return config
 
-    def _draft(self) -> RunConfig:
-        """The same, before the policy's own configuration has been made, which takes seconds to import."""
-        env = self.env.config(self.robot.type, self.task.type)
-        cameras = self.image.config(self.cameras)
+    def _config(self) -> RunConfig:
+        """Return the same before the policy's own configuration is checked, which takes seconds to import."""
         from manip_il.algorithms.beta import BetaSchedule
-        from manip_il.algorithms.config import RunConfig, check_cameras
-        from manip_il.algorithms.sampling import Sampling
         from manip_il.engine.drivers import QueryRule
 
-        made = {"env", "fit", "sampling", "cameras", "beta", "query_rule"}
-        own = {one.name for one in fields(RunConfig)} - made
-        config = RunConfig(
-            env=env,
-            fit=self._fit(),
-            sampling=Sampling(**to_plain(self.sampling)),
-            cameras=cameras,
-            beta=BetaSchedule.parse(self.beta),
-            query_rule=None if self.query is None else QueryRule.parse(self.query),
-            **{name: getattr(self, name) for name in own},
-        )
+        made = {
+            "env": self.env_config(),
+            "fit": self._fit(),
+            "cameras": self.image.config(self.cameras),
+            "beta": BetaSchedule.parse(self.beta),
+            "query_rule": None if self.query is None else QueryRule.parse(self.query),
+        }
+        own = {one.name: getattr(self, one.name) for one in fields(RunConfig) if one.name not in made}
+        config = RunConfig(**made, **own)
         check_cameras(config)
         check_method(config)
         return config
@@ -202,7 +172,7 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
 
 
 def _add_metrics(path: Path, result: RoundResult) -> None:
-    """Add the round's line, unless an earlier run has: what it took then is what is true."""
+    """Add the round's line, unless it is there from before an interruption, with the seconds of then."""
     if all(record.get("round") != result.round for record in read_jsonl(path)):
         append_jsonl(path, result.to_json())
 
@@ -245,9 +215,9 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
 
 
 def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
-    """Which round was taken, with its validation success, and whether it is shown to be better than round 0.
+    """Return which round is the best, its validation success, and whether it is shown to be better than round 0.
 
-    Where round 0 is the best itself, the last round takes its place. names: of the rounds.
+    Where round 0 is the best itself, it is compared with the last round. names: of the rounds.
     """
     from manip_il.algorithms.rounds import best_round
     from manip_il.evaluation.results import compare_results
@@ -267,15 +237,26 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
-    """Return validation success over labels, episodes and wall-clock, one point a round. name: what made the rounds."""
+    """Return validation success over labels, episodes and wall-clock, one point a round. name: of the algorithm."""
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.evaluation.rounds import curve_points, history
 
     return LearningCurve(dagger=curve_points(history(read_jsonl(folder / METRICS_FILE), str(folder))), name=name)
 
 
+def run_curve(policy: Path | None) -> LearningCurve | None:
+    """Return the learning curve of the DAgger run that a policy lies in; None where it lies in none."""
+    for folder in [] if policy is None else [policy, *policy.resolve().parents[:5]]:
+        if (folder / METRICS_FILE).is_file():
+            try:
+                return learning_curve(folder, ALGORITHMS[from_yaml(folder / CONFIG_FILE, DaggerOptions).method].title)
+            except (ManipError, KeyError):  # of another command, which counts no labels
+                return None
+    return None
+
+
 def round_timings(folder: Path) -> dict[str, float]:
-    """What each round's stages took [s], as the run that made them measured it."""
+    """Return what each round's stages took [s], from the run's metrics."""
     path = folder / METRICS_FILE
     return {
         f"round {record.get('round')}, {stage}": checks.number(f"{path}: {stage}", seconds, 0)

@@ -1,15 +1,15 @@
-"""`manip-il doctor DATASET`: what is wrong with a dataset, and what can be put right."""
+"""`manip-il doctor DATASET`: find what is wrong with a dataset, and repair it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.groups import option
-from manip_il.cli.paths import hub_hint, require_folder
+from manip_il.cli.inputs import hub_hint, require_folder
 from manip_il.cli.progress import progress, say
 from manip_il.errors import ManipError
+from manip_il.option import option
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,7 +30,7 @@ class DoctorOptions:
     """
 
     example: ClassVar[str] = "manip-il doctor datasets/demos"
-    dataset: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset", "positional": True})
+    dataset: Path = option(MISSING, "folder of a LeRobot v3.0 dataset", positional=True)
     repair: bool = option(False, "repair what can be repaired, and keep a copy")
 
     def check(self) -> None:
@@ -59,7 +59,7 @@ class DoctorOptions:
 
         findings: list[Finding] = []
         with progress(None, "files examined") as bar:
-            named = self.dataset.name not in ("", "..")  # what stands beside it has its name
+            named = self.dataset.name not in ("", "..")  # journals and copies beside it are named after it
             dataset = Dataset(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
             for finding in examine(dataset, (*CHECKS, check_robot)):
                 say(str(finding))
@@ -68,7 +68,7 @@ class DoctorOptions:
 
 
 def check_robot(dataset: Dataset) -> Iterator[Finding]:
-    """Joints and state are those of the robot and task as this program has them; so is the compiled model."""
+    """Compare joints, state and compiled model with those of the robot and task in this program."""
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS
     from manip_il.data.lerobot_read import read_fingerprint
@@ -95,7 +95,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         found, wanted = getattr(spec, what), getattr(here, what)
         if found != wanted:
             yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
-    # Of the rest, versions are compared already, and tolerance and horizon are not what a dataset says.
+    # Versions are compared elsewhere; tolerance and horizon are not part of a dataset.
     if _MODEL in fingerprint:
         theirs, ours = ({_MODEL: table[_MODEL]} for table in (fingerprint, env_fingerprint(env)))
         for text in compare_fingerprints("the dataset", theirs, "this program", ours):

@@ -8,56 +8,48 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import (
-    DEFAULT_HZ,
-    DEFAULT_ROBOT,
-    DEFAULT_TASK,
-    ENGINE_HELP,
-    WORKERS_HELP,
+from manip_il.cli.common_options import (
     EnvGroup,
     MaybeRobotGroup,
     MaybeTaskGroup,
-    check_same_options,
-    command_line,
-    find_policy,
-    option,
-    save_options,
+    engine_option,
+    require_workers,
+    seed_option,
     trust_option,
+    workers_option,
 )
-from manip_il.cli.kept_episodes import KeptEpisodes
-from manip_il.cli.options import to_plain
-from manip_il.cli.paths import require_output, require_workers
-from manip_il.cli.policy_check import check_policy, looks
-from manip_il.cli.progress import say
-from manip_il.cli.suites import SUITE_HELP, require_suite, suite_conditions
-from manip_il.errors import FolderExistsError, ManipError, UsageError
+from manip_il.cli.eval_files import EpisodeJournal
+from manip_il.cli.films import Pictures, Shot, condition_caption, film_shots
+from manip_il.cli.inputs import check_policy, find_policy, observation_text
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
+from manip_il.cli.progress import Stages, say
+from manip_il.cli.trials import SUITE_HELP, require_suite, suite_conditions
+from manip_il.errors import ManipError, UsageError
+from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.cli.shown import Shown
-    from manip_il.cli.stages import Stages
     from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
-    from manip_il.evaluation.results import EvalResult
-    from manip_il.learn.checkpoint import CheckpointMeta
-    from manip_il.sim.env import EnvConfig
+    from manip_il.evaluation.results import EpisodeResult, EvalResult
 
-REPORT_FILE = "report.html"
 EPISODES, MOST_EPISODES = 100, 10_000
+EPISODES_FILE = "episodes.jsonl"
+FILMS = "films"
 FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust")
 
 
 @dataclass
-class WhoGroup:
+class MeasuredPolicyGroup:
     """`--policy.*` of what is measured."""
 
-    path: Path | None = field(default=None, metadata={"help": "a checkpoint or a run"})
+    path: Path | None = option(None, "a checkpoint or a run")
     type: Literal["expert", "random"] | None = option(None, "instead of a checkpoint")
 
 
 @dataclass
 class EvalGroup:
-    """`--eval.*`: what is run."""
+    """`--eval.*`: the episodes to run."""
 
     n_episodes: int | None = option(
         None, f"episodes, each with its own seed; by default {EPISODES}, with until_width at most {MOST_EPISODES:,}"
@@ -74,60 +66,23 @@ class EvalOptions:
     """Measure a policy's success on unseen seeds; writes eval.json and report.html."""
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
-    policy: WhoGroup = field(default_factory=WhoGroup)
+    policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
     robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
     task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
     env: EnvGroup = field(default_factory=EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
     suite: str = option("nominal", SUITE_HELP)
     until_width: float | None = option(None, "stop when the interval is this narrow; 0.02 is 2 points")
-    seed: int = option(0, "shifts every random stream, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    seed: int = seed_option()
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     trust: bool = trust_option()
-    output_dir: Path = field(default=Path("runs/eval"), metadata={"help": "folder of eval.json"})
+    output_dir: Path = option(Path("runs/eval"), "folder of eval.json")
     resume: bool = option(False, "continue an interrupted evaluation, or add more episodes")
     overwrite: bool = option(False, "replace an existing evaluation")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        self._check()
-        self._seeds()
-        require_workers(self.workers)
-        if self.policy.path is not None:
-            find_policy(self.policy.path)
-        require_suite(self.suite)
-        require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
-        self._env(None)
-
-    def run(self) -> None:
-        """Run the episodes, write `eval.json` and `report.html`, print the table."""
-        self._check()
-        seeds = self._seeds()
-        from manip_il.engine.engine import Engine
-
-        engine = Engine(self.workers, self.engine)
-        job = self._job(engine, len(seeds))
-        with contextlib.ExitStack() as held:
-            self._prepare(held)
-            self._run(job, seeds, engine)
-
-    def _run(self, job: RolloutJob, seeds: range, engine: Engine) -> None:
-        from manip_il.cli.stages import Stages
-        from manip_il.evaluation.results import FILE_NAME
-
-        kept = KeptEpisodes.open(self.output_dir, job, self.suite, str(self.output_dir))
-        with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
-            result = self._evaluate(job, seeds, engine, kept, stages)
-            result.write(self.output_dir / FILE_NAME)
-            self._say(result)
-            shown = self._show(job, result, engine, stages)
-        self._report(result, shown)
-        say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
-        say(f"next: {self._next(result)}")
-
-    def _check(self) -> None:
         if (self.policy.path is None) == (self.policy.type is None):
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
         for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("hold", 0), ("batch_size", 1)):
@@ -136,6 +91,34 @@ class EvalOptions:
                 raise UsageError(f"--eval.{name} is {value}; expected at least {lowest}")
         if self.until_width is not None and not 0 < self.until_width < 1:
             raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
+        self._seeds()
+        require_workers(self.workers)
+        if self.policy.path is not None:
+            find_policy(self.policy.path)
+        require_suite(self.suite)
+        require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
+        self.env.config(self.robot.type, self.task.type)
+
+    def run(self) -> None:
+        """Run the episodes, write `eval.json` and `report.html`, print the table."""
+        from manip_il.engine.engine import Engine
+        from manip_il.evaluation.results import FILE_NAME
+
+        seeds = self._seeds()
+        engine = Engine(self.workers, self.engine)
+        job = self._job(engine, len(seeds))
+        with contextlib.ExitStack() as held:
+            self._prepare(held)
+            journal = EpisodeJournal.open(self.output_dir, job, self.suite)
+            with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
+                result = self._evaluate(job, seeds, engine, journal, stages)
+                result.write(self.output_dir / FILE_NAME)
+                self._say(result)
+                pictures = self._film(job, result, engine, stages)
+            self._report(result, pictures)
+        say(f"result: {self.output_dir / FILE_NAME}")
+        say(f"report: {self.output_dir / REPORT_FILE}")
+        say(f"next: {self._next(result)}")
 
     def _seeds(self) -> range:
         from manip_il.seeding import stream_seeds
@@ -150,24 +133,23 @@ class EvalOptions:
         path = None if self.policy.path is None else find_policy(self.policy.path)
         self._check_memory(path, episodes)
         if episodes > 1:
-            engine.warm_up(learned=path is not None)  # while the policy is looked at here
-        if path is None:
-            env, driver, cameras = self._env(None), self.policy.type, None
-        else:
+            engine.warm_up(learned=path is not None)  # while the policy is checked here
+        meta = cameras = None
+        if path is not None:
             from manip_il.learn.checkpoint import read_meta
 
-            driver = "policy"
             meta = read_meta(path)
-            env = self._env(meta)
+        env = self.env.config(self.robot.type, self.task.type, meta)
+        if path is not None:
             cameras = check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:
-                say(looks(cameras, path))
+                say(observation_text(cameras, path))
         conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
-        job = RolloutJob(env, driver or "random", policy=path, label="last", conditions=conditions)
+        job = RolloutJob(env, self.policy.type or "policy", policy=path, label="last", conditions=conditions)
         return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
-        """Before anything large is loaded; on a cluster memory is its own affair."""
+        """Raise where memory is too small, before anything large is loaded; a Ray cluster checks for itself."""
         from manip_il.engine.engine import default_workers
         from manip_il.engine.local import check_memory
 
@@ -182,25 +164,10 @@ class EvalOptions:
         weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
         check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)
 
-    def _env(self, meta: CheckpointMeta | None) -> EnvConfig:
-        robot = self.robot.type or (meta.robot if meta else DEFAULT_ROBOT)
-        task = self.task.type or (meta.task if meta else DEFAULT_TASK)
-        return self.env.config(robot, task, meta.fps if meta else DEFAULT_HZ)
-
     def _prepare(self, held: contextlib.ExitStack) -> None:
         """Make the folder, before the first episode, and hold it for as long as `held` is open."""
-        from manip_il.data.atomic import exclusive
-
         try:
-            held.enter_context(exclusive(self.output_dir))
-            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-            if self.resume:
-                check_same_options(self.output_dir, self, FREE, may_grow="eval.n_episodes")
-            save_options(self.output_dir, self)
-        except FolderExistsError:
-            raise UsageError(
-                f"{self.output_dir} exists already; continue with --resume=true, or replace it with --overwrite=true"
-            ) from None
+            held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
         except OSError as error:
             raise ManipError(
                 f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
@@ -208,16 +175,15 @@ class EvalOptions:
             ) from error
 
     def _evaluate(
-        self, job: RolloutJob, seeds: range, engine: Engine, kept: KeptEpisodes, stages: Stages
+        self, job: RolloutJob, seeds: range, engine: Engine, journal: EpisodeJournal, stages: Stages
     ) -> EvalResult:
-        from manip_il.evaluation.results import EpisodeResult
         from manip_il.evaluation.runner import evaluate
 
-        done = kept.results(seeds)
+        done = journal.results(seeds)
         stages.start(f"evaluate {self._name()}", len(seeds) - len(done))
 
         def keep(result: EpisodeResult) -> None:
-            kept.add(result)
+            journal.add(result)
             stages.episode(result)
 
         result = evaluate(
@@ -226,13 +192,24 @@ class EvalOptions:
         stages.close()
         return result
 
-    def _show(self, job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages) -> Shown:
-        from manip_il.cli.shown import show
+    def _film(self, job: RolloutJob, result: EvalResult, engine: Engine, stages: Stages) -> Pictures:
+        """Run the first failures and as many successes again and film them, also into `films/`."""
+        outcomes = [[one.seed for one in result.episodes if one.success == good] for good in (False, True)]
+        seeds = [seed for found in outcomes for seed in found[: self.eval.films]]
+        if not seeds:
+            return Pictures()
+        stages.start("films", len(seeds))
+        episodes = {episode.seed: episode for episode in engine.run(replace(job, label="last"), seeds)}
+        filmed = [episodes[seed] for seed in seeds]
+        shots = [Shot(job, one, condition_caption(job, one), success=one.success) for one in filmed]
+        pictures = film_shots(shots, stages)
+        for film, episode in zip(pictures.films, filmed, strict=False):  # no films without OpenGL
+            outcome = "success" if episode.success else "failure"
+            atomic_write(self.output_dir / FILMS / f"seed_{episode.seed}_{outcome}.mp4", film.mp4)
+        return pictures
 
-        return show(job, result, engine, stages, self.eval.films, self.output_dir)
-
-    def _report(self, result: EvalResult, shown: Shown) -> None:
-        from manip_il.cli.shown import run_curve
+    def _report(self, result: EvalResult, pictures: Pictures) -> None:
+        from manip_il.cli.dagger import run_curve
         from manip_il.evaluation.eval_report import EvalReport, eval_page
         from manip_il.evaluation.report import write_page
 
@@ -240,9 +217,9 @@ class EvalOptions:
             result,
             command=command_line("eval", self),
             config=to_plain(self),
-            films=shown.films,
-            paths=shown.paths,
-            pictures_note=shown.note,
+            films=pictures.films,
+            paths=pictures.paths,
+            pictures_note=pictures.note,
             curve=run_curve(self.policy.path),
         )
         write_page(self.output_dir / REPORT_FILE, eval_page(report))

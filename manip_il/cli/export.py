@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from manip_il.cli.folders import atomic_write
-from manip_il.cli.groups import find_policy, option, warn
-from manip_il.cli.progress import say
+from manip_il.cli.inputs import find_policy
+from manip_il.cli.outputs import atomic_write
+from manip_il.cli.progress import say, warn
 from manip_il.errors import ManipError, UsageError
+from manip_il.option import option
 
 EXPORTABLE = ("mlp", "cnn")
 SUFFIXES = {"onnx": ".onnx", "torchscript": ".pt"}
@@ -27,9 +28,9 @@ class ExportOptions:
     """
 
     example: ClassVar[str] = "manip-il export runs/dagger --format=onnx --output=policy.onnx"
-    policy: Path = field(metadata={"help": "a run, a checkpoint or a pretrained_model folder", "positional": True})
+    policy: Path = option(MISSING, "a run, a checkpoint or a pretrained_model folder", positional=True)
     format: Literal["onnx", "torchscript"] = option("onnx", "for onnxruntime and others, or for torch alone")
-    output: Path | None = field(default=None, metadata={"help": "the file; by default policy.onnx or policy.pt"})
+    output: Path | None = option(None, "the file; by default policy.onnx or policy.pt")
     overwrite: bool = option(False, "replace an existing file")
 
     def run(self) -> None:
@@ -73,5 +74,8 @@ class ExportOptions:
 
 def _lines(metadata: Mapping[str, Any]) -> list[str]:
     """The file's inputs and outputs, a line each."""
-    sides = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
-    return [f"{side:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})" for side, one in sides]
+    tensors = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
+    return [
+        f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})"
+        for direction, one in tensors
+    ]

@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.groups import DEFAULT_ROBOT, DEFAULT_TASK
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, RenderError
 
@@ -37,7 +36,7 @@ class HealthOptions:
     example: ClassVar[str] = "manip-il health"
 
     def run(self) -> None:
-        """Check everything, the most frequent trouble first."""
+        """Check everything, the most frequent fault first."""
         check_backend(os.environ.get("MUJOCO_GL"))
         check_temporary_folder()
         check_shared_memory()
@@ -45,7 +44,7 @@ class HealthOptions:
         from manip_il.engine.engine import default_workers
         from manip_il.engine.local import available_memory
 
-        # How little is free is no fault: a health check runs beside the evaluation that has taken the rest.
+        # Little free memory is no fault: an evaluation may be running that uses the rest.
         free = available_memory()
         memory = "memory unknown" if free is None else f"{free / 1e9:.1f} GB of memory free"
         say(f"healthy: {drawing}; {describe_torch()}; {memory}; cores {default_workers()}")
@@ -70,7 +69,7 @@ def check_temporary_folder() -> None:
             "or set TMPDIR"
         ) from error
     home = Path(tempfile.gettempdir())
-    if home == Path.cwd():  # Python's last resort, where none of the usual places is writable
+    if home == Path.cwd():  # Python's fallback, where none of the usual folders is writable
         raise ManipError(f"temporary files would go into {home}; make /tmp writable (docker run --tmpfs /tmp)")
 
 
@@ -83,7 +82,7 @@ def check_shared_memory() -> None:
 
 
 def check_pictures(pictures: Mapping[str, Picture]) -> None:
-    """Raise `RenderError` for a picture that shows nothing: a driver may draw without an error, and draw nothing."""
+    """Raise `RenderError` for a blank picture, which some drivers draw without an error."""
     for camera, picture in pictures.items():
         colours = len({tuple(pixel) for pixel in picture.reshape(-1, 3).tolist()})
         if colours < _FEWEST_COLOURS:
@@ -94,7 +93,7 @@ def check_pictures(pictures: Mapping[str, Picture]) -> None:
 
 
 def _draw() -> str:
-    """Draw and time the default scene; what draws, and how fast."""
+    """Draw and time the default scene; return renderer and speed."""
     from manip_il.sim.env import ManipEnv
     from manip_il.sim.look import CameraConfig
     from manip_il.sim.render import pictures
@@ -103,7 +102,7 @@ def _draw() -> str:
     world.start(0)
 
     def draw() -> Mapping[str, Picture]:
-        return pictures(DEFAULT_ROBOT, DEFAULT_TASK, world.data, cameras)
+        return pictures(world.config.robot, world.config.task, world.data, cameras)
 
     check_pictures(draw())
     begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: finish the step in hand, keep what is there, say how to go on."""
+"""Ctrl-C and SIGTERM: finish the current step, keep what is done, print how to resume."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MESSAGE = b"\nstopping after the step in hand (Ctrl-C again to stop at once)\n"
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user stopped a command in good order (exit code 130).
+    """Raised where the user has stopped a command between two steps (exit code 130).
 
     kept: what is safe on disk, as in `12 of 50 episodes in datasets/x`. resume_command: the whole command to go on
     with; by default the one that was given, with `--resume=true`. No `ManipError`, so that code which outlives
@@ -79,7 +79,7 @@ class StopRequest:
 
     @staticmethod
     def _in_worker(number: int) -> None:
-        """A forked worker inherits the handlers: Ctrl-C is its parent's affair, SIGTERM means to die."""
+        """Handle a signal in a forked worker, which inherits the handlers: ignore Ctrl-C, die of SIGTERM."""
         if number == signal.SIGTERM:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple, NoReturn
 from manip_il import __version__
 from manip_il.cli import progress
 from manip_il.cli.interrupt import Interrupted, resume_command
-from manip_il.cli.options import Option, options_of, parse, to_plain
-from manip_il.cli.values import metavar
+from manip_il.cli.options import Option, metavar, options_of, word
+from manip_il.cli.parsing import parse
 from manip_il.errors import ManipError, UnknownName, UsageError
 
 PROGRAM = "manip-il"
@@ -41,21 +41,23 @@ class Command(NamedTuple):
 COMMANDS = {
     "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
     "render": Command(
-        "manip_il.cli.render:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
+        "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
     ),
-    "build": Command("manip_il.cli.build:BuildOptions", "rebuild a dataset from its journals"),
+    "build": Command("manip_il.cli.record:BuildOptions", "rebuild a dataset from its journals"),
     "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
     "dagger": Command("manip_il.cli.dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),
     "eval": Command("manip_il.cli.evaluate:EvalOptions", "measure a policy's success on unseen seeds"),
-    "replay": Command("manip_il.cli.replay:ReplayOptions", "run one episode of an evaluation again, and film it"),
-    "merge": Command("manip_il.cli.merge:MergeOptions", "merge parts of an evaluation from several machines"),
+    "replay": Command("manip_il.cli.eval_files:ReplayOptions", "run one episode of an evaluation again, and film it"),
+    "merge": Command("manip_il.cli.eval_files:MergeOptions", "merge parts of an evaluation from several machines"),
     "compare": Command("manip_il.cli.compare:CompareOptions", "compare two policies or runs on the same seeds"),
     "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
     "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
-    "push": Command("manip_il.cli.push:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"),
-    "pull": Command("manip_il.cli.pull:PullOptions", "download a dataset or policy, every file verified"),
+    "push": Command(
+        "manip_il.cli.push_pull:PushOptions", "upload a dataset or policy to the Hub, S3, SFTP or a folder"
+    ),
+    "pull": Command("manip_il.cli.push_pull:PullOptions", "download a dataset or policy, every file verified"),
     "export": Command("manip_il.cli.export:ExportOptions", "export a policy as ONNX or TorchScript"),
     "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
     "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
@@ -225,7 +227,7 @@ def _commands(names: Collection[str]) -> str:
 
 
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
-    """words: all that was asked, as a command may tell more of a choice (`more_help`)."""
+    """Help of one command. words: all that was given, as some have help for a choice, too (`more_help`)."""
     options = options_of(cls)
     places = "".join(f" {option.label}" for option in options if option.positional)
     rows = [_row(option) for option in options]
@@ -235,15 +237,9 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     example = getattr(cls, "example", "")
     more = cls.more_help(words) if hasattr(cls, "more_help") else ""
     return (
-        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{_description(name, cls)}\n\n"
+        f"usage: {PROGRAM} {name}{places} [--option=value ...]\n\n{inspect.getdoc(cls)}\n\n"
         f"options:\n{lines}{more}\n\n{_GLOBAL_HELP}" + (f"\n\nexample: {example}" if example else "")
     )
-
-
-def _description(name: str, cls: type) -> str:
-    text = inspect.cleandoc(cls.__doc__ or "")
-    generated = text.startswith(f"{cls.__name__}(")  # what `dataclass` makes up where there is no docstring
-    return COMMANDS[name].summary if generated or not text else text
 
 
 def _row(option: Option) -> tuple[str, str]:
@@ -254,14 +250,9 @@ def _row(option: Option) -> tuple[str, str]:
 def _default_text(option: Option) -> str:
     if option.default is MISSING:
         return "required"
-    if option.is_open:
+    if option.is_open or option.default is None or option.default == []:
         return "none"
-    value = to_plain(option.default)
-    if isinstance(value, list):
-        return ",".join(map(str, value)) or "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "none" if value is None else str(value) or "empty"
+    return word(option.default) or "empty"
 
 
 def _stdout_is_gone() -> bool:

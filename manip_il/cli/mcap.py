@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import option, save_options
-from manip_il.cli.paths import require_dataset, require_new
+from manip_il.cli.inputs import require_dataset
+from manip_il.cli.outputs import prepare_output, require_new, save_options
 from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
+from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.mcap.importing import Import
@@ -27,8 +27,8 @@ class McapExportOptions:
     """
 
     example: ClassVar[str] = "manip-il mcap export datasets/demos demos_mcap"
-    dataset: Path = field(metadata={"help": "the dataset's folder", "positional": True})
-    out: Path = field(metadata={"help": "folder for the files", "positional": True})
+    dataset: Path = option(MISSING, "the dataset's folder", positional=True)
+    out: Path = option(MISSING, "folder for the files", positional=True)
     overwrite: bool = option(False, "replace an existing export")
 
     def check(self) -> None:
@@ -66,9 +66,9 @@ class McapImportOptions:
     """
 
     example: ClassVar[str] = "manip-il mcap import demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
-    source: Path = field(metadata={"help": "an MCAP file, or a folder of them", "positional": True})
-    dataset: Path = field(metadata={"help": "folder for the dataset", "positional": True})
-    mapping: Path = field(metadata={"help": "YAML: columns in terms of topics (see configs/mcap/panda.yaml)"})
+    source: Path = option(MISSING, "an MCAP file, or a folder of them", positional=True)
+    dataset: Path = option(MISSING, "folder for the dataset", positional=True)
+    mapping: Path = option(MISSING, "YAML: columns in terms of topics (see configs/mcap/panda.yaml)")
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""

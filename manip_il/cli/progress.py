@@ -1,12 +1,19 @@
-"""How far long work has come: a bar on a terminal, a line every few seconds elsewhere, both on standard error."""
+"""Output of commands: lines, warnings, and progress (a bar on a terminal, else a line every few seconds)."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from typing import Any, Protocol
+from collections.abc import Callable, Generator, Iterable
+from contextlib import ExitStack, contextmanager
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Protocol
+
+from manip_il.cli.interrupt import Interrupted, StopRequest
+from manip_il.errors import ManipError, UsageError
+
+if TYPE_CHECKING:
+    from manip_il.algorithms.run import Watch
 
 INTERVAL = 5.0  # [s] between plain lines
 _UNITS = ("B", "kB", "MB", "GB", "TB")
@@ -15,10 +22,10 @@ _quiet = False
 
 
 class Progress(Protocol):
-    """What `progress` hands out."""
+    """Display of work under way."""
 
     def advance(self, n: int = 1, **fields: object) -> None:
-        """`n` more are done; `fields` (loss=0.12, success=0.9) replace those shown so far."""
+        """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
         ...
 
 
@@ -29,13 +36,19 @@ def set_quiet(quiet: bool) -> None:
 
 
 def say(line: str) -> None:
-    """A line of normal output, on standard output."""
+    """Print a line of normal output, on standard output."""
     print(line, flush=True)
+
+
+def warn(lines: Iterable[str]) -> None:
+    """Print warnings on standard error, one line each."""
+    for line in lines:
+        print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(total: int | None, description: str, *, of_bytes: bool = False) -> Generator[Progress]:
-    """Show the progress of `total` steps (None where nobody knows), or bytes, while the `with` lasts."""
+    """Show the progress of `total` steps (None where the number is unknown), or bytes, while the `with` lasts."""
     if _quiet:
         yield _Silent()
     elif sys.stderr.isatty():
@@ -62,7 +75,7 @@ class _Lines:
         self._done = 0
         self._fields: dict[str, object] = {}
         self._start = self._printed = time.monotonic()
-        self._fresh = True  # something to say since the last line
+        self._fresh = True  # advanced since the last line
 
     def advance(self, n: int = 1, **fields: object) -> None:
         self._done += n
@@ -96,7 +109,6 @@ class _Bar:
 
 @contextmanager
 def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]:
-    # Imported here: `manip-il --help` needs none of it.
     from rich import progress as rich_progress
     from rich.console import Console
 
@@ -114,7 +126,7 @@ def _bar(total: int | None, description: str, of_bytes: bool) -> Generator[_Bar]
 
 
 def bytes_text(count: float) -> str:
-    """As people read it: `1.2 GB`."""
+    """Return a number of bytes as people read it: `1.2 GB`."""
     unit = 0
     while count >= 999.5 and unit < len(_UNITS) - 1:
         count, unit = count / 1000, unit + 1
@@ -129,3 +141,89 @@ def _fields_text(fields: dict[str, object]) -> str:
     return ", ".join(
         f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in fields.items()
     )
+
+
+class Outcome(Protocol):
+    """An episode that has ended, or its result."""
+
+    @property
+    def success(self) -> bool:
+        """Whether the task was solved at some time."""
+        ...
+
+
+class Stages:
+    """One progress bar at a time; use as a context manager. A stop request takes effect at the next step.
+
+    kept: what is safe on disk, for the message to the user, also where the work fails.
+    """
+
+    def __init__(self, kept: str):
+        self.kept = kept
+        self._stop = StopRequest()
+        self._open = ExitStack()
+        self._bar: Progress | None = None
+        self._done = self._solved = 0
+
+    def __enter__(self) -> Stages:
+        self._stop.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+        self._stop.__exit__(kind, error, trace)
+        if isinstance(error, ManipError) and not isinstance(error, UsageError):
+            error.args = (f"{error}; kept: {self.kept}; continue with --resume=true",)
+
+    def start(self, description: str, total: int) -> None:
+        """Close the bar of the stage before and open one of `total` episodes or steps."""
+        self.close()
+        self.check()
+        self._done = self._solved = 0
+        self._bar = self._open.enter_context(progress(total, description))
+
+    def close(self) -> None:
+        """Close the bar."""
+        self._open.close()
+        self._bar = None
+
+    def episode(self, episode: Outcome) -> None:
+        """Count an episode that has ended."""
+        self._done += 1
+        self._solved += episode.success
+        if self._bar is not None:
+            self._bar.advance(success=self._solved / self._done)
+        self.check()
+
+    def step(self) -> None:
+        """Count a step that is done."""
+        if self._bar is not None:
+            self._bar.advance()
+        self.check()
+
+    def log(self, record: dict[str, Any]) -> None:
+        """Show a fit's metrics at a step; {} where there are none."""
+        if not record:
+            self.check()
+            return
+        if self._bar is not None:
+            self._bar.advance(record["step"] - self._done, loss=record["loss"])
+        self._done = record["step"]
+        self.check()
+
+    def check(self) -> None:
+        """Raise `Interrupted` where the user has asked to stop."""
+        if self._stop.requested:
+            raise Interrupted(self.kept)
+
+    def watch(self) -> Watch:
+        """Return the callbacks that a run of an algorithm reports to."""
+        from manip_il.algorithms.run import Watch
+
+        return Watch(
+            on_stage=lambda stage, round_, total: self.start(f"round {round_}, {stage}", total),
+            on_episode=self.episode,
+            on_log=self.log,
+        )

@@ -4,49 +4,61 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.cli.dagger import FREE, REPORT_FILE, DaggerOptions, learning_curve, round_timings, run_rounds
-from manip_il.cli.folders import atomic_write, prepare_output
-from manip_il.cli.groups import (
-    ENGINE_HELP,
-    WORKERS_HELP,
-    EnvGroup,
-    PolicyGroup,
-    RobotGroup,
-    TaskGroup,
-    check_same_options,
-    command_line,
-    option,
-    save_options,
-    warn,
+from manip_il.algorithms.config import RunConfig
+from manip_il.cli.common_options import (
+    EnvOptions,
+    engine_option,
+    seed_option,
+    workers_option,
 )
-from manip_il.cli.options import to_plain
-from manip_il.cli.paths import require_output
-from manip_il.cli.progress import say
-from manip_il.errors import UsageError
+from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timings, run_rounds
+from manip_il.cli.films import Pictures, Shot, film_shots
+from manip_il.cli.options import Open, command_line, to_plain
+from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
+from manip_il.cli.progress import Stages, say
+from manip_il.cli.trials import Trial, suite_conditions
+from manip_il.errors import UnknownName, UsageError
+from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.config import RunConfig
     from manip_il.algorithms.rounds import RoundResult
-    from manip_il.cli.stages import Stages
-    from manip_il.cli.story import Contestant, Pictures
     from manip_il.engine.engine import Engine
-    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.report_data import Kind, PolicyRow, Report
     from manip_il.evaluation.results import EvalResult
 
-    Measured = dict[str, dict[str, EvalResult]]
-
+POLICY_TYPES = ("mlp",)
 TIMINGS_FILE = "timings.json"
+SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}  # by the folder of the evaluations
 
 
 @dataclass
-class QuickstartOptions:
+class PolicyGroup:
+    """`--policy.*` of the mlp that is fitted."""
+
+    type: str = option("mlp", "the policy; `manip-il train` trains every other LeRobot policy")
+    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
+    width: int = option(256, "units per layer")
+    depth: int = option(3, "hidden layers")
+
+    def settings(self) -> Open:
+        """Return them as `--policy.*` of `manip-il train`; `UsageError` for another type."""
+        if self.type not in POLICY_TYPES:
+            raise UsageError(
+                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) are trained by "
+                "manip-il train and manip-il dagger, with --policy.type=..."
+            )
+        return to_plain(self)
+
+
+@dataclass
+class QuickstartOptions(EnvOptions):
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
@@ -54,25 +66,20 @@ class QuickstartOptions:
     """
 
     example: ClassVar[str] = "manip-il quickstart --output_dir=runs/quickstart"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
-    demonstrations: int = option(100, "successful expert episodes to begin with")
-    rounds: int = option(3, "of DAgger")
-    episodes_per_round: int = option(50, "rollouts per round")
-    disturbed_share: float = option(
-        0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
-    )
+    demonstrations: int = option_of(RunConfig, "demonstrations", 100)
+    rounds: int = option_of(RunConfig, "rounds", 3)
+    episodes_per_round: int = option_of(RunConfig, "episodes_per_round", help_text="rollouts per round")
+    disturbed_share: float = option_of(RunConfig, "disturbed_share")
     policy: PolicyGroup = field(default_factory=PolicyGroup)
     steps: int = option(3_000, "gradient steps per fit")
     batch_size: int = option(512, "frames per step")
-    validation_episodes: int = option(100, "unseen episodes that choose the best round")
+    validation_episodes: int = option_of(RunConfig, "validation_episodes", 100)
     test_episodes: int = option(200, "unseen test episodes, used for no choice")
     disturbed_episodes: int = option(100, "the first of them again, disturbed")
-    seed: int = option(0, "shifts every random stream, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
-    output_dir: Path = field(default=Path("runs/quickstart"), metadata={"help": "folder of the run"})
+    seed: int = seed_option()
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
+    output_dir: Path = option(Path("runs/quickstart"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
 
@@ -88,47 +95,48 @@ class QuickstartOptions:
         """Run what is not there yet, print the table, write the report."""
         started = time.monotonic()
         config = self._dagger().config()
-        from manip_il.data.atomic import exclusive
+        with open_output(self, FREE) as folder:
+            from manip_il.engine.engine import Engine
 
-        with exclusive(self.output_dir):
-            self._run(config, started)
-
-    def _run(self, config: RunConfig, started: float) -> None:
-        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-        if self.resume:
-            check_same_options(self.output_dir, self, FREE)
-        save_options(self.output_dir, self)
-        from manip_il.cli.stages import Stages
-        from manip_il.engine.engine import Engine
-
-        kept = f"every finished episode, round and evaluation, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            engine.warm_up(learned=True)
-            story = _Story(self, config, engine, stages)
-            story.add_time("start", time.monotonic() - started)
-            story.tell()
+            kept = f"every finished episode, round and evaluation, in {folder}"
+            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+                engine.warm_up(learned=True)
+                quickstart = _Quickstart(self, config, engine, stages)
+                quickstart.add_time("start", time.monotonic() - started)
+                quickstart.run()
 
     def _dagger(self) -> DaggerOptions:
-        """Of the rounds."""
+        """Return the options of the DAgger run."""
         shared = ("robot", "task", "env", "demonstrations", "rounds", "episodes_per_round", "steps")
         shared += ("disturbed_share", "batch_size", "validation_episodes", "seed")
         same = {name: getattr(self, name) for name in shared}
         return DaggerOptions(**same, policy=self.policy.settings(), workers=self.workers)
 
 
-class _Story:
-    """One run of the quickstart, chapter by chapter."""
+@dataclass(frozen=True)
+class Contestant:
+    """One policy of the comparison; None is the expert. labels: expert labels that it learnt from."""
+
+    key: str  # its folder
+    name: str
+    kind: Kind
+    policy: Path | None = None
+    labels: int | None = None
+
+
+class _Quickstart:
+    """One run of the quickstart: its parts one after the other, each of which skips what is done."""
 
     def __init__(self, options: QuickstartOptions, config: RunConfig, engine: Engine, stages: Stages) -> None:
         self.options, self.config, self.engine, self.stages = options, config, engine, stages
         self.folder = options.output_dir
         path = self.folder / TIMINGS_FILE
-        self.timings = _read_timings(path) if path.is_file() else {}
+        self.timings = read_timings(path) if path.is_file() else {}
 
-    def tell(self) -> None:
-        """Every chapter, then table and report."""
-        from manip_il.cli.story import picture, telling_seed
+    def run(self) -> None:
+        """Run every part, then print the table and write the report."""
         from manip_il.evaluation.report import write_report
+        from manip_il.evaluation.report_data import format_seconds
         from manip_il.evaluation.terminal import print_results
 
         with self._timed("demonstrations and DAgger"):
@@ -138,84 +146,98 @@ class _Story:
         with self._timed("evaluations"):
             measured = self._measure(contestants)
         with self._timed("films"):
-            _, cloned, _, dagger = contestants
-            seed = telling_seed(measured["nominal"][cloned.key], measured["nominal"][dagger.key])
-            pictures = picture(contestants, self.config.env, seed, self.stages)
-        if pictures.note:
-            warn([f"the report shows paths in place of films: {pictures.note}"])
-        report = self._report(results, contestants, measured, pictures)
+            pictures = self._film(contestants, measured["nominal"])
+        report = self._report(contestants, measured, pictures)
         write_report(self.folder / REPORT_FILE, report)
         print_results(report.rows)
         for sentence in (report.verdict, *report.facts):
             say(sentence)
-        self._close(dagger)
+        say(f"took {format_seconds(sum(self.timings.values()))} in all")
+        say(f"report: {self.folder / REPORT_FILE}")
+        say(
+            f"next: manip-il eval --policy.path={contestants[-1].policy} --eval.films=3 --output_dir={self.folder}_eval"
+        )
 
-    def _contestants(self, results: list[RoundResult]) -> tuple[Contestant, ...]:
+    def _contestants(self, results: list[RoundResult]) -> list[Contestant]:
         from manip_il.algorithms.rounds import best_round
-        from manip_il.algorithms.run import round_folder
-        from manip_il.cli.story import Contestant, clone_with_labels
+        from manip_il.cli.cloning_baseline import clone_with_labels
 
         first, best = results[0], best_round(results)
-        round_0 = round_folder(self.folder / "dagger", 0)
         policy, labels = clone_with_labels(
-            self.config, results[-1].labels, round_0, self.folder / "cloning", self.engine, self.stages
+            self.config, results[-1].labels, self.folder / "dagger", self.folder / "cloning", self.engine, self.stages
         )
-        return (
+        return [
             Contestant("expert", "expert", "expert"),
             Contestant("cloned", "cloning", "cloning", first.policy, first.labels),
             Contestant("cloned_more", "cloning, as many labels", "cloning", policy, labels),
             Contestant("dagger", f"DAgger (round {best.round})", "dagger", best.policy, best.labels),
-        )
+        ]
 
-    def _measure(self, contestants: tuple[Contestant, ...]) -> Measured:
-        from manip_il.cli.story import measure
+    def _trial(self, folder: str, seeds: range) -> Trial:
+        suite = SUITES[folder]
+        return Trial(self.config.env, seeds, suite, suite_conditions(suite, self.config.env.task, sees=False))
+
+    def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
+        """Return folder -> policy -> evaluation; those of an interrupted run are read."""
         from manip_il.seeding import stream_seeds
 
-        counts = {"nominal": self.options.test_episodes, "disturbed": self.options.disturbed_episodes}
-        measured = {
-            name: measure(
-                contestants,
-                self.config.env,
-                stream_seeds("test", count, self.options.seed),
-                self.folder / "evaluation" / name,
-                self.engine,
-                self.stages,
-            )
-            for name, count in counts.items()
-        }
-        seeds = stream_seeds("validation", self.config.validation_episodes, self.options.seed)
-        folder = self.folder / "evaluation" / "validation"
-        more = [who for who in contestants if who.key == "cloned_more"]
-        return measured | {"validation": measure(more, self.config.env, seeds, folder, self.engine, self.stages)}
+        options, more = self.options, [one for one in contestants if one.key == "cloned_more"]
+        measured: dict[str, dict[str, EvalResult]] = {}
+        for folder, stream, count, measured_ones in (
+            ("nominal", "test", options.test_episodes, contestants),
+            ("disturbed", "test", options.disturbed_episodes, contestants),
+            ("validation", "validation", options.validation_episodes, more),
+        ):
+            trial, place = self._trial(folder, stream_seeds(stream, count, options.seed)), self.folder / "evaluation"
+            measured[folder] = {
+                one.key: trial.measure(
+                    one.policy, one.name, place / folder / f"{one.key}.json", self.engine, self.stages, complete=False
+                )
+                for one in measured_ones
+            }
+        return measured
+
+    def _film(self, contestants: Sequence[Contestant], results: Mapping[str, EvalResult]) -> Pictures:
+        """Film every policy on the first seed on which DAgger succeeds and cloning fails, else the first of all."""
+        from manip_il.evaluation.film import run_states
+
+        won = {episode.seed for episode in results["dagger"].episodes if episode.success}
+        lost = [episode.seed for episode in results["cloned"].episodes if not episode.success]
+        seed = next((seed for seed in lost if seed in won), results["cloned"].episodes[0].seed)
+        trial = self._trial("nominal", range(seed, seed + 1))
+        shots: list[Shot] = []
+        for one in contestants:
+            episode = run_states(trial.job(one.policy), seed)
+            caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
+            shots.append(Shot(trial.job(one.policy), episode, one.name, caption))
+        self.stages.start("films", len(shots))
+        return film_shots(shots, self.stages)
 
     def _report(
-        self,
-        results: list[RoundResult],
-        contestants: tuple[Contestant, ...],
-        measured: Measured,
-        pictures: Pictures,
+        self, contestants: Sequence[Contestant], measured: dict[str, dict[str, EvalResult]], pictures: Pictures
     ) -> Report:
-        from manip_il.cli.story import compare
         from manip_il.evaluation.report_data import CurvePoint, PolicyRow, Report
         from manip_il.evaluation.results import compare_results
 
         _, cloned, more, dagger = contestants
         nominal, disturbed = measured["nominal"], measured["disturbed"]
         rows = [PolicyRow.of(w.name, nominal[w.key], w.labels, disturbed[w.key], w.kind) for w in contestants]
-        pairs = [(cloned, dagger), (more, dagger)]
-        curve = learning_curve(self.folder / "dagger")
-        points = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
+        facts = [
+            f"{words}: {compare_results(results[one.key], results[dagger.key], (one.name, dagger.name)).verdict}"
+            for words, results in (("Undisturbed", nominal), ("Disturbed", disturbed))
+            for one in (cloned, more)
+        ]
+        point = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
         return Report(
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
-            verdict=told_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
+            verdict=quickstart_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
             command=command_line("quickstart", self.options),
             rows=tuple(rows),
             facts=(
-                *compare(nominal, pairs, "Undisturbed"),
-                *compare(disturbed, pairs, "Disturbed"),
+                *facts,
                 f"{self.config.disturbed_share:.0%} of DAgger's rollouts were disturbed, no demonstration was.",
             ),
-            curve=replace(curve, cloning=(points,)),
+            curve=replace(learning_curve(self.folder / "dagger"), cloning=(point,)),
             films=pictures.films,
             strips=pictures.strips,
             paths=pictures.paths,
@@ -227,37 +249,30 @@ class _Story:
         )
 
     @contextmanager
-    def _timed(self, chapter: str) -> Generator[None]:
-        """Add what a chapter takes, also where it is stopped, to what it took before."""
+    def _timed(self, part: str) -> Generator[None]:
+        """Add the time of a part, also where it is interrupted, to that of earlier runs."""
         started = time.monotonic()
         try:
             yield
         finally:
-            self.add_time(chapter, time.monotonic() - started)
+            self.add_time(part, time.monotonic() - started)
 
-    def add_time(self, chapter: str, seconds: float) -> None:
-        """Add what a chapter took [s]."""
-        self.timings[chapter] = round(self.timings.get(chapter, 0.0) + seconds, 2)
+    def add_time(self, part: str, seconds: float) -> None:
+        """Add the time of a part [s] and write the file."""
+        self.timings[part] = round(self.timings.get(part, 0.0) + seconds, 2)
         atomic_write(self.folder / TIMINGS_FILE, json.dumps(self.timings, indent=1) + "\n")
 
-    def _close(self, dagger: Contestant) -> None:
-        from manip_il.evaluation.report_data import format_seconds
 
-        say(f"took {format_seconds(sum(self.timings.values()))} in all")
-        say(f"report: {self.folder / REPORT_FILE}")
-        say(f"next: manip-il eval --policy.path={dagger.policy} --eval.films=3 --output_dir={self.folder}_eval")
-
-
-def _read_timings(path: Path) -> dict[str, float]:
-    """Chapter -> what it took [s]."""
+def read_timings(path: Path) -> dict[str, float]:
+    """Return the time of every part [s]."""
     timings = checks.read_json(path, f"the {TIMINGS_FILE} of a quickstart")
     return {name: checks.number(f"{path}: {name}", seconds, 0) for name, seconds in timings.items()}
 
 
-def told_verdict(rows: Sequence[PolicyRow], shown: bool) -> str:
+def quickstart_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
     """Return the first sentence of the report.
 
-    shown: whether DAgger and cloning with as many labels are shown to differ.
+    significant: whether DAgger and cloning with as many labels are shown to differ.
     """
     from manip_il.evaluation.report_data import format_percent
 
@@ -266,5 +281,5 @@ def told_verdict(rows: Sequence[PolicyRow], shown: bool) -> str:
         f"DAgger solves {format_percent(dagger.success.rate)} of {dagger.success.n:,} unseen starts, "
         f"cloning {format_percent(more.success.rate)} with as many labels "
         f"and {format_percent(cloned.success.rate)} with the first demonstrations alone."
-        + ("" if shown else " So few starts show no difference between DAgger and cloning with as many labels.")
+        + ("" if significant else " So few starts show no difference between DAgger and cloning with as many labels.")
     )

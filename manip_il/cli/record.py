@@ -1,28 +1,36 @@
-"""`manip-il record`: demonstrations of the expert, as a LeRobot dataset."""
+"""`manip-il record`, `build` and `render`: a LeRobot dataset of the expert's demonstrations.
+
+It is made again from its journals, or with other pictures.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.cli.folders import check_output, prepare_output
-from manip_il.cli.groups import (
-    ENGINE_HELP,
-    WORKERS_HELP,
-    EnvGroup,
+from manip_il.cli.common_options import (
+    EnvOptions,
     ImageGroup,
-    RobotGroup,
-    TaskGroup,
-    check_same_options,
-    option,
-    save_options,
-    warn,
+    engine_option,
+    require_workers,
+    seed_option,
+    workers_option,
 )
-from manip_il.cli.paths import require_output, require_workers
-from manip_il.cli.progress import say
+from manip_il.cli.inputs import require_dataset, require_folder
+from manip_il.cli.outputs import (
+    check_output,
+    check_same_options,
+    prepare_output,
+    require_new,
+    require_output,
+    save_options,
+)
+from manip_il.cli.progress import Stages, progress, say, warn
 from manip_il.errors import ManipError, UsageError
+from manip_il.option import option
+from manip_il.sim.look import Look
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -47,45 +55,44 @@ class DatasetGroup:
     """`--dataset.*` of what is recorded."""
 
     repo_id: str | None = option(None, "USER/NAME on the Hub; by default local/ROBOT_TASK")
-    root: Path | None = field(default=None, metadata={"help": "folder of the dataset; by default datasets/NAME"})
+    root: Path | None = option(None, "folder of the dataset; by default datasets/NAME")
     num_episodes: int = option(50, "successful episodes")
     rgb_encoder: EncoderGroup = field(default_factory=EncoderGroup)
 
 
 @dataclass
-class RecordOptions:
+class RecordOptions(EnvOptions):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
     Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
     """
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
-    robot: RobotGroup = field(default_factory=RobotGroup)
-    task: TaskGroup = field(default_factory=TaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
-    cameras: list[str] = field(default_factory=list, metadata={"help": "front, wrist or both; by default no pictures"})
+    cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
     image: ImageGroup = field(default_factory=ImageGroup)
-    seed: int = option(0, "shifts every random stream, 0 to 1000")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    seed: int = seed_option()
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     resume: bool = option(False, "continue a recording, or add more episodes")
     overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        self._check()
+        if self.dataset.num_episodes < 1:
+            raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
+        require_repo_id("--dataset.repo_id", self._repo_id())
         require_workers(self.workers)
         root, journals = self._folders()
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
             require_output(journals, "record", resume=self.resume, overwrite=self.overwrite)
-        self.env.config(self.robot.type, self.task.type)
+        self.env_config()
         self.image.config(self.cameras)
 
     def run(self) -> None:
         """Record; the dataset is written as the episodes come."""
-        env, cameras = self.env.config(self.robot.type, self.task.type), self.image.config(self.cameras)
+        env, cameras = self.env_config(), self.image.config(self.cameras)
         if cameras:
             from manip_il.data.video import VideoConfig
 
@@ -99,17 +106,12 @@ class RecordOptions:
         with exclusive(root):
             prepare_output(root, resume=self.resume, overwrite=self.overwrite)
             prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-            if self._is_there(root, journals):
+            if self._is_complete(root, journals):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
                 job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras)
                 self._record(engine, job, root, journals)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
-
-    def _check(self) -> None:
-        if self.dataset.num_episodes < 1:
-            raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
-        require_repo_id("--dataset.repo_id", self._repo_id())
 
     def _repo_id(self) -> str:
         return self.dataset.repo_id or f"local/{self.robot.type}_{self.task.type}"
@@ -118,8 +120,8 @@ class RecordOptions:
         root = self.dataset.root or Path("datasets") / self._repo_id().partition("/")[2]
         return root, root.with_name(f"{root.name}.journals")
 
-    def _is_there(self, root: Path, journals: Path) -> bool:
-        """Whether a resumed recording has nothing to do."""
+    def _is_complete(self, root: Path, journals: Path) -> bool:
+        """Return whether a resumed recording is complete."""
         from manip_il.data.lerobot_read import dataset_info
 
         if not self.resume:
@@ -133,7 +135,6 @@ class RecordOptions:
         return dataset_info(root).episodes == self.dataset.num_episodes
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
-        from manip_il.cli.stages import Stages
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
         from manip_il.recording import MAX_TRIES, check_journals, collect_successes, provenance, record
@@ -154,8 +155,97 @@ class RecordOptions:
         say(f"dataset: {root} (its episodes one by one, to open in Foxglove: {journals})")
 
 
+@dataclass
+class BuildOptions:
+    """Build the LeRobot dataset of a folder of journals.
+
+    The same journals give the same bytes, those that record wrote. Unreadable journals are reported and left out; the
+    exit code is then 1.
+    """
+
+    example: ClassVar[str] = "manip-il build datasets/demos.journals datasets/demos"
+    journals: Path = option(MISSING, "folder of episode-*.mcap files", positional=True)
+    dataset: Path = option(MISSING, "folder of the dataset", positional=True)
+    repo_id: str | None = option(None, "USER/NAME on the Hub; by default as recorded")
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what the paths show to be wrong."""
+        require_folder(self.journals, "one of episode-*.mcap files")
+        require_new(self.dataset, overwrite=self.overwrite)
+        if self.repo_id is not None:
+            require_repo_id("--repo_id", self.repo_id)
+
+    def run(self) -> None:
+        """Build the dataset; `ManipError` where a journal could not be read."""
+        from manip_il.data.atomic import exclusive
+        from manip_il.data.build import build
+
+        with exclusive(self.dataset):
+            result = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
+        say(f"built {result.info.episodes:,} episodes, {result.info.frames:,} frames; {left_out(result.failed)}")
+        say(f"dataset: {self.dataset}")
+        warn(result.damaged)
+        if result.damaged:
+            raise ManipError(
+                f"{len(result.damaged)} journal{'s' if len(result.damaged) > 1 else ''} could not be read: the dataset "
+                "lacks them; record them again by `manip-il record ... --resume=true`"
+            )
+
+
+@dataclass
+class RenderOptions:
+    """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
+
+    example: ClassVar[str] = "manip-il render datasets/demos datasets/demos_dim --cameras=front --look.brightness=0.6"
+    source: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
+    target: Path = option(MISSING, "folder of the new dataset", positional=True)
+    cameras: list[str] = option(lambda: ["front", "wrist"], "front, wrist or both")
+    image: ImageGroup = field(default_factory=ImageGroup)
+    look: Look = field(default_factory=Look)
+    workers: int | None = option(None, "processes; by default one per core")
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        require_workers(self.workers)
+        require_dataset(self.source)
+        source, target = self.source.resolve(), self.target.resolve()
+        if source.is_relative_to(target) or target.is_relative_to(source):
+            raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")
+        require_new(self.target, overwrite=self.overwrite)
+        self.image.config(self.cameras, self.look)
+
+    def run(self) -> None:
+        """Render every episode; TARGET appears when all are there."""
+        cameras = self.image.config(self.cameras, self.look)
+        if cameras is None:
+            raise UsageError("--cameras names none; expected front, wrist or both")
+        from manip_il.data.atomic import exclusive
+        from manip_il.data.build import local_id
+        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.engine.engine import default_workers
+        from manip_il.engine.render import open_source, render_dataset
+
+        source = open_source(self.source)
+        warn(source.warnings)
+        with exclusive(self.target), progress(dataset_info(self.source).episodes, f"render {self.source}") as bar:
+            info = render_dataset(
+                source,
+                self.target,
+                cameras,
+                repo_id=local_id(self.target.name),
+                workers=self.workers or default_workers(),
+                replace=self.overwrite,
+                on_episode=lambda _: bar.advance(),
+            )
+        what = f"{', '.join(cameras.names)}, {cameras.height} x {cameras.width} pixels"
+        say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {what}")
+        say(f"dataset: {self.target}")
+
+
 def require_repo_id(option: str, value: str) -> None:
-    """Raise `UsageError` unless the value is USER/NAME: a folder is named by it."""
+    """Raise `UsageError` unless the value is USER/NAME: a folder is named after it."""
     try:
         checks.repo_id(option, value)
     except ManipError as error:
@@ -165,7 +255,7 @@ def require_repo_id(option: str, value: str) -> None:
 
 
 def left_out(failed: int) -> str:
-    """What became of failed demonstrations, in words."""
+    """Return in words how many demonstrations failed."""
     if failed == 0:
         return "no demonstration failed"
     return f"{failed} failed demonstration{'s' if failed > 1 else ''} left out"

@@ -1,32 +1,41 @@
-"""`manip-il study`: the same runs for several arms and training seeds, tested and compared."""
+"""`manip-il study`: the same runs for several arms and training seeds, tested and compared.
+
+Arms that differ only after round 0 share it: the same options and seed would give the same bytes.
+"""
 
 from __future__ import annotations
 
+import json
 import shlex
-from dataclasses import dataclass, field, replace
+import shutil
+from collections.abc import Iterable
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from manip_il.cli.dagger import REPORT_FILE
-from manip_il.cli.folders import atomic_write, prepare_output
-from manip_il.cli.groups import ENGINE_HELP, WORKERS_HELP, check_same_options, option, save_options, trust_option
-from manip_il.cli.measure import Trial, check_policies, measured, rule_json
+from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
+from manip_il.cli.common_options import engine_option, require_workers, trust_option, workers_option
+from manip_il.cli.compare import rule_json
+from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
 from manip_il.cli.options import to_plain
-from manip_il.cli.paths import require_output, require_workers
-from manip_il.cli.progress import say
-from manip_il.cli.shared_start import share_start
-from manip_il.cli.sides import Source, limit_of, run_finished, run_history
+from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, read_jsonl, require_output, save_options
+from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
+from manip_il.cli.trials import Trial
 from manip_il.errors import UsageError
 from manip_il.evaluation.comparison import Arm, write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
+from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.cli.dagger import DaggerOptions
     from manip_il.evaluation.study_report import StudyReport
 
-# What the file says is compared by itself.
-FREE = ("workers", "engine", "output_dir", "file", "training_seeds", "trust")
+ROUND_0 = "round_000"
+# Options on which round 0 (demonstrations and the first fit) does not depend
+_AFTER_ROUND_0 = (
+    *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "query", "branch_steps"),
+    *("refit", "refit_steps", "output_dir", "resume", "overwrite", "workers", "engine"),
+)
 
 
 @dataclass
@@ -38,12 +47,12 @@ class StudyOptions:
     """
 
     example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
-    file: Path = field(metadata={"help": "YAML of the study", "positional": True})
+    file: Path = option(MISSING, "YAML of the study", positional=True)
     training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
-    engine: Literal["local", "ray"] = option("local", ENGINE_HELP)
-    workers: int | None = option(None, WORKERS_HELP)
+    engine: Literal["local", "ray"] = engine_option()
+    workers: int | None = workers_option()
     trust: bool = trust_option()
-    output_dir: Path = field(default=Path("runs/study"), metadata={"help": "folder of the study"})
+    output_dir: Path = option(Path("runs/study"), "folder of the study")
     resume: bool = option(False, "continue an interrupted study")
     overwrite: bool = option(False, "replace an existing study")
 
@@ -59,30 +68,22 @@ class StudyOptions:
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""
         plan = read_plan(self.file, self.training_seeds, self.trust)
-        from manip_il.data.atomic import exclusive
-
-        with exclusive(self.output_dir):
-            self._run(plan)
-
-    def _run(self, plan: Plan) -> None:
-        prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.resume:
-            check_same_options(self.output_dir, self, FREE)
             check_same_file(self.output_dir, plan.file)
-        save_options(self.output_dir, self)
-        keep_file(self.output_dir, plan.file)
-        self._learn(plan)
-        study = self._test(plan)
-        write_json(self.output_dir / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
-        atomic_write(self.output_dir / TABLE_FILE, table_markdown(study))
-        from manip_il.evaluation.report import write_page
-        from manip_il.evaluation.study_report import render_study
+        with open_output(self, (*FREE, "file", "training_seeds")) as folder:  # what the file says is compared above
+            keep_file(folder, plan.file)
+            self._learn(plan)
+            study = self._test(plan)
+            write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
+            atomic_write(folder / TABLE_FILE, table_markdown(study))
+            from manip_il.evaluation.report import write_page
+            from manip_il.evaluation.study_report import render_study
 
-        write_page(self.output_dir / REPORT_FILE, render_study(self._report(plan, study)))
+            write_page(folder / REPORT_FILE, render_study(self._report(plan, study)))
         self._say(study)
 
     def _learn(self, plan: Plan) -> None:
-        """One run after the other, seed by seed, so that a study that is stopped early has all arms."""
+        """Run one after the other, seed by seed, so that a study that is stopped early has all arms."""
         runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             folder = self._folder(name, seed)
@@ -98,23 +99,20 @@ class StudyOptions:
         return replace(own, engine=self.engine, workers=self.workers)
 
     def _test(self, plan: Plan) -> Study:
-        from manip_il.cli.stages import Stages
         from manip_il.engine.engine import Engine
         from manip_il.seeding import stream_seeds
 
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]
         limit = limit_of(plan.rule, everything)
-        policies = {source.name: source.chosen(plan.rule, limit)[0] for source in everything}
+        policies = {source.name: source.select(plan.rule, limit)[0] for source in everything}
         seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
         trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values(), self.trust)
-        check_policies(trial, policies, self.output_dir, self.engine)
+        trial.check_policies(policies, self.output_dir, self.engine)
         kept = f"every finished run and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            arms = tuple(
-                Arm(name, tuple(measured(s, plan.rule, limit, trial, self.output_dir, engine, stages) for s in arm))
-                for name, arm in sources.items()
-            )
+            last = (plan.rule, limit, trial, self.output_dir, engine, stages)
+            arms = tuple(Arm(name, tuple(source.measure(*last) for source in arm)) for name, arm in sources.items())
         return Study(arms, plan.baseline, plan.file.target, plan.rule, limit)
 
     def _sources(self, plan: Plan, name: str) -> list[Source]:
@@ -160,3 +158,29 @@ class StudyOptions:
             return f"manip-il eval --policy.path={best.members[0].policy} --eval.films=3"
         left, right = self.output_dir / other, self.output_dir / best.name
         return f"manip-il compare {left} {right} --at=seconds --output_dir={self.output_dir}_seconds"
+
+
+def same_start(left: DaggerOptions, right: DaggerOptions) -> bool:
+    """Return whether two runs have the same round 0."""
+    names = [one.name for one in fields(DaggerOptions) if one.name not in _AFTER_ROUND_0]
+    return all(getattr(left, name) == getattr(right, name) for name in names)
+
+
+def share_start(options: DaggerOptions, others: Iterable[DaggerOptions]) -> bool:
+    """Begin a run that is not there yet with round 0 of another that has the same; return whether there was one.
+
+    Its line of metrics comes along, so that the run is charged for what its round 0 took.
+    """
+    from manip_il.data.atomic import new_folder
+
+    if options.output_dir.exists():
+        return False
+    for other in others:
+        records = read_jsonl(other.output_dir / METRICS_FILE)
+        if same_start(options, other) and records and (other.output_dir / ROUND_0).is_dir():
+            with new_folder(options.output_dir) as folder:
+                shutil.copytree(other.output_dir / ROUND_0, folder / ROUND_0, symlinks=True)
+                atomic_write(folder / METRICS_FILE, json.dumps(records[0]) + "\n")
+                save_options(folder, options)
+            return True
+    return False

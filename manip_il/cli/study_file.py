@@ -3,35 +3,36 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
-from manip_il.cli.compare import TrialGroup
+from manip_il.cli.candidates import require_same_env
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.folders import atomic_write
-from manip_il.cli.groups import option
-from manip_il.cli.measure import FOLDER
-from manip_il.cli.options import Open, dump_yaml, from_layers, from_yaml, to_plain
-from manip_il.cli.sides import require_same_env
+from manip_il.cli.options import Open, to_plain
+from manip_il.cli.outputs import atomic_write
+from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml
+from manip_il.cli.trials import FOLDER, TrialGroup
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.evaluation.report_data import flatten
 from manip_il.evaluation.rounds import Rule
+from manip_il.option import option
 from manip_il.seeding import MAX_SEED
 
 if TYPE_CHECKING:
-    from manip_il.sim.env import EnvConfig
+    from manip_il.sim.config import EnvConfig
 
 STUDY_FILE = "study.yaml"
-OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study sets
+OWN = ("seed", "output_dir", "resume", "overwrite", "workers", "engine")  # options of a run that the study itself sets
 ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass
 class StudyFile:
-    """What a study's YAML file may hold.
+    """Content of a study's YAML file.
 
     common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. suite: as
     `manip-il eval --suite=`, for the test.
@@ -50,7 +51,7 @@ class StudyFile:
 
 @dataclass(frozen=True)
 class Plan:
-    """A file that has been checked: every arm's options are sound, and all arms share one environment."""
+    """A checked file: the options of every arm are valid, and all arms have one environment."""
 
     file: StudyFile
     arms: Mapping[str, DaggerOptions]
@@ -60,7 +61,7 @@ class Plan:
 
 
 def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
-    """Return the study in `path`; training_seeds: in place of the file's; trust: what the file may not say of its runs.
+    """Return the study in `path`; training_seeds: in place of the file's. trust: of its runs.
 
     Raises `UsageError` in one line for what is not sound.
     """
@@ -69,7 +70,7 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
         file = replace(file, training_seeds=training_seeds)
     _check_numbers(path, file)
     arms = {name: replace(_arm(path, file, name), trust=trust) for name in file.arms}
-    envs = {name: _checked(path, name, options) for name, options in arms.items()}
+    envs = {name: _env(path, name, options) for name, options in arms.items()}
     first = next(iter(envs))
     for name, env in envs.items():
         require_same_env(f"arm {first!r}", envs[first], f"arm {name!r}", env)
@@ -134,12 +135,21 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
         for own in OWN:
             if own in tree:
                 raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
-    return from_layers(DaggerOptions, layers)
+    with _named(path, name):
+        return from_layers(DaggerOptions, layers)
 
 
-def _checked(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
-    try:
+def _env(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
+    with _named(path, name):
         return options.config().env
+
+
+@contextmanager
+def _named(path: Path, arm: str) -> Generator[None]:
+    """Add the file and the arm to an error that does not name them."""
+    try:
+        yield
     except ManipError as error:
-        error.args = (f"{path}: arm {name!r}: {error}",)
+        if str(path) not in str(error):
+            error.args = (f"{path}: arm {arm!r}: {error}",)
         raise

@@ -5,27 +5,20 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli.folders import prepare_output
-from manip_il.cli.groups import (
-    check_dataset,
-    check_same_options,
-    option,
-    policy_help,
-    save_options,
-    start_policy,
-    trust_option,
-)
+from manip_il.cli.common_options import policy_help, trust_option
+from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
 from manip_il.cli.options import Open
-from manip_il.cli.paths import require_dataset, require_output
-from manip_il.cli.progress import progress, say, set_quiet
-from manip_il.learn.fit_config import MLP_BATCH_SIZE, MLP_LR, MLP_STEPS, STEPS, FitConfig
+from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
+from manip_il.cli.progress import Stages, progress, say, set_quiet
+from manip_il.learn.fit_config import FitConfig
+from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.cli.stages import Stages
+    pass
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
@@ -38,8 +31,8 @@ _FREE = (
 class SourceGroup:
     """`--dataset.*` of what is learnt from."""
 
-    root: Path = field(metadata={"help": "folder of a LeRobot v3.0 dataset"})
-    eval_split: float = option(0.05, "share of the episodes held out for val_loss")
+    root: Path = option(MISSING, "folder of a LeRobot v3.0 dataset")
+    eval_split: float = option_of(FitConfig, "eval_split")
 
 
 @dataclass
@@ -55,25 +48,23 @@ class TrainOptions:
         "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
     )
     dataset: SourceGroup
-    policy: Open = field(default_factory=dict, metadata={"help": "type (mlp), or path of a policy to start from; ..."})
-    observation: Literal["state", "images", "both"] | None = option(
-        None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
-    )
-    steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
-    batch_size: int | None = option(None, f"frames per step (and process); by default {MLP_BATCH_SIZE} for mlp, else 8")
-    lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
-    optimizer: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type (adamw), ..."})
-    scheduler: Open = field(default_factory=dict, metadata={"help": "in place of the policy's own: type, ..."})
-    image_augment: bool = option(True, "random crops and colour jitter of pictures while training")
-    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
-    num_workers: int = option(4, "processes of LeRobot's loader")
-    output_dir: Path = field(default=Path("runs/train"), metadata={"help": "folder of the run"})
+    policy: Open = option_of(FitConfig, "policy")
+    observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
+    steps: int | None = option_of(FitConfig, "steps")
+    batch_size: int | None = option_of(FitConfig, "batch_size")
+    lr: float | None = option_of(FitConfig, "lr")
+    optimizer: Open = option_of(FitConfig, "optimizer")
+    scheduler: Open = option_of(FitConfig, "scheduler")
+    image_augment: bool = option_of(FitConfig, "image_augment")
+    image_cache_gb: float = option_of(FitConfig, "image_cache_gb")
+    num_workers: int = option_of(FitConfig, "num_workers")
+    output_dir: Path = option(Path("runs/train"), "folder of the run")
     seed: int = option(0, "seed of weights and batches, 0 to 1000")
-    threads: int = option(1, "PyTorch threads; more help only on free cores")
-    save_freq: int | None = option(None, "steps between checkpoints; by default 1,000 for mlp, else 20,000")
-    log_freq: int = option(200, "steps between metrics")
-    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
-    wandb: Open = field(default_factory=dict, metadata={"help": "Weights & Biases: enable, project, mode, ..."})
+    threads: int = option_of(FitConfig, "threads")
+    save_freq: int | None = option_of(FitConfig, "save_freq")
+    log_freq: int = option_of(FitConfig, "log_freq")
+    tensorboard: bool = option_of(FitConfig, "tensorboard")
+    wandb: Open = option_of(FitConfig, "wandb")
     trust: bool = trust_option()
     resume: bool = option(False, "continue from the last checkpoint")
     overwrite: bool = option(False, "replace an existing run")
@@ -122,8 +113,6 @@ class TrainOptions:
             save_options(self.output_dir, self)
 
     def _stages(self, config: FitConfig) -> Stages:
-        from manip_il.cli.stages import Stages
-
         steps = config.steps_per_checkpoint
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
@@ -172,20 +161,20 @@ class TrainOptions:
 
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
-        """What is told how many pictures more have been decoded; a bar, where there are any."""
+        """Yield a callback for the number of pictures just decoded; a bar is displayed from the first one on."""
         from manip_il.data.lerobot_read import camera_keys, dataset_info
 
         with contextlib.ExitStack() as stack:
             bar = None
 
-            def seen(frames: int) -> None:
+            def decoded(frames: int) -> None:
                 nonlocal bar
                 if bar is None:
                     total = dataset_info(self.dataset.root).frames * len(camera_keys(self.dataset.root))
                     bar = stack.enter_context(progress(total, "decode pictures, once"))
                 bar.advance(frames)
 
-            yield seen
+            yield decoded
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import ast
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 
 from manip_il.checks import read_json
 from manip_il.errors import UnknownName, UsageError
+from manip_il.option import option
 
 MLP = "mlp"  # the one policy with a loop of its own
 MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
@@ -47,22 +48,28 @@ class FitConfig:
     option of it that is not there.
     """
 
-    policy: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    observation: str | None = None
-    steps: int | None = None
-    batch_size: int | None = None
-    lr: float | None = None
-    optimizer: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    scheduler: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    eval_split: float = 0.05
-    image_augment: bool = True
-    image_cache_gb: float = 20.0
-    num_workers: int = 4
-    threads: int = 1
-    save_freq: int | None = None
-    log_freq: int = 200
-    tensorboard: bool = False
-    wandb: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    policy: Mapping[str, Any] = option(dict, "type (mlp), or path of a policy to start from; ...")
+    observation: str | None = option(
+        None, "what the policy observes besides its joints; by default images if it is cnn, else state"
+    )
+    steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
+    batch_size: int | None = option(
+        None, f"frames per step (and process); by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}"
+    )
+    lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
+    optimizer: Mapping[str, Any] = option(dict, "in place of the policy's own: type (adamw), ...")
+    scheduler: Mapping[str, Any] = option(dict, "in place of the policy's own: type, ...")
+    eval_split: float = option(0.05, "share of the episodes held out for val_loss")
+    image_augment: bool = option(True, "random crops and colour jitter of pictures while training")
+    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
+    num_workers: int = option(4, "processes of LeRobot's loader")
+    threads: int = option(1, "PyTorch threads; more help only on free cores")
+    save_freq: int | None = option(
+        None, f"steps between checkpoints; by default {MLP_SAVE_FREQ:,} for mlp, else {SAVE_FREQ:,}"
+    )
+    log_freq: int = option(200, "steps between metrics")
+    tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
+    wandb: Mapping[str, Any] = option(dict, "Weights & Biases: enable, project, mode, ...")
     trust: bool = False
     seed: int = 0
     init_from: Path | None = None

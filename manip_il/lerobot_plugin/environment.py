@@ -20,8 +20,9 @@ from manip_il.data.lerobot_log import shorten_ffmpeg_warning
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName
 from manip_il.learn.pretrained import OBSERVATIONS
+from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
-from manip_il.sim import env as sim
+from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.look import CameraConfig
 from manip_il.sim.register import ENV_IDS, register_envs
@@ -40,22 +41,22 @@ class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
-    with commas between. observation_height, observation_width: of their pictures [pixels]. fps: control steps a
-    second. episode_length: control steps. tolerance: of object (or hand) to goal [m]. success_steps: in a row within
-    it. render_mode: `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+    with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
+    tolerance, success_steps: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode: `none`
+    leaves the films of lerobot-eval black, which needs no OpenGL and no time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """
 
     task: str | None = "PandaPickPlace-v0"
-    fps: int = sim.EnvConfig.control_hz
+    fps: int = option_of(SimConfig, "control_hz")
     observation: str = "state"
     cameras: str = "front,wrist"
-    observation_height: int = 128
-    observation_width: int = 128
-    episode_length: int = sim.EnvConfig.horizon
-    tolerance: float = sim.EnvConfig.tolerance
-    success_steps: int = sim.EnvConfig.success_steps
+    observation_height: int = option_of(CameraConfig, "height")
+    observation_width: int = option_of(CameraConfig, "width")
+    episode_length: int = option_of(SimConfig, "horizon")
+    tolerance: float = option_of(SimConfig, "tolerance")
+    success_steps: int = option_of(SimConfig, "success_steps")
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -74,20 +75,20 @@ class ManipILEnv(EnvConfig):
     @property
     @override
     def package_name(self) -> str:
-        """What stands before the task's name in gymnasium's table."""
+        """Namespace of the task's id in gymnasium's registry."""
         return PACKAGE
 
     @property
     @override
     def gym_kwargs(self) -> dict[str, Any]:
-        """What `gymnasium.make` takes beside the id."""
+        """Arguments of `gymnasium.make` beside the id."""
         kwargs: dict[str, Any] = {"config": self._simulation(), "render_mode": "rgb_array"}
-        pictured = self._pictured()
-        return kwargs | ({"cameras": pictured.names, "image_size": pictured.size} if pictured else {})
+        cameras = self._cameras()
+        return kwargs | ({"cameras": cameras.names, "image_size": cameras.size} if cameras else {})
 
     @override
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """As LeRobot's own, with `render_mode`: {type: {0: n_envs environments}}."""
+        """Return {type: {0: n_envs environments}} as LeRobot does, with `render_mode`."""
         make: Callable[[], gymnasium.Env[Any, Any]] = partial(
             make_env, self.gym_id, self.gym_kwargs, film=self.render_mode != "none"
         )
@@ -100,19 +101,19 @@ class ManipILEnv(EnvConfig):
             envs = SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
         return {self.type: {0: envs}}
 
-    def _simulation(self) -> sim.EnvConfig:
+    def _simulation(self) -> SimConfig:
         robot, task = TASKS[self.task or ""]
-        return sim.EnvConfig(robot, task, self.fps, self.tolerance, self.success_steps, self.episode_length)
+        return SimConfig(robot, task, self.fps, self.tolerance, self.success_steps, self.episode_length)
 
-    def _pictured(self) -> CameraConfig | None:
+    def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":
             return None
         names = tuple(name.strip() for name in self.cameras.split(","))
         return CameraConfig(names, self.observation_height, self.observation_width)
 
     def _features(self) -> dict[str, PolicyFeature]:
-        """By the names under which the environment gives them; a camera by its column, as LeRobot's recorder wants."""
-        simulation, pictured = self._simulation(), self._pictured()
+        """Features by the environment's names; a camera by its column, as LeRobot's recorder wants."""
+        simulation, cameras = self._simulation(), self._cameras()
         joints = (len(get_robot(simulation.robot).joint_names),)
         features = {
             ACTION: PolicyFeature(FeatureType.ACTION, joints),
@@ -121,9 +122,9 @@ class ManipILEnv(EnvConfig):
         if self.observation != "images":
             size = len(environment_state_names(build_scene(simulation.robot, simulation.task)))
             features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
-        if pictured is not None:
-            picture = PolicyFeature(FeatureType.VISUAL, (*pictured.size, 3))
-            features |= {IMAGES + name: picture for name in pictured.names}
+        if cameras is not None:
+            picture = PolicyFeature(FeatureType.VISUAL, (*cameras.size, 3))
+            features |= {IMAGES + name: picture for name in cameras.names}
         return features
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, Self
 
@@ -13,47 +12,20 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UsageError
-from manip_il.mdp import LONGEST_EPISODE, Observation, State
+from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
+from manip_il.sim.config import EnvConfig
 from manip_il.sim.events import Events
 from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.render import Picture, pictures
-from manip_il.sim.scene import DT_SIM, build_scene
+from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """Settings of an environment; every field is part of the fingerprint."""
-
-    robot: str = "panda"
-    task: str = "pick_place"
-    control_hz: int = 20
-    tolerance: float = 0.02  # of object (or hand) to goal [m]
-    success_steps: int = 5  # control steps in a row within the tolerance
-    horizon: int = 100  # control steps
-
-    def __post_init__(self) -> None:
-        if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
-            raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
-        if not 0 < self.tolerance < 1:
-            raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
-        if self.horizon > LONGEST_EPISODE:
-            raise UsageError(f"horizon is {self.horizon}; expected at most {LONGEST_EPISODE} control steps")
-        if self.success_steps < 1 or self.horizon < self.success_steps:
-            raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
-
-    @property
-    def physics_steps(self) -> int:
-        """MuJoCo steps in one control step."""
-        return round(1 / (DT_SIM * self.control_hz))
 
 
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from manip_il.errors import UnknownName, UsageError
+from manip_il.option import option
 
 CAMERAS = ("front", "wrist")
 MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
@@ -20,9 +21,9 @@ class Look:
     Raises `UsageError` for a value out of range.
     """
 
-    shadows: bool = False
-    brightness: float = 1.0
-    light_turn: float = 0.0
+    shadows: bool = option(False, "cast shadows; rendering then takes two to six times as long")
+    brightness: float = option(1.0, "factor on every lamp, 0.1 to 2")
+    light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
 
     def __post_init__(self) -> None:
         low, high = _BRIGHTNESS
@@ -44,8 +45,8 @@ class CameraConfig:
     """
 
     names: tuple[str, ...]
-    height: int = 128
-    width: int = 128
+    height: int = option(128, "of a picture [pixels]")
+    width: int = option(128, "of a picture [pixels]")
     look: Look = field(default_factory=Look)
 
     def __post_init__(self) -> None:

@@ -15,12 +15,12 @@ from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.spec import arm_spec
 from manip_il.sim import variation
+from manip_il.sim.config import DT_SIM
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Task
 
-DT_SIM = 0.002  # [s]
 PREFIX = "robot/"  # of everything of the robot's in a scene
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]

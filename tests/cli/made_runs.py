@@ -7,9 +7,9 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from manip_il.cli.common_options import EnvGroup, TaskGroup
 from manip_il.cli.dagger import DaggerOptions
-from manip_il.cli.folders import append_jsonl
-from manip_il.cli.groups import EnvGroup, TaskGroup, save_options
+from manip_il.cli.outputs import append_jsonl, save_options
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
@@ -23,10 +23,15 @@ OPTIONS = DaggerOptions(task=TaskGroup("reach"), env=EnvGroup(horizon=8))
 SUCCESSES = (0.2, 0.6, 0.4)
 
 
-def make_policy(folder: Path) -> Path:
+def files(root: Path) -> dict[str, bytes]:
+    """Content of every file by its path in `root`."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
     """A policy that acts, badly."""
-    spec = env_spec(ENV)
-    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(ENV)))
+    spec = env_spec(env)
+    return write_checkpoint(folder, "act", spec, meta=CheckpointMeta.of(spec, env_fingerprint(env)))
 
 
 def mark(policy: Path, words: str) -> Path:

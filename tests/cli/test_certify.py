@@ -8,28 +8,19 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.engine.environments import env_fingerprint
 from manip_il.sim.env import EnvConfig, ManipEnv
 
-from ..learn.tiny_policies import write_checkpoint
+from .made_runs import make_policy
 
 ENV = EnvConfig("fetch", "reach", horizon=60)
 WORDS = ["certify", "--robot.type=fetch", "--task.type=reach", "--env.horizon=60", "--cases=2", "--workers=1"]
 
 
-def error(capsys) -> str:
-    """What went wrong: one line."""
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1
-    return lines[0]
-
-
 @pytest.fixture
 def policy(tmp_path) -> Path:
     """An untrained one for fetch reach."""
-    meta = CheckpointMeta.of(env_spec(ENV), env_fingerprint(ENV))
-    return write_checkpoint(tmp_path / "policy", "act", env_spec(ENV), meta=meta)
+    return make_policy(tmp_path / "policy", ENV)
 
 
 def test_the_file_and_the_tables_say_the_same(tmp_path, capsys):
@@ -51,13 +42,13 @@ def test_the_file_and_the_tables_say_the_same(tmp_path, capsys):
     assert (folder / "config.yaml").is_file()
 
 
-def test_what_is_there_is_refused_or_replaced(tmp_path, capsys):
+def test_what_is_there_is_refused_or_replaced(tmp_path, capsys, error):
     words = [*WORDS, f"--output_dir={tmp_path / 'c'}"]
     assert main(words) == 0
     before = (tmp_path / "c" / "certificate.json").read_bytes()
     capsys.readouterr()
     assert main(words) == 2
-    assert "--overwrite=true" in error(capsys)
+    assert "--overwrite=true" in error()
     assert main([*words, "--overwrite=true"]) == 0
     assert (tmp_path / "c" / "certificate.json").read_bytes() == before
     assert main([*words, "--overwrite=true", "--seed=1"]) == 0
@@ -76,30 +67,9 @@ def test_a_policy_brings_its_robot_and_task(policy, tmp_path, capsys):
     assert data["rows"][-1]["group"] == "learner"
 
 
-def test_another_robots_policy_is_refused_before_the_first_step(policy, tmp_path, capsys, monkeypatch):
+def test_another_robots_policy_is_refused_before_the_first_step(policy, tmp_path, error, monkeypatch):
     monkeypatch.setattr(ManipEnv, "advance", None)
     words = [*WORDS[:1], "--robot.type=panda", f"--policy.path={policy}", f"--output_dir={tmp_path / 'c'}"]
     assert main(words) == 1
-    assert "robot differs: the policy has fetch" in error(capsys)
+    assert "robot differs: the policy has fetch" in error()
     assert not (tmp_path / "c").exists()
-
-
-@pytest.mark.parametrize(
-    ("word", "hint"),
-    [
-        ("--cases=0", "--cases is 0; expected at least 1"),
-        ("--cases=2000000", "2000000 seeds asked of stream 'certificate'"),
-        ("--robot.type=pandas", "did you mean 'panda'?"),
-        ("--task.type=pick", "did you mean 'pick_place'?"),
-        ("--workers=0", "workers is 0"),
-        ("--seed=-1", "seed is -1"),
-        ("--env.horizon=2", "horizon is 2"),
-        ("--policy.path=nowhere", "no policy in nowhere"),
-        ("--case=3", "did you mean '--cases'?"),
-    ],
-)
-def test_a_wrong_word_exits_2_and_leaves_nothing(word, hint, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["certify", word]) == 2
-    assert hint in error(capsys)
-    assert list(tmp_path.iterdir()) == []

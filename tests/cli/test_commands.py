@@ -1,3 +1,5 @@
+"""Recording, training, DAgger and the quickstart from the command line."""
+
 from __future__ import annotations
 
 import json
@@ -7,25 +9,30 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import MISSING
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from manip_il.cli import groups, story
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli import films
+from manip_il.cli.dagger import DaggerOptions, best_verdict
 from manip_il.cli.main import load, main
-from manip_il.cli.options import from_yaml, options_of, parse
+from manip_il.cli.options import command_line, options_of
+from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.parsing import from_yaml, parse
+from manip_il.cli.quickstart import quickstart_verdict
 from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
-from manip_il.evaluation.results import EvalResult
-from manip_il.sim.env import EnvConfig
+from manip_il.evaluation.report_data import PolicyRow
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+
+from .made_runs import files
 
 ROOT = Path(__file__).resolve().parents[2]
-SAMPLE = ROOT / "datasets" / "sample"
 TINY_DAGGER = [
     "--demonstrations=3",
     "--rounds=1",
@@ -57,36 +64,6 @@ def policy(demos, tmp_path_factory) -> Path:
     return folder
 
 
-def files(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
-
-
-def one_error(capsys) -> str:
-    err = capsys.readouterr().err
-    lines = [line for line in err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1, err
-    return lines[0]
-
-
-@pytest.fixture
-def killed(start, tmp_path) -> Callable[[list[str], Path], None]:
-    """Starts a command and kills it, hard, as soon as a file matches."""
-
-    def run(words: list[str], is_time: Path) -> None:
-        process = start(*words, log=tmp_path / "log")
-        while not list(is_time.parent.glob(is_time.name)):
-            assert process.is_alive(), "it ended before it was killed"
-            time.sleep(0.002)
-        process.kill()
-        process.join()
-
-    return run
-
-
-def test_option_defaults_are_those_of_the_environment():
-    assert groups.EnvGroup().config(groups.DEFAULT_ROBOT, groups.DEFAULT_TASK) == EnvConfig()
-
-
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_config_loads_by_the_command_in_its_first_line(path):
     command = path.read_text().splitlines()[0].removeprefix("# ").split()
@@ -107,7 +84,7 @@ def test_record_writes_successes_and_their_provenance(demos):
     assert read_provenance(demos)["seeds"] == [1_000_000, 1_000_002]
 
 
-def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, capsys):
+def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, capsys, error):
     assert main(record(tmp_path / "d", 2)) == 0
     assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
     assert files(tmp_path / "d") == files(demos)
@@ -115,25 +92,7 @@ def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp
     assert main(record(tmp_path / "d", 3, "--resume=true")) == 0
     assert "3 episodes already" in capsys.readouterr().out
     assert main(record(tmp_path / "d", 3, "--resume=true", "--seed=1")) == 1
-    assert "--seed differs" in one_error(capsys)
-
-
-@pytest.mark.slow
-def test_a_recorded_dataset_opens_in_lerobot(demos):
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset("local/d", root=demos)
-    assert dataset.num_episodes == 3
-    assert dataset.hf_dataset[0]["action"].shape == (8,)
-
-
-@pytest.mark.slow
-def test_a_killed_recording_resumes_to_the_same_bytes(killed, tmp_path):
-    killed(record(tmp_path / "cut", 6), tmp_path / "cut.journals" / "episode-*.mcap")
-    assert not (tmp_path / "cut").exists()
-    assert main(record(tmp_path / "cut", 6, "--resume=true")) == 0
-    assert main(record(tmp_path / "whole", 6)) == 0
-    assert files(tmp_path / "cut") == files(tmp_path / "whole")
+    assert "--seed differs" in error()
 
 
 @pytest.mark.slow
@@ -149,65 +108,16 @@ def test_ctrl_c_keeps_what_is_done_and_says_how_to_go_on(tmp_path):
     assert err.rstrip().endswith("--workers=1 --resume=true")
 
 
-def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, capsys):
+def test_what_is_there_is_refused_or_replaced(demos, policy, tmp_path, error):
     for words in (record(demos, 3), ["train", f"--dataset.root={demos}", f"--output_dir={policy}"]):
         assert main(words) == 2
-        assert "exists already" in one_error(capsys)
+        assert "exists already" in error()
     assert main(record(tmp_path / "d", 1)) == 0
     assert main(record(tmp_path / "d", 1, "--seed=2", "--overwrite=true")) == 0
     assert read_table(tmp_path / "d", ["seed"])["seed"][0] > 200_000_000
 
 
-@pytest.mark.parametrize(
-    ("words", "hint"),
-    [
-        (["record", "--robot.type=pandas"], "did you mean 'panda'?"),
-        (["record", "--task.type=pick"], "did you mean 'pick_place'?"),
-        (["record", "--num_episodes=3"], "did you mean '--dataset.num_episodes'?"),
-        (["record", "--cameras=front,wirst"], "did you mean 'wrist'?"),
-        (["record", "--cameras=front", "--image.height=127"], "height 127"),
-        (["record", "--cameras=front", "--dataset.rgb_encoder.vcodec=h265"], "did you mean 'h264'?"),
-        (["record", "--cameras=front", "--dataset.rgb_encoder.preset=99"], "preset"),
-        (["record", "--workers=0"], "workers is 0"),
-        (["record", "--engine=rai"], "did you mean 'ray'?"),
-        (["build", "nix", "dataset"], "nix does not exist"),
-        (["build", "configs"], "DATASET is missing"),
-        (["record", "--dataset.num_episodes=0"], "expected at least 1"),
-        (["record", "--dataset.repo_id=name"], "expected USER/NAME"),
-        (["train"], "--dataset.root is missing"),
-        (["train", "--dataset.root=x", "--policy.type=mpl"], "did you mean 'mlp'?"),
-        (["train", "--dataset.root=x", "--policy.type=atc"], "did you mean 'act'"),
-        (["train", "--dataset.root=x", "--policy.lr=1"], "unknown option of --policy.type=mlp: 'lr'"),
-        (["train", "--dataset.root=x", "--policy.type=act", "--observation=eyes"], "one of state, images, both"),
-        (["train", "--dataset.root=x", "--policy=act"], "--policy.NAME=VALUE"),
-        (["train", f"--dataset.root={SAMPLE}", "--wandb.projekt=a", "--policy.type=act"], "did you mean 'project'"),
-        (["train", f"--dataset.root={SAMPLE}", "--policy.loss=mes"], "did you mean 'mse'?"),
-        (["dagger", "--beta=lineal:5"], "did you mean 'linear'?"),
-        (["dagger", "--rounds=-1"], "expected at least 0"),
-        (["dagger", "--label=takover"], "did you mean 'takeover'?"),
-        (["dagger", "--query=evry"], "did you mean 'every'?"),
-        (["dagger", "--label_budget=0"], "label_budget is 0"),
-        (["dagger", "--query=ensemble:0.1"], "give ensemble=2 or more"),
-        (["dagger", "--policy.type=act", "--query=one"], "use label=branch or label=takeover"),
-        (["dagger", "--policy.type=cnn"], "give --cameras=front,wrist"),
-        (["dagger", "--policy.lr=1"], "unknown option of --policy.type=mlp: 'lr'"),
-        (["eval", "--policy.type=exprt"], "did you mean 'expert'?"),
-        (["eval"], "--policy.path=DIR"),
-        (["eval", "--policy.path=configs"], "no policy in configs"),
-        (["eval", "--policy.type=expert", "--env.tolerance=2"], "tolerance is 2.0"),
-        (["quickstart", "--test_episodes=0"], "expected at least 1"),
-    ],
-    ids=lambda value: " ".join(value)[:50] if isinstance(value, list) else "",
-)
-def test_a_wrong_word_exits_2_and_says_the_right_one(words, hint, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("configs").mkdir()
-    assert main(words) == 2
-    assert hint in one_error(capsys)
-    assert [path.name for path in tmp_path.iterdir()] == ["configs"]
-
-
-def test_train_refuses_a_dataset_with_nan(demos, tmp_path, capsys):
+def test_train_refuses_a_dataset_with_nan(demos, tmp_path, error):
     broken = tmp_path / "broken"
     shutil.copytree(demos, broken)
     [path] = broken.glob("data/*/*.parquet")
@@ -218,10 +128,10 @@ def test_train_refuses_a_dataset_with_nan(demos, tmp_path, capsys):
     column = pa.FixedSizeListArray.from_arrays(pa.array(values), 8).cast(table.schema.field("action").type)
     pq.write_table(table.set_column(place, table.schema.field("action"), column), path)
     assert main(["train", f"--dataset.root={broken}", f"--output_dir={tmp_path / 't'}"]) == 1
-    assert "column action, row 5" in one_error(capsys)
+    assert "column action, row 5" in error()
 
 
-def test_train_to_eval(policy, tmp_path, capsys):
+def test_train_to_eval(policy, tmp_path, capsys, error):
     words = ["eval", f"--policy.path={policy}", "--eval.n_episodes=2", "--workers=1", "--eval.films=0"]
     words += [f"--output_dir={tmp_path / 'e'}"]
     assert main(words) == 0
@@ -232,12 +142,12 @@ def test_train_to_eval(policy, tmp_path, capsys):
     assert [episode.seed for episode in result.episodes] == [4_000_000, 4_000_001]
     assert (result.robot, result.task, result.settings.disturbance) == ("panda", "pick_place", "none")
     assert main(words) == 2
-    assert "--overwrite=true" in one_error(capsys)
+    assert "--overwrite=true" in error()
     assert main([*words, "--overwrite=true", "--env.tolerance=0.05", "--suite=knocked"]) == 0
     assert "config differs" in capsys.readouterr().err
     assert "noise" in EvalResult.read(tmp_path / "e").settings.disturbance
     assert main([*words, "--overwrite=true", "--robot.type=fetch"]) == 1
-    assert "robot differs: the policy has panda" in one_error(capsys)
+    assert "robot differs: the policy has panda" in error()
 
 
 def test_the_expert_is_measured_by_name(tmp_path):
@@ -248,34 +158,23 @@ def test_the_expert_is_measured_by_name(tmp_path):
     assert data["episodes"][0]["seed"] == 3_000_000
 
 
-def metrics(folder: Path) -> list[dict]:
-    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
-
-
 @pytest.mark.slow
-def test_a_killed_dagger_run_resumes_to_the_same_metrics(killed, tmp_path, capsys):
-    words = ["dagger", *TINY_DAGGER]
-    killed([*words, f"--output_dir={tmp_path / 'cut'}"], tmp_path / "cut" / "metrics.jsonl")
-    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true"]) == 0
-    assert main([*words, f"--output_dir={tmp_path / 'whole'}"]) == 0
-    assert metrics(tmp_path / "cut") == metrics(tmp_path / "whole")
-    assert [record["round"] for record in metrics(tmp_path / "cut")] == [0, 1]
-    assert files(tmp_path / "cut" / "dataset") == files(tmp_path / "whole" / "dataset")
+def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error):
+    run = tmp_path / "run"
+    words = ["dagger", *TINY_DAGGER, f"--output_dir={run}"]
+    assert main(words) == 0
     for name in ("config.yaml", "fingerprint.json", "report.html", "best/pretrained_model/model.safetensors"):
-        assert (tmp_path / "whole" / name).is_file()
-    capsys.readouterr()
-    assert main([*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true", "--beta=constant:0.5"]) == 1
-    assert "--beta differs" in one_error(capsys)
-    more = [*words, f"--output_dir={tmp_path / 'cut'}", "--resume=true", "--rounds=2"]
-    assert main(more) == 0
-    assert [record["round"] for record in metrics(tmp_path / "cut")] == [0, 1, 2]
-    assert dataset_info(tmp_path / "cut" / "dataset").episodes == 3 + 2 * 2
+        assert (run / name).is_file()
+    assert main([*words, "--resume=true", "--beta=constant:0.5"]) == 1
+    assert "--beta differs" in error()
+    assert main([*words, "--resume=true", "--rounds=2"]) == 0
+    assert [record["round"] for record in read_jsonl(run / "metrics.jsonl")] == [0, 1, 2]
+    assert dataset_info(run / "dataset").episodes == 3 + 2 * 2
 
 
 @pytest.mark.slow
-def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(story, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
+def test_the_quickstart_shows_every_policy_and_resumes(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(films, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the time
     sizes = [word for word in TINY_DAGGER if word != "--env.horizon=60"]
     words = ["quickstart", *sizes, "--test_episodes=2", "--disturbed_episodes=1", f"--output_dir={tmp_path / 'q'}"]
     assert main(words) == 0
@@ -290,4 +189,37 @@ def test_the_quickstart_tells_its_story_and_resumes(tmp_path, capsys, monkeypatc
 
 def test_a_command_line_can_be_copied_from_a_report():
     options = DaggerOptions(rounds=2, output_dir=Path("runs/a b"))
-    assert groups.command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
+    assert command_line("dagger", options) == "manip-il dagger --rounds=2 '--output_dir=runs/a b'"
+
+
+NAMES = ["cloning (round 0)", "DAgger, round 1"]
+
+
+def result(successes: int, n: int) -> EvalResult:
+    episodes = tuple(EpisodeResult(seed, seed < successes, seed < successes, 5, 0.0) for seed in range(n))
+    return EvalResult("p", "panda", "reach", {}, episodes, EvalSettings(100, 0.02))
+
+
+def rounds(*successes: int, n: int) -> list[Any]:
+    return [SimpleNamespace(round=index, validation=result(count, n)) for index, count in enumerate(successes)]
+
+
+def test_the_best_round_of_few_episodes_is_taken_and_not_shown_to_be_better():
+    said = best_verdict(NAMES, rounds(0, 0, n=4))
+    assert said.startswith("DAgger, round 1 is chosen of 2, with 0.0 %")
+    assert said.endswith("on 4 validation episodes; no difference from cloning (round 0) is shown.")
+    assert "no difference from DAgger, round 1 is shown" in best_verdict(NAMES, rounds(2, 1, n=4))
+    assert "no difference" in best_verdict(NAMES, rounds(0, 2, n=4))
+
+
+def test_the_best_round_of_many_episodes_is_the_best():
+    assert best_verdict(NAMES, rounds(50, 90, n=100)).startswith("DAgger, round 1 is the best of 2: 90.0 %")
+    assert best_verdict(NAMES, rounds(3, n=4)).startswith("cloning (round 0): 75.0 %")
+
+
+def test_the_quickstart_says_where_nothing_is_shown():
+    rows = [PolicyRow.of(name, result(1, 4)) for name in ("expert", "cloned", "more", "dagger")]
+    assert quickstart_verdict(rows, significant=False).endswith(
+        "no difference between DAgger and cloning with as many labels."
+    )
+    assert quickstart_verdict(rows, significant=True).endswith("with the first demonstrations alone.")

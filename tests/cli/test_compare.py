@@ -8,26 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.candidates import read_candidate
 from manip_il.cli.dagger import learning_curve
 from manip_il.cli.main import main
-from manip_il.cli.sides import read_side
 from manip_il.evaluation import runner
 
-from .made_runs import ENV, OPTIONS, make_eval, make_policy, make_run, mark
+from .made_runs import ENV, OPTIONS, make_eval, make_run, mark
 
 GOOD, BAD = [True] * 19 + [False], [True] * 8 + [False] * 12
 SIZES = ("--eval.n_episodes=2", "--workers=1")
-
-
-@pytest.fixture(scope="module")
-def policy(tmp_path_factory) -> Path:
-    return make_policy(tmp_path_factory.mktemp("made") / "policy")
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture
@@ -50,12 +39,6 @@ def compare(*words: object) -> int:
 
 def result(folder: Path = Path("runs/compare")) -> dict:
     return json.loads((folder / "compare.json").read_text())
-
-
-def error(capsys) -> str:
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_two_evaluations_are_compared_as_they_are(here, capsys, evaluated):
@@ -84,13 +67,13 @@ def test_of_a_run_the_rule_takes_the_round(here, policy, capsys):
     out = capsys.readouterr().out
     assert "within 240 labels" in out
     assert f"No difference shown between b and a: {'+0.0 points'}" in out
-    assert "compare a b --suite=disturbed --output_dir=runs/compare_disturbed --checkpoint=last" in out
+    assert "--suite=disturbed --workers=1 --output_dir=runs/compare_disturbed" in out
     assert compare("a", "b", *SIZES, "--overwrite=true") == 0
     pair = result()["training_seeds"][0]
     assert [pair[side]["chosen"]["round"] for side in ("left", "right")] == [1, 3]
 
 
-def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(here, policy, evaluated, capsys):
+def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(here, policy, evaluated, capsys, error):
     make_run(here / "a", policy)
     make_run(here / "b", policy)
     assert compare("a", "b", *SIZES) == 0
@@ -104,9 +87,9 @@ def test_what_is_measured_is_not_measured_again_unless_the_policy_is_another(her
     assert evaluated == ["a", "b", "b"]
     capsys.readouterr()
     assert compare("a", "b", *SIZES, "--resume=true", "--checkpoint=last") == 1
-    assert "--checkpoint differs" in error(capsys)
+    assert "--checkpoint differs" in error()
     assert compare("a", "b", *SIZES) == 2
-    assert "exists already" in error(capsys)
+    assert "exists already" in error()
 
 
 def test_training_seeds_are_matched_by_number(here, policy, capsys):
@@ -145,7 +128,7 @@ def test_a_run_keeps_its_learning_curve_where_a_loss_was_not_finite(here, policy
 def test_a_fit_whose_metrics_have_nan_is_a_policy_to_compare(here, policy):
     shutil.copytree(policy, here / "fit" / "checkpoints" / "last" / "pretrained_model")
     (here / "fit" / "metrics.jsonl").write_text('{"step": 1, "loss": 0.5, "grad_norm": NaN}\n')
-    (source,) = read_side(here / "fit").sources
+    (source,) = read_candidate(here / "fit").sources
     assert source.policy == here / "fit" / "checkpoints" / "last" / "pretrained_model"
 
 
@@ -203,19 +186,19 @@ def sides(here: Path, policy: Path) -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_bad_input_is_one_line_before_any_episode(words, code, line, here, policy, capsys, evaluated):
+def test_bad_input_is_one_line_before_any_episode(words, code, line, here, policy, evaluated, error):
     sides(here, policy)
     assert compare(*words) == code
-    assert line in error(capsys)
+    assert line in error()
     assert evaluated == []
     assert not (here / "runs").is_dir() or not list((here / "runs").iterdir())
 
 
-def test_runs_of_other_environments_are_refused_by_name(here, policy, capsys):
+def test_runs_of_other_environments_are_refused_by_name(here, policy, error):
     make_run(here / "a", policy)
     make_run(here / "b", policy)
     config = here / "b" / "config.yaml"
     config.write_text(config.read_text().replace("tolerance: 0.02", "tolerance: 0.03"))
     assert compare("a", "b", *SIZES) == 1
-    assert "tolerance differs: a has 0.02, b has 0.03" in error(capsys)
+    assert "tolerance differs: a has 0.02, b has 0.03" in error()
     assert OPTIONS.env.tolerance == 0.02

@@ -3,55 +3,37 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from manip_il.cli.kept_episodes import FILE_NAME as KEPT
+from manip_il.cli.eval_files import EPISODES_FILE as KEPT
 from manip_il.cli.main import main
-from manip_il.cli.suites import CONDITIONS, SUITES, suite_conditions
+from manip_il.cli.trials import CONDITIONS, SUITES, suite_conditions
 from manip_il.data import schema
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.environments import env_spec
 from manip_il.errors import UsageError
 from manip_il.evaluation.results import EvalResult
-from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
 
 from ..learn.tiny_policies import write_checkpoint
-from .made_runs import mark
+from .made_runs import make_policy, make_run, mark
 
 ENV = EnvConfig("fetch", "pick_place", horizon=10)
 SMALL = ["--robot.type=fetch", "--env.horizon=10", "--workers=1", "--eval.films=0"]
 REACH = ["--policy.type=expert", "--task.type=reach", *SMALL]
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="module")
 def act(tmp_path_factory) -> Path:
-    spec = env_spec(ENV)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
-    return write_checkpoint(tmp_path_factory.mktemp("act"), "act", spec, meta=meta)
+    return make_policy(tmp_path_factory.mktemp("act") / "act", ENV)
 
 
 def evaluate(folder: str, *words: str) -> int:
     return main(["eval", *words, f"--output_dir={folder}"])
-
-
-def error(capsys) -> str:
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
@@ -63,6 +45,8 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
     assert names == ["nominal", "knocked", "sensing", "object", "view"]
     assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == names[:-1]
     assert [one.name for one in suite_conditions("all", "reach", sees=False)] == names[:-2]
+    with pytest.raises(UsageError, match="changes nothing for reach"):
+        suite_conditions("object", "reach", sees=True)
 
 
 def test_knocked_is_the_disturbance_that_dagger_collects_under():
@@ -71,7 +55,7 @@ def test_knocked_is_the_disturbance_that_dagger_collects_under():
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
-    from manip_il.cli import suites
+    from manip_il.cli import trials
 
     expected = suite_conditions("all", "pick_place", sees=True)
     folder = tmp_path / "share" / "manip_il" / "suites"
@@ -79,7 +63,7 @@ def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch)
     for name in CONDITIONS:
         (folder / f"{name}.yaml").write_bytes((Path("configs/suites") / f"{name}.yaml").read_bytes())
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    monkeypatch.setattr(suites.manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
+    monkeypatch.setattr(trials.manip_il, "__file__", str(tmp_path / "lib" / "manip_il" / "__init__.py"))
     assert suite_conditions("all", "pick_place", sees=True) == expected
 
 
@@ -102,7 +86,7 @@ def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, 
     assert Path("e/report.html").read_text().count("<video") == 0
 
 
-def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys):
+def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys, error):
     Path("heavy.yaml").write_text("mass: [0.4, 0.5]\n")
     words = [f"--policy.path={act}", "--eval.n_episodes=2", *SMALL]
     assert evaluate("e", *words, "--suite=heavy.yaml") == 0
@@ -119,15 +103,11 @@ def test_a_yaml_of_ones_own_is_a_suite(act, here, capsys):
     ):
         Path("heavy.yaml").write_text(text)
         assert evaluate("f", *words, "--suite=heavy.yaml") == 2
-        assert what in error(capsys)
-    assert evaluate("f", *words, "--suite=none.yaml") == 2
-    assert "--suite=none.yaml: no such file" in error(capsys)
-    assert evaluate("f", *words, "--suite=nominall") == 2
-    assert "did you mean 'nominal'?" in error(capsys)
+        assert what in error()
     assert not Path("f").exists()
 
 
-def test_until_width_takes_a_hyphen_too_and_stops_early(here, capsys):
+def test_until_width_takes_a_hyphen_too_and_stops_early(here, capsys, error):
     words = ["--policy.type=random", "--task.type=reach", *SMALL, "--env.horizon=5", "--eval.n_episodes=300"]
     assert evaluate("e", *words, "--until-width=0.1") == 0
     assert "stopped after 100 episodes" in capsys.readouterr().out
@@ -135,11 +115,9 @@ def test_until_width_takes_a_hyphen_too_and_stops_early(here, capsys):
     assert (len(result.episodes), result.until_width) == (100, 0.1)
     low, high = result.success.interval
     assert high - low <= 0.1
-    assert evaluate("f", *words, "--until_width=2") == 2
-    assert "--until_width is 2.0; expected between 0 and 1" in error(capsys)
 
 
-def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys):
+def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys, error):
     assert evaluate("whole", *REACH, "--eval.n_episodes=5") == 0
     assert evaluate("a", *REACH, "--eval.n_episodes=3") == 0
     assert evaluate("b", *REACH, "--eval.n_episodes=2", "--eval.first=3") == 0
@@ -148,19 +126,13 @@ def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys):
     assert Path("ab/report.html").is_file()
     capsys.readouterr()
     assert main(["merge", "a", "whole", "--output_dir=c"]) == 1
-    assert "seed 4000000 is in a and in whole" in error(capsys)
+    assert "seed 4000000 is in a and in whole" in error()
     assert main(["merge", "a", "b", "--output_dir=ab"]) == 2
-    assert "--overwrite=true" in error(capsys)
-    assert main(["merge", "a"]) == 2
-    assert "two or more" in error(capsys)
-    assert main(["merge", "a", "a"]) == 2
-    assert "given twice" in error(capsys)
-    assert main(["merge"]) == 2
-    assert "FILES" in error(capsys)
+    assert "--overwrite=true" in error()
     assert not Path("c").exists()
 
 
-def test_a_resumed_evaluation_is_the_whole_one(here, capsys):
+def test_a_resumed_evaluation_is_the_whole_one(here, capsys, error):
     assert evaluate("whole", *REACH, "--eval.n_episodes=4") == 0
     assert evaluate("e", *REACH, "--eval.n_episodes=4") == 0
     kept = Path("e") / KEPT
@@ -173,58 +145,38 @@ def test_a_resumed_evaluation_is_the_whole_one(here, capsys):
     assert [one.seed for one in EvalResult.read(Path("e")).episodes] == list(range(4_000_000, 4_000_006))
     capsys.readouterr()
     assert evaluate("e", *REACH, "--eval.n_episodes=6", "--suite=sensing", "--resume=true") == 1
-    assert "--suite differs" in error(capsys)
+    assert "--suite differs" in error()
     assert evaluate("e", *REACH, "--eval.n_episodes=4") == 2
-    assert "--resume=true" in error(capsys)
+    assert "--resume=true" in error()
 
 
-def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys):
+def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, error):
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
     words = [f"--policy.path={act}", *SMALL, "--eval.n_episodes=1"]
     assert evaluate("e", *words) == 0
     (act / "model.safetensors").write_bytes((act / "model.safetensors").read_bytes()[:-4] + b"\0\0\1\0")
     capsys.readouterr()
     assert evaluate("e", *words, "--resume=true") == 1
-    assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error(capsys)
+    assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
 
 
-@pytest.mark.slow
-def test_a_killed_evaluation_keeps_what_was_done_and_goes_on(start, here):
-    words = ["eval", "--policy.type=expert", "--robot.type=fetch", "--eval.n_episodes=16", "--workers=2"]
-    words += ["--eval.films=0", "--suite=knocked"]
-    process = start(*words, f"--output_dir={here / 'cut'}", log=here / "log", warm=True)
-    kept = here / "cut" / KEPT
-    while not (kept.is_file() and kept.read_bytes().count(b"\n") > 3):
-        assert process.is_alive(), "it ended before it was killed"
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.join()
-    before = kept.read_bytes().count(b"\n")
-    assert 3 < before < 17
-    assert not (here / "cut" / "eval.json").exists()
-    assert main([*words, f"--output_dir={here / 'cut'}", "--resume=true"]) == 0
-    assert kept.read_bytes().count(b"\n") == 17
-    assert main([*words, "--output_dir=whole"]) == 0
-    assert (here / "cut" / "eval.json").read_bytes() == (here / "whole" / "eval.json").read_bytes()
-
-
-def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(here, capsys, monkeypatch):
+def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(here, monkeypatch, error):
     monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
     Path("file").touch()
     for folder in ("/proc/nothing/here", "file/below"):
         assert evaluate(folder, *REACH, "--eval.n_episodes=1") == 1
-        assert f"{folder} cannot be written to" in error(capsys)
+        assert f"{folder} cannot be written to" in error()
 
 
-def test_too_little_memory_is_said_before_the_first_episode(here, capsys, monkeypatch):
+def test_too_little_memory_is_said_before_the_first_episode(here, monkeypatch, error):
     monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
     monkeypatch.setattr("manip_il.engine.local.needed_memory", lambda *_, **__: 10**15)
     assert evaluate("e", *REACH, "--eval.n_episodes=1") == 1
-    assert "memory" in error(capsys)
+    assert "memory" in error()
     assert not Path("e").exists()
 
 
-def test_a_mounted_folder_is_emptied_where_another_would_be_replaced(here, capsys, monkeypatch):
+def test_a_mounted_folder_is_emptied_where_another_would_be_replaced(here, monkeypatch):
     assert evaluate("e", *REACH, "--eval.n_episodes=2") == 0
     Path("e/more").mkdir()
     Path("e/more/file").touch()
@@ -249,7 +201,7 @@ def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys)
         assert "warning" not in err
 
 
-def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys):
+def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
     path = Path("e/eval.json")
     data = json.loads(path.read_text())
@@ -258,23 +210,23 @@ def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys):
     path.write_text(json.dumps(data))
     capsys.readouterr()
     assert main(["replay", "e", "--episode=0"]) == 1
-    line = error(capsys)
+    line = error()
     assert "success was True, is False" in line
     assert "return was 3.0, is 0.0" in line
     assert main(["replay", "e", "--episode=1"]) == 1
-    assert "what is drawn for the episode differs" in error(capsys)
+    assert "what is drawn for the episode differs" in error()
     for index in (-1, 2):
         assert main(["replay", "e", f"--episode={index}"]) == 2
-        assert "has episodes 0 to 1" in error(capsys)
+        assert "has episodes 0 to 1" in error()
 
 
-def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys):
+def test_a_replay_finds_a_policy_that_has_moved_and_knows_another_one(here, capsys, error):
     act = write_checkpoint(here / "act", "act", env_spec(ENV))
     assert evaluate("e", "--policy.path=act", "--eval.n_episodes=1", "--task.type=pick_place", *SMALL) == 0
     act.rename(here / "moved")
     capsys.readouterr()
     assert main(["replay", "e", "--episode=0"]) == 2
-    assert "e is of act, which is not here" in error(capsys)
+    assert "e is of act, which is not here" in error()
     assert main(["replay", "e", "--episode=0", "--policy.path=moved"]) == 0
     assert "files differ" not in capsys.readouterr().err
     other = write_checkpoint(here / "other", "act", env_spec(ENV), chunk_size=4)
@@ -296,13 +248,8 @@ def test_failures_and_successes_are_filmed_and_a_replay_films_one(act, here):
     assert Path("deep/one.mp4").read_bytes() == (Path("bad/films") / names[1]).read_bytes()
 
 
-def test_without_opengl_the_report_shows_paths(act, here, capsys, monkeypatch):
-    from manip_il.errors import RenderError
-
-    def no_pictures(*_):
-        raise RenderError("no OpenGL here")
-
-    monkeypatch.setattr("manip_il.sim.env.pictures", no_pictures)
+@pytest.mark.usefixtures("no_opengl")
+def test_without_opengl_the_report_shows_paths(act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", "--eval.n_episodes=1", *SMALL, "--eval.films=1") == 0
     assert "no OpenGL here" in capsys.readouterr().err
     page = Path("e/report.html").read_text()
@@ -312,19 +259,9 @@ def test_without_opengl_the_report_shows_paths(act, here, capsys, monkeypatch):
     assert schema.SIM_STATE not in page
 
 
-def test_a_run_is_measured_with_its_learning_curve(here):
-    from .made_runs import make_policy, make_run
-
-    run = make_run(here / "run", make_policy(here / "policy"))
+def test_a_run_is_measured_with_its_learning_curve(here, policy):
+    run = make_run(here / "run", policy)
     mark(run / "best" / "pretrained_model", "best")
     words = ["--eval.n_episodes=1", "--workers=1", "--eval.films=0", "--env.horizon=8"]
     assert evaluate("e", "--policy.path=run", *words) == 0
     assert "round 2" in Path("e/report.html").read_text()
-
-
-def test_wrong_numbers_are_refused(here, capsys):
-    for word in ("--eval.n_episodes=0", "--eval.films=-1", "--eval.first=-1", "--eval.batch_size=0"):
-        assert evaluate("e", *REACH, word) == 2
-        assert word.partition("=")[0] in error(capsys)
-    with pytest.raises(UsageError, match="changes nothing for reach"):
-        suite_conditions("object", "reach", sees=True)

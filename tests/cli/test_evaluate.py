@@ -10,13 +10,13 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.errors import RenderError
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.look import CameraConfig, Look
 
 from ..learn.tiny_policies import edit_config, write_checkpoint
+from .made_runs import make_policy
 
 ENV = EnvConfig("panda", "reach", horizon=8)
 DIM = CameraConfig(("front",), 32, 32, Look(brightness=0.5))
@@ -29,9 +29,7 @@ def evaluate(policy: Path, folder: Path, *words: str) -> int:
 
 @pytest.fixture
 def act(tmp_path) -> Path:
-    spec = env_spec(ENV)
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV))
-    return write_checkpoint(tmp_path / "policy", "act", spec, meta=meta)
+    return make_policy(tmp_path / "policy", ENV)
 
 
 @pytest.fixture
@@ -45,13 +43,6 @@ def seeing(tmp_path) -> Path:
 def change_meta(policy: Path, **changes: object) -> None:
     path = policy / META_FILE
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
-def error(capsys) -> str:
-    """What went wrong: one line."""
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):
@@ -86,17 +77,12 @@ def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tm
     assert "how its pictures were lit" in capsys.readouterr().err
 
 
-def test_a_policy_of_pictures_does_not_mind_another_tasks_poses(seeing, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("manip_il.sim.env.pictures", lambda *_: (_ for _ in ()).throw(RenderError("no OpenGL here")))
-    assert evaluate(seeing, tmp_path / "e", "--task.type=lift") == 1
-    assert "no OpenGL here" in error(capsys)  # the poses are compared before
-
-
-def test_without_opengl_the_word_comes_before_the_first_episode(seeing, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("manip_il.sim.env.pictures", lambda *_: (_ for _ in ()).throw(RenderError("no OpenGL here")))
+@pytest.mark.usefixtures("no_opengl")
+@pytest.mark.parametrize("words", [(), ("--task.type=lift",)])  # it looks at no poses, so another task's are no matter
+def test_without_opengl_the_word_comes_before_the_first_episode(seeing, tmp_path, error, monkeypatch, words):
     monkeypatch.setattr(ManipEnv, "advance", None)
-    assert evaluate(seeing, tmp_path / "e") == 1
-    assert "no OpenGL here" in error(capsys)
+    assert evaluate(seeing, tmp_path / "e", *words) == 1
+    assert "no OpenGL here" in error()
     assert not (tmp_path / "e").exists()
 
 
@@ -131,9 +117,9 @@ def spoil(policy: Path, how: str) -> None:
         ("another state", 1, "the policy has 6, panda/reach has 8"),
     ],
 )
-def test_a_bad_checkpoint_is_one_line_before_the_first_step(how, code, words, act, tmp_path, capsys, monkeypatch):
+def test_a_bad_checkpoint_is_one_line_before_the_first_step(how, code, words, act, tmp_path, monkeypatch, error):
     monkeypatch.setattr(ManipEnv, "advance", None)
     spoil(act, how)
     assert evaluate(act, tmp_path / "e") == code
-    assert words in error(capsys)
+    assert words in error()
     assert not (tmp_path / "e").exists()

@@ -35,20 +35,6 @@ def write_run(folder: Path, kind: str = "mlp", observation: str = "state") -> Pa
     return write_checkpoint(place, kind, spec, observation, meta=meta)
 
 
-def complaint(capsys) -> str:
-    """The one line on standard error."""
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    return err.removeprefix("manip-il: error: ").strip()
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.mark.parametrize(("format_", "name"), [("onnx", "policy.onnx"), ("torchscript", "policy.pt")])
 def test_it_tells_what_goes_in_and_out_and_how_near_the_checkpoint_is(here, capsys, format_, name):
     policy = write_run(here / "run", "cnn", "both")
@@ -69,46 +55,39 @@ def test_it_tells_what_goes_in_and_out_and_how_near_the_checkpoint_is(here, caps
     assert policy_sha256(policy).encode() in (here / name).read_bytes()
 
 
-def test_a_file_that_is_there_stays_unless_told_otherwise(here, capsys):
+def test_a_file_that_is_there_stays_unless_told_otherwise(here, error, monkeypatch):
+    monkeypatch.setattr(command, "find_spec", lambda name: None)  # only ONNX needs its packages
     write_run(here / "run")
     (here / "mine.pt").write_bytes(b"mine")
     words = ["export", "run", "--format=torchscript", "--output=mine.pt"]
     assert main(words) == 2
-    assert complaint(capsys) == "mine.pt exists already; replace it with --overwrite=true, or choose another --output"
+    assert "mine.pt exists already; replace it with --overwrite=true, or choose another --output" in error()
     assert (here / "mine.pt").read_bytes() == b"mine"
     assert main([*words, "--overwrite=true"]) == 0
     assert (here / "mine.pt").read_bytes().startswith(b"PK")
     assert sorted(path.name for path in here.iterdir()) == ["mine.pt", "run"]
 
 
-def test_a_folder_is_no_file(here, capsys):
-    write_run(here / "run")
-    assert main(["export", "run", "--output=run"]) == 2
-    assert complaint(capsys) == "--output is run, a folder; expected a file such as run/policy.onnx"
-
-
-def test_the_policys_own_folder_stays_as_it_is(here, capsys):
-    policy = write_run(here / "run").relative_to(here)
-    assert main(["export", "run", f"--output={policy}/policy.pt", "--format=torchscript"]) == 2
-    expected = f"--output is {policy}/policy.pt, inside the policy's own folder {policy}; choose another place"
-    assert complaint(capsys) == expected
-    assert not (policy / "policy.pt").exists()
-
-
-def test_other_policies_are_refused_by_their_type(here, capsys):
-    policy = write_run(here / "run", "act")
-    assert main(["export", "run"]) == 1
-    assert (
-        complaint(capsys) == f"{policy.relative_to(here)} is a policy of type 'act'; only mlp and cnn can be exported"
-    )
-
-
-def test_a_missing_package_is_named_with_what_installs_it(here, capsys, monkeypatch):
-    write_run(here / "run")
+@pytest.mark.parametrize(
+    ("kind", "words", "code", "line"),
+    [
+        ("mlp", ["--output=run"], 2, "--output is run, a folder; expected a file such as run/policy.onnx"),
+        (
+            "mlp",
+            ["--output=POLICY/policy.pt", "--format=torchscript"],
+            2,
+            "--output is POLICY/policy.pt, inside the policy's own folder POLICY; choose another place",
+        ),
+        ("act", [], 1, "POLICY is a policy of type 'act'; only mlp and cnn can be exported"),
+        ("mlp", [], 1, "--format=onnx needs onnxruntime: pip install 'manip_il[export]'"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(here, error, monkeypatch, kind, words, code, line):
+    policy = str(write_run(here / "run", kind).relative_to(here))
     monkeypatch.setattr(command, "find_spec", lambda name: None if name == "onnxruntime" else object())
-    assert main(["export", "run"]) == 1
-    assert complaint(capsys) == "--format=onnx needs onnxruntime: pip install 'manip_il[export]'"
-    assert main(["export", "run", "--format=torchscript"]) == 0
+    assert main(["export", "run", *(word.replace("POLICY", policy) for word in words)]) == code
+    assert error() == f"manip-il: error: {line}".replace("POLICY", policy)
+    assert [path.name for path in here.iterdir()] == ["run"]
 
 
 def test_a_policy_of_another_tool_is_exported_with_a_warning(here, capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import re
 import subprocess
 import sys
@@ -15,14 +14,6 @@ import pytest
 from manip_il.cli import health
 from manip_il.cli.main import main
 from manip_il.errors import ManipError, RenderError
-
-
-def error(capsys) -> str:
-    """The one line that went wrong."""
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    [line] = captured.err.splitlines()
-    return line
 
 
 @pytest.fixture
@@ -51,10 +42,10 @@ def test_torch_is_not_imported_to_say_its_version():
 
 
 @pytest.mark.parametrize("backend", ["nonsense", "", "disable"])
-def test_a_wrong_backend_is_named_with_the_right_ones(backend, monkeypatch, capsys):
+def test_a_wrong_backend_is_named_with_the_right_ones(backend, monkeypatch, error):
     monkeypatch.setenv("MUJOCO_GL", backend)
     assert main(["health"]) == 1
-    assert f"MUJOCO_GL is {backend!r}; expected egl or osmesa" in error(capsys)
+    assert f"MUJOCO_GL is {backend!r}; expected egl or osmesa" in error()
 
 
 def test_without_any_backend_the_packages_are_named():
@@ -62,14 +53,14 @@ def test_without_any_backend_the_packages_are_named():
         health.check_backend(None)
 
 
-def test_opengl_that_fails_is_one_line(monkeypatch, capsys):
+def test_opengl_that_fails_is_one_line(monkeypatch, error):
     def fail(*_):
         raise RenderError("no off-screen OpenGL here")
 
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setattr("manip_il.sim.render.pictures", fail)
     assert main(["health"]) == 1
-    assert "no off-screen OpenGL here" in error(capsys)
+    assert "no off-screen OpenGL here" in error()
 
 
 def test_pictures_of_one_colour_are_no_pictures(monkeypatch):
@@ -80,15 +71,6 @@ def test_pictures_of_one_colour_are_no_pictures(monkeypatch):
         health.check_pictures({"front": scene, "wrist": np.zeros((8, 8, 3), dtype=np.uint8)})
 
 
-def test_nowhere_to_write_is_said(undrawn, monkeypatch, capsys):
-    def fail(*_):
-        raise FileNotFoundError(2, "No usable temporary directory found")
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
-    assert main(["health"]) == 1
-    assert "cannot create a temporary file (No usable temporary directory found); make /tmp writable" in error(capsys)
-
-
 def test_temporary_files_that_end_up_in_the_current_folder_are_said(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -96,13 +78,33 @@ def test_temporary_files_that_end_up_in_the_current_folder_are_said(tmp_path, mo
         health.check_temporary_folder()
 
 
-def test_processes_that_cannot_share_a_lock_are_said(undrawn, monkeypatch, capsys):
-    def fail():
-        raise PermissionError(13, "Permission denied")
+def fails(error: OSError):
+    def fail(*_):
+        raise error
 
-    monkeypatch.setattr(multiprocessing, "get_context", lambda _: SimpleNamespace(Lock=fail))
+    return fail
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("place", "stand_in", "says"),
+    [
+        (
+            "tempfile.TemporaryFile",
+            fails(FileNotFoundError(2, "No usable temporary directory found")),
+            "cannot create a temporary file (No usable temporary directory found); make /tmp writable",
+        ),
+        (
+            "multiprocessing.get_context",
+            lambda _: SimpleNamespace(Lock=fails(PermissionError(13, "Permission denied"))),
+            "/dev/shm writable",
+        ),
+    ],
+)
+def test_what_cannot_be_written_is_said(place, stand_in, says, monkeypatch, error):
+    monkeypatch.setattr(place, stand_in)
     assert main(["health"]) == 1
-    assert "/dev/shm writable" in error(capsys)
+    assert says in error()
 
 
 def test_little_free_memory_is_told_but_no_fault(undrawn, monkeypatch, capsys):

@@ -31,31 +31,15 @@ def dataset(tmp_path_factory) -> Path:
     return root
 
 
-def error(capsys) -> str:
-    captured = capsys.readouterr()
-    assert captured.err.count("manip-il: error:") == 1
-    return captured.err.splitlines()[-1]
-
-
 @pytest.mark.slow
-def test_export_then_import_gives_equal_numbers(dataset, tmp_path, capsys):
-    out, new = tmp_path / "out", tmp_path / "new"
+def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(dataset, tmp_path, capsys):
+    out, mapping = tmp_path / "out", tmp_path / "m.yaml"
     assert main(["mcap", "export", str(dataset), str(out)]) == 0
     assert f"manip-il mcap import {out} DATASET --mapping={out / 'mapping.yaml'}" in capsys.readouterr().out
-    assert main(["mcap", "import", str(out), str(new), f"--mapping={out / 'mapping.yaml'}"]) == 0
+    assert main(["mcap", "import", str(out), str(tmp_path / "all"), f"--mapping={out / 'mapping.yaml'}"]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert rows[0] == ["topic", "messages", "used", "unused"]
     assert ["/sim_state", "8", "8", "0"] in rows
-    left, right = read_table(dataset), read_table(new)
-    assert {key: values.tobytes() for key, values in left.items()} == {
-        key: values.tobytes() for key, values in right.items()
-    }
-
-
-@pytest.mark.slow
-def test_what_the_mapping_leaves_out_is_said(dataset, tmp_path, capsys):
-    out, mapping = tmp_path / "out", tmp_path / "m.yaml"
-    assert main(["mcap", "export", str(dataset), str(out)]) == 0
     feature = "{topic: /action, field: 'joints[name=b].position', dtype: float32, resample: hold, tolerance: 0.1}"
     mapping.write_text(f"fps: 10\ntask: t\nfeatures:\n  action: {feature}\n")
     assert main(["mcap", "import", str(out), str(tmp_path / "new"), f"--mapping={mapping}"]) == 0
@@ -65,50 +49,33 @@ def test_what_the_mapping_leaves_out_is_said(dataset, tmp_path, capsys):
     np.testing.assert_array_equal(read_table(tmp_path / "new")["action"], read_table(dataset)["action"][::2, 1])
 
 
-def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, capsys):
+def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, error):
     out = tmp_path / "out"
     words = ["mcap", "export", str(dataset), str(out)]
     assert main(words) == 0
     before = {path.name: path.read_bytes() for path in out.glob("*.mcap")}
     assert len(before) == 2
     assert main(words) == 2
-    assert "out exists already" in error(capsys)
+    assert "out exists already" in error()
     (out / "episode_000000.mcap").unlink()
     assert main([*words, "--overwrite=true"]) == 0
     assert {path.name: path.read_bytes() for path in out.glob("*.mcap")} == before
 
 
-def test_an_export_never_overwrites_its_own_dataset(dataset, capsys):
+def test_an_export_never_overwrites_its_own_dataset(dataset, error):
     for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
         assert main(["mcap", "export", str(dataset), str(out), "--overwrite=true"]) == 2
-        assert "holds the dataset itself" in error(capsys)
+        assert "holds the dataset itself" in error()
     assert len(read_table(dataset)["seed"]) == 8
 
 
-def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path, capsys):
+def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path, error):
     mapping = tmp_path / "m.yaml"
     mapping.write_text("fps: 10\ntask: t\nfeatures: {a: {topic: /a, video: true, resample: hold, tolerance: 1}}\n")
     (tmp_path / "a.mcap").touch()
     words = ["mcap", "import", str(tmp_path / "a.mcap"), str(dataset), f"--mapping={mapping}"]
     assert main(words) == 2
-    assert error(capsys).endswith("exists already; choose another folder, or delete it first")
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "why"),
-    [
-        (["expotr", "a", "b"], 2, "unknown command 'mcap expotr' (did you mean 'mcap export'?); known: mcap export, "),
-        (["export"], 2, "DATASET is missing"),
-        (["export", "nothing", "b"], 2, "nothing does not exist; expected the folder of a LeRobot dataset"),
-        (["import", "a", "b"], 2, "--mapping is missing"),
-        (["import", "a", "b", "--mapping=nothing.yaml"], 2, "a does not exist; expected an MCAP file"),
-        (["import", ".", "b", "--mapping=nothing.yaml"], 2, "nothing.yaml does not exist; expected a mapping file"),
-        (["import", "a", "b", "--maping=x"], 2, "(did you mean '--mapping'?)"),
-    ],
-)
-def test_wrong_words_are_one_line(words, code, why, capsys):
-    assert main(["mcap", *words]) == code
-    assert why in error(capsys)
+    assert error().endswith("exists already; choose another folder, or delete it first")
 
 
 def test_help_of_two_words(capsys):

@@ -1,3 +1,5 @@
+"""Options from words and YAML; a mistake is one short line."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
@@ -11,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.cli.options import CONFIG_HEADER, Open, dump_yaml, from_layers, from_yaml, options_of, parse, to_plain
-from manip_il.cli.values import expected, metavar
+from manip_il.cli.main import main
+from manip_il.cli.options import Open, expected, metavar, options_of, to_plain
+from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
 
 
@@ -262,3 +265,32 @@ def test_a_layers_error_says_which_layer():
 def test_an_open_options_dotted_name_may_stand_in_yaml(tmp_path):
     (tmp_path / "c.yaml").write_text("policy.width: 16\npolicy: {depth: 2}\n")
     assert from_yaml(tmp_path / "c.yaml", Fit).policy == {"width": 16, "depth": 2}
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(['*' + before] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize("command", ["dagger", "record", "quickstart"])
+def test_a_bomb_as_a_file_of_options_is_one_short_line(tmp_path, command: str, capsys):
+    (tmp_path / "bomb.yaml").write_text(BOMB)
+    assert main([command, f"--config_path={tmp_path / 'bomb.yaml'}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert len(error) < 1_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "dataset: [" + "1, " * 10_000 + "1]",
+        "seed: " + "x" * 100_000,
+        "cameras: {a: " + "y" * 100_000 + "}",
+        "x" * 1_000 + ": 1",
+    ],
+)
+def test_an_error_prints_of_a_large_value_as_much_as_one_reads(tmp_path, text: str, capsys):
+    (tmp_path / "x.yaml").write_text(text)
+    assert main(["record", f"--config_path={tmp_path / 'x.yaml'}"]) == 2
+    assert len(capsys.readouterr().err) < 1_000

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from manip_il.cli.dagger import DaggerOptions
+from manip_il.cli.common_options import TaskGroup
+from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
 from manip_il.cli.main import main
+from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.study import ROUND_0, same_start, share_start
 from manip_il.cli.study_file import read_plan
+from manip_il.data.lerobot_read import read_tables
 from manip_il.evaluation import runner
 
-from .made_runs import make_policy, make_run
+from .made_runs import make_run
 
 FILE = """
 common:
@@ -47,11 +52,6 @@ eval: {n_episodes: 4}
 """
 
 
-@pytest.fixture(scope="module")
-def policy(tmp_path_factory) -> Path:
-    return make_policy(tmp_path_factory.mktemp("made") / "policy")
-
-
 @pytest.fixture
 def here(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
@@ -76,12 +76,6 @@ def runs(policy, monkeypatch) -> list[DaggerOptions]:
 
 def study(*words: str) -> int:
     return main(["study", "x.yaml", "--output_dir=s", "--workers=1", *words])
-
-
-def error(capsys) -> str:
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_every_arm_runs_with_every_training_seed_and_its_own_options(here, runs):
@@ -144,13 +138,13 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, monkeypatc
         ("  cloning: {method: cloning}\n", "", "arms.cloning.method"),
     ],
 )
-def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs, capsys):
+def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs, capsys, error):
     assert study() == 0
     assert before in FILE
     (here / "x.yaml").write_text(FILE.replace(before, after))
     capsys.readouterr()
     assert study("--resume=true") == 1
-    assert f"{name} differs: s/study.yaml has" in error(capsys)
+    assert f"{name} differs: s/study.yaml has" in error()
     assert len(runs) == 4
 
 
@@ -177,18 +171,18 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         (FILE, "- 1", "expected a mapping"),
     ],
 )
-def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after, words, here, runs, capsys):
+def test_a_file_that_is_not_sound_is_one_line_before_anything_runs(before, after, words, here, runs, error):
     assert before in FILE
     (here / "x.yaml").write_text(FILE.replace(before, after, 1))
     assert study() in (1, 2)
-    assert words in error(capsys)
+    assert words in error()
     assert runs == []
     assert not (here / "s").exists()
 
 
-def test_a_file_that_is_not_there_is_one_line(tmp_path, capsys):
+def test_a_file_that_is_not_there_is_one_line(tmp_path, error):
     assert main(["study", str(tmp_path / "y.yaml")]) == 2
-    assert "y.yaml does not exist; expected the YAML of a study" in error(capsys)
+    assert "y.yaml does not exist; expected the YAML of a study" in error()
 
 
 def test_the_baseline_is_the_first_arm_unless_named(here):
@@ -199,7 +193,7 @@ def test_the_baseline_is_the_first_arm_unless_named(here):
 
 
 @pytest.mark.slow
-def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys):
+def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys, error):
     (tmp_path / "x.yaml").write_text(TINY)
     words = ["study", str(tmp_path / "x.yaml"), "--workers=1"]
     process = start(*words, f"--output_dir={tmp_path / 'cut'}", log=tmp_path / "log")
@@ -217,7 +211,7 @@ def test_a_killed_study_goes_on_to_the_same_answer(start, tmp_path, capsys):
     left, right = tmp_path / "cut" / "cloning", tmp_path / "whole" / "dagger"
     compared = ["compare", str(left), str(right), "--eval.n_episodes=4", "--workers=1", "--at=seconds:9999"]
     assert main([*compared, f"--output_dir={tmp_path / 'c'}"]) == 2
-    assert "not every run got that far" in error(capsys)
+    assert "not every run got that far" in error()
     assert main([*compared[:-1], f"--output_dir={tmp_path / 'c'}"]) == 0
     assert json.loads((tmp_path / "c" / "compare.json").read_text())["n_episodes"] == 4
 
@@ -233,3 +227,72 @@ def answer(folder: Path):
         return [strip(inner) for inner in value] if isinstance(value, list) else value
 
     return strip(data)
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> DaggerOptions:
+    return DaggerOptions(
+        task=TaskGroup("reach"),
+        demonstrations=2,
+        rounds=1,
+        episodes_per_round=2,
+        policy={"width": 16},
+        steps=20,
+        validation_episodes=2,
+        output_dir=tmp_path / "first",
+        workers=1,
+    )
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix in (".safetensors", ".parquet")]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("changes", [{"method": "cloning"}, {"label": "takeover"}, {"refit": "warm"}, {"rounds": 9}])
+def test_what_differs_after_the_first_round_begins_alike(options, changes):
+    assert same_start(options, replace(options, **changes))
+
+
+@pytest.mark.parametrize("changes", [{"seed": 1}, {"steps": 21}, {"policy": {}}, {"label_budget": 9}, {"ensemble": 2}])
+def test_what_differs_from_the_start_does_not(options, changes):
+    assert not same_start(options, replace(options, **changes))
+
+
+@pytest.mark.slow
+def test_a_shared_start_ends_with_the_same_bytes_and_is_charged_for_it(options, tmp_path):
+    options.run()
+    arm = replace(options, method="cloning", output_dir=tmp_path / "shared")
+    alone = replace(arm, output_dir=tmp_path / "alone")
+    alone.run()
+    assert share_start(arm, [replace(options, seed=3), options])
+    assert bytes_of(arm.output_dir / ROUND_0) == bytes_of(alone.output_dir / ROUND_0)
+    replace(arm, resume=True).run()
+    for part in (ROUND_0, "round_001"):
+        assert bytes_of(arm.output_dir / part) == bytes_of(alone.output_dir / part)
+    rounds = [read_jsonl(run.output_dir / METRICS_FILE) for run in (options, arm)]
+    assert rounds[0][0] == rounds[1][0]
+    assert len(rounds[1]) == 2
+    assert set(read_tables([arm.output_dir / "dataset"], ("actor",))["actor"].ravel()) == {0}
+
+
+def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options, tmp_path):
+    assert not share_start(options, [replace(options, output_dir=tmp_path / "nowhere")])
+    assert not options.output_dir.exists()
+    options.output_dir.mkdir()
+    assert not share_start(options, [options])
+
+
+STUDIES = sorted((Path(__file__).parents[2] / "configs/studies").glob("*.yaml"))
+
+
+def test_there_are_studies():
+    assert len(STUDIES) >= 4
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_a_study_that_comes_along_is_sound_and_says_its_own_command(path: Path):
+    plan = read_plan(path, None)
+    assert plan.baseline in plan.arms
+    first = path.read_text().splitlines()[0]
+    assert first == f"# manip-il study configs/studies/{path.name} --output_dir=runs/{path.stem}"

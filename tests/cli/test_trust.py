@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.groups import find_policy
+from manip_il.cli.inputs import find_policy
 from manip_il.cli.main import load, main
-from manip_il.cli.options import dump_yaml, options_of, parse
+from manip_il.cli.options import options_of
+from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.study_file import read_plan
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
@@ -59,13 +60,12 @@ def refused(words: list[str], capsys) -> None:
     assert "add --trust=true" in line
 
 
-def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, tmp_path, capsys):
+def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, policy, tmp_path, capsys):
     out = f"--output_dir={tmp_path / 'out'}"
     words = ["--env.horizon=8", "--workers=1", out]
     refused(["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words], capsys)
     refused(["certify", f"--policy.path={hostile}", "--cases=1", *words], capsys)
-    other = make_policy(tmp_path / "other")
-    refused(["compare", str(other), str(hostile), "--eval.n_episodes=1", *words], capsys)
+    refused(["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words], capsys)
     file = make_eval(tmp_path / "e" / "eval.json", [True, False])
     refused(["replay", str(file), "--episode=0", f"--policy.path={hostile}"], capsys)
     refused(["dagger", f"--policy.path={named}", out], capsys)
@@ -106,8 +106,8 @@ def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
     assert read_plan(path, None, trust=True).arms["a"].trust is True
 
 
-def test_a_run_means_its_best_policy_else_its_newest(tmp_path):
-    run = make_run(tmp_path / "run", make_policy(tmp_path / "p"))
+def test_a_run_means_its_best_policy_else_its_newest(tmp_path, policy):
+    run = make_run(tmp_path / "run", policy)
     assert find_policy(run) == run / "best" / "pretrained_model"
     shutil.rmtree(run / "best")
     assert find_policy(run) == run / "round_002" / "policy" / "checkpoints" / "last" / "pretrained_model"
@@ -115,8 +115,7 @@ def test_a_run_means_its_best_policy_else_its_newest(tmp_path):
     assert find_policy(run) == run / "round_001" / "policy" / "checkpoints" / "last" / "pretrained_model"
 
 
-def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path):
-    policy = make_policy(tmp_path / "p")
+def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path, policy):
     for step in ("000100", "020000", "001000"):
         shutil.copytree(policy, tmp_path / "run" / "checkpoints" / step / "pretrained_model")
     assert find_policy(tmp_path / "run") == tmp_path / "run" / "checkpoints" / "020000" / "pretrained_model"
@@ -125,8 +124,8 @@ def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path):
 
 
 @pytest.mark.parametrize("command", ["train", "dagger"])
-def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, tmp_path, monkeypatch):
-    run = make_run(tmp_path / "run", make_policy(tmp_path / "p"))
+def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, tmp_path, policy, monkeypatch):
+    run = make_run(tmp_path / "run", policy)
     monkeypatch.chdir(tmp_path)
     options = parse(load(command), [*REQUIRED.get(command, []), "--policy.path=run"])
     fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
@@ -143,8 +142,7 @@ def test_a_path_without_a_policy_is_one_line(command, value, tmp_path, monkeypat
     assert "policy" in err
 
 
-def test_eval_on_another_task_than_the_policys_says_which(tmp_path, capsys):
-    policy = make_policy(tmp_path / "p")
+def test_eval_on_another_task_than_the_policys_says_which(tmp_path, policy, capsys):
     words = [f"--policy.path={policy}", "--task.type=lift", "--eval.n_episodes=1", f"--output_dir={tmp_path / 'e'}"]
     assert main(["eval", *words]) == 1
     assert "task differs: the policy has reach, the environment has lift" in capsys.readouterr().err

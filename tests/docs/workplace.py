@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from manip_il.cli.main import load, main
-from manip_il.cli.options import parse
+from manip_il.cli.parsing import parse
 from manip_il.tasks.table import TASKS
 
 from .pages import ROOT, Block, Line, command_of, shell_lines

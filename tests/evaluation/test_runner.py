@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from manip_il.cli.suites import suite_conditions
+from manip_il.cli.trials import suite_conditions
 from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job

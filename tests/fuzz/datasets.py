@@ -149,7 +149,7 @@ def _export(folder: Path) -> None:
 
 def _learn(folder: Path) -> None:
     """What `train` does with a dataset before it fits."""
-    from manip_il.cli.groups import check_dataset
+    from manip_il.cli.inputs import check_dataset
     from manip_il.learn.columns import LEARNING_COLUMNS, check_table, learning_rows
 
     root = folder / "dataset"

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from manip_il.cli import quickstart
 from manip_il.cli.main import COMMANDS, load
-from manip_il.cli.options import dump_yaml, options_of, parse
+from manip_il.cli.options import options_of
+from manip_il.cli.parsing import dump_yaml, parse
 
 from .target import Read, Target, command
 from .trees import mutate_json, mutate_json_lines, mutate_yaml
@@ -65,7 +66,7 @@ def _same_study(folder: Path) -> None:
 
 
 def _read_suite(folder: Path) -> None:
-    from manip_il.cli.suites import suite_conditions
+    from manip_il.cli.trials import suite_conditions
     from manip_il.evaluation.results import EvalSettings
 
     conditions = suite_conditions(str(folder / "suite.yaml"), "pick_place", sees=True)
@@ -94,7 +95,7 @@ def _compare(folder: Path) -> None:
 
 def _replay(folder: Path) -> None:
     """What `replay` makes of an evaluation before it runs anything."""
-    from manip_il.cli.replay import ReplayOptions
+    from manip_il.cli.eval_files import ReplayOptions
     from manip_il.evaluation.results import EvalResult
 
     result = EvalResult.read(folder / "left")
@@ -112,12 +113,12 @@ def make_kept(folder: Path) -> None:
 
 
 def _kept(folder: Path):
-    from manip_il.cli.kept_episodes import KeptEpisodes
+    from manip_il.cli.eval_files import EpisodeJournal
     from manip_il.engine.jobs import RolloutJob
 
     from ..cli.made_runs import ENV
 
-    return KeptEpisodes.open(folder, RolloutJob(ENV, "expert", label="last"), "nominal", "eval")
+    return EpisodeJournal.open(folder, RolloutJob(ENV, "expert", label="last"), "nominal")
 
 
 def _read_kept(folder: Path) -> None:
@@ -136,19 +137,19 @@ def make_run(folder: Path) -> None:
 
 
 def _side(folder: Path) -> None:
-    from manip_il.cli.sides import limit_of, read_side
+    from manip_il.cli.candidates import limit_of, read_candidate
     from manip_il.evaluation.rounds import Rule
 
     for at in ("end", "labels", "seconds"):
         rule = Rule.parse("best", at)
-        for source in (side := read_side(folder / "run")).sources:
-            source.chosen(rule, limit_of(rule, side.sources))
+        for source in (side := read_candidate(folder / "run")).sources:
+            source.select(rule, limit_of(rule, side.sources))
 
 
 def _resume_dagger(folder: Path) -> None:
     """What `dagger --resume=true` reads before it goes on."""
-    from manip_il.cli.groups import check_same_options
-    from manip_il.cli.sides import run_history
+    from manip_il.cli.candidates import run_history
+    from manip_il.cli.outputs import check_same_options
 
     from ..cli.made_runs import OPTIONS
 
@@ -168,7 +169,7 @@ def make_timings(folder: Path) -> None:
 
 
 def _read_timings(folder: Path) -> None:
-    quickstart._read_timings(folder / "timings.json")
+    quickstart.read_timings(folder / "timings.json")
 
 
 def make_store(folder: Path) -> None:

@@ -53,8 +53,7 @@ def _resume(folder: Path) -> None:
 
 def _load(folder: Path) -> None:
     """What `eval` does with a policy before the first episode."""
-    from manip_il.cli.groups import find_policy
-    from manip_il.cli.policy_check import check_policy
+    from manip_il.cli.inputs import check_policy, find_policy
     from manip_il.learn.checkpoint import read_meta
 
     from ..cli.made_runs import ENV
@@ -64,7 +63,7 @@ def _load(folder: Path) -> None:
 
 
 def _describe(folder: Path) -> None:
-    from manip_il.cli.groups import find_policy
+    from manip_il.cli.inputs import find_policy
     from manip_il.engine.environments import policy_sha256
     from manip_il.learn.pretrained import read_interface
     from manip_il.store.cards import card_for

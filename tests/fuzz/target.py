@@ -14,7 +14,7 @@ from pathlib import Path
 from random import Random
 
 from manip_il.cli.main import LONGEST_LINE, PROGRAM, _report, load
-from manip_il.cli.options import parse
+from manip_il.cli.parsing import parse
 from manip_il.errors import ManipError
 
 LARGEST = 1024  # [MB] beyond what the process held before

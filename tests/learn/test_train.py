@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from manip_il import checks
-from manip_il.cli.folders import read_jsonl
+from manip_il.cli.outputs import read_jsonl
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta, check_fits, publish, read_meta, recorded_look
 from manip_il.learn.columns import learning_rows, split_by_episode

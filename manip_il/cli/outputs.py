@@ -5,16 +5,34 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
-from manip_il.cli.options import CONFIG_HEADER
-from manip_il.data.atomic import PARTIAL, write_file, writing
-from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+from manip_il.cli.options import options_of, value_of
+from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
+from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
+from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
 
-_MARKS = ("config.yaml", "eval.json", "meta")  # by which `require_ours` knows a folder
+CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
+_MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
+
+
+@contextmanager
+def open_output(options: Any, free: Iterable[str] = (), may_grow: str | None = None) -> Generator[Path]:
+    """Hold and prepare `options.output_dir`, and write `config.yaml` into it.
+
+    A run that is resumed must have the same options as before, see `check_same_options`.
+    """
+    folder, resume = options.output_dir, getattr(options, "resume", False)
+    with exclusive(folder):
+        prepare_output(folder, resume=resume, overwrite=options.overwrite)
+        if resume:
+            check_same_options(folder, options, free, may_grow)
+        save_options(folder, options)
+        yield folder
 
 
 def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
@@ -25,14 +43,14 @@ def prepare_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     """
     check_output(folder, resume=resume, overwrite=overwrite)
     for path in folder.rglob(f".*{PARTIAL}") if resume else ():
-        if path.is_file():  # a folder has a lock of its own, and goes with the next writer
+        if path.is_file():  # a folder has a lock of its own, and is removed by the next writer
             path.unlink()
     if overwrite and folder.exists() and any(folder.iterdir()):
         _delete(folder)
 
 
 def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise what would keep `prepare_output` from its work; nothing is changed.
+    """Raise where `prepare_output` would fail; nothing is changed.
 
     `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
     program did not make.
@@ -50,6 +68,49 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not overwrite:
         raise FolderExistsError(folder)
     require_ours(folder)
+
+
+def require_output(folder: Path, command: str, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Raise `UsageError` where a command cannot begin to write to `folder`, or has nothing in it to resume."""
+    check_output(folder, resume=resume, overwrite=overwrite)
+    if resume and not (folder.is_dir() and any(folder.iterdir())):
+        raise UsageError(
+            f"--resume=true: nothing to resume in {folder}; expected what an earlier manip-il {command} left there "
+            "(leave out --resume=true to start)"
+        )
+
+
+def require_new(folder: Path, *, overwrite: bool = False) -> None:
+    """Raise `UsageError` where a command that cannot be resumed may not write to `folder`."""
+    try:
+        check_output(folder, resume=False, overwrite=overwrite)
+    except FolderExistsError:
+        raise UsageError(f"{folder} exists already; replace it with --overwrite=true") from None
+
+
+def save_options(folder: Path, options: Any) -> None:
+    """Write the resolved options to `folder/config.yaml`."""
+    atomic_write(folder / CONFIG_FILE, dump_yaml(options))
+
+
+def check_same_options(folder: Path, options: Any, free: Iterable[str], may_grow: str | None = None) -> None:
+    """Raise `MismatchError` naming the option unless the run in `folder` was started with the same options.
+
+    free: options that may differ. may_grow: one that may be larger than it was. A folder that is not there or
+    empty is no run yet; one without `config.yaml` is none of ours (`UsageError`).
+    """
+    path = folder / CONFIG_FILE
+    # A run that was killed at once leaves at most half a file, under a hidden name.
+    if not folder.is_dir() or all(path.name.startswith(".") for path in folder.iterdir()):
+        return
+    if not path.is_file():
+        raise UsageError(f"{folder} holds no {CONFIG_FILE}, so there is no run to continue; choose another folder")
+    before = from_yaml(path, type(options))
+    for known in options_of(type(options)):
+        was, now = value_of(before, known.name), value_of(options, known.name)
+        grown = known.name == may_grow and now >= was
+        if was != now and known.name not in (*free, "resume", "overwrite") and not grown:
+            raise MismatchError(f"--{known.name}", str(path), was, "the command line", now)
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
@@ -111,7 +172,7 @@ def _is_ours(folder: Path) -> bool:
     config = folder / "config.yaml"
     if config.is_file() and config.read_bytes().startswith(CONFIG_HEADER.encode()):
         return True
-    # Any LeRobot dataset has meta/info.json; one with both actions is from here.
+    # Any LeRobot dataset has meta/info.json; only ours has both actions.
     features = _json_object(folder / "meta" / "info.json").get("features")
     if isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys():
         return True
@@ -119,16 +180,16 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _json_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file, or an empty one."""
+    """Return the object in a JSON file, or an empty one."""
     return (_record(path.read_bytes()) or {}) if path.is_file() else {}
 
 
 def _delete(folder: Path) -> None:
-    if folder.is_mount():  # in a container: it can be emptied, not renamed; what marks it as ours goes last
+    if folder.is_mount():  # in a container: it can be emptied, not renamed; the mark of ours is deleted last
         for path in sorted(folder.iterdir(), key=lambda path: path.name in _MARKS):
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         return
-    # Renamed first: a kill on the way leaves no folder that has lost its mark but not its files.
+    # Renamed first: after a kill in between, no folder is left that has files but not the mark of ours.
     doomed = folder.with_name(f".{folder.name}.deleting.{os.getpid()}")
     folder.rename(doomed)
     shutil.rmtree(doomed)
@@ -170,7 +231,7 @@ def _require_record(path: Path, number: int, line: bytes) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Numpy scalars and arrays, and paths, as JSON has them."""
+    """Return numpy scalars and arrays, and paths, as JSON values."""
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):

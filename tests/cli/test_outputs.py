@@ -1,6 +1,9 @@
+"""Output folders: what a kill leaves, what may be overwritten, and one command at a time."""
+
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.cli.folders import append_jsonl, atomic_write, prepare_output, read_jsonl
-from manip_il.cli.groups import CONFIG_FILE, check_same_options
-from manip_il.cli.options import CONFIG_HEADER
+from manip_il.cli.main import main
+from manip_il.cli.outputs import CONFIG_FILE, append_jsonl, atomic_write, check_same_options, prepare_output, read_jsonl
+from manip_il.cli.parsing import CONFIG_HEADER
 from manip_il.cli.record import DatasetGroup, RecordOptions
-from manip_il.data.atomic import WriteError
-from manip_il.errors import FolderExistsError, ManipError, NotFiniteError, UsageError
+from manip_il.data.atomic import exclusive
+from manip_il.errors import FolderBusyError, FolderExistsError, ManipError, NotFiniteError, UsageError
+
+from .made_runs import make_eval
 
 
 @pytest.fixture
@@ -27,20 +32,18 @@ def overwrite(folder: Path) -> None:
     prepare_output(folder, resume=False, overwrite=True)
 
 
-def test_a_new_or_empty_folder_is_fine(tmp_path):
+def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_on(ours, tmp_path):
     prepare_output(tmp_path / "new", resume=False, overwrite=False)
-    prepare_output(tmp_path, resume=False, overwrite=False)
     prepare_output(tmp_path / "new", resume=True, overwrite=False)
-
-
-def test_a_folder_that_holds_something_is_refused_with_the_ways_on(ours):
+    (tmp_path / "empty").mkdir()
+    prepare_output(tmp_path / "empty", resume=False, overwrite=False)
     with pytest.raises(FolderExistsError, match=r"--resume=true.*--overwrite=true"):
         prepare_output(ours, resume=False, overwrite=False)
-
-
-def test_resume_leaves_everything(ours):
-    prepare_output(ours, resume=True, overwrite=False)
-    assert (ours / "config.yaml").exists()
+    with pytest.raises(UsageError, match="contradict"):
+        prepare_output(ours, resume=True, overwrite=True)
+    (tmp_path / "x").touch()
+    with pytest.raises(UsageError, match="is a file"):
+        prepare_output(tmp_path / "x", resume=True, overwrite=False)
 
 
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
@@ -56,11 +59,6 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
     (tmp_path / "episode.mcap").touch()
     with pytest.raises(UsageError, match=r"holds no config\.yaml"):
         check_same_options(tmp_path, options, ())
-
-
-def test_resume_and_overwrite_contradict(ours):
-    with pytest.raises(UsageError, match="contradict"):
-        prepare_output(ours, resume=True, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -118,26 +116,6 @@ def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monk
     assert (ours / "config.yaml").exists()
 
 
-def test_a_file_in_place_of_a_folder_is_refused(tmp_path):
-    atomic_write(tmp_path / "x", "")
-    with pytest.raises(UsageError, match="is a file"):
-        prepare_output(tmp_path / "x", resume=True, overwrite=False)
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / "a" / "x.json"
-    atomic_write(path, b"old")
-
-    def full_disk(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(WriteError, match=f"cannot write {path}: No space"):
-        atomic_write(path, "new")
-    assert path.read_bytes() == b"old"
-    assert list(path.parent.iterdir()) == [path]
-
-
 def test_records_come_back_in_order(tmp_path):
     path = tmp_path / "m" / "metrics.jsonl"
     assert read_jsonl(path) == []
@@ -179,3 +157,61 @@ def test_numbers_that_are_not_finite_are_missing(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1, "grad_norm": NaN}\n{"step": 2, "grad_norm": null, "x": [Infinity, -Infinity]}\n')
     assert read_jsonl(path) == [{"step": 1, "grad_norm": None}, {"step": 2, "grad_norm": None, "x": [None, None]}]
+
+
+SAMPLE = Path(__file__).resolve().parents[2] / "datasets" / "sample"
+STUDY = "common: {task.type: reach}\narms: {cloning: {method: cloning}, dagger: {}}\ntraining_seeds: 1\n"
+COMMANDS = {
+    "eval": ["--policy.type=expert", "--robot.type=fetch", "--task.type=reach", "--workers=1"],
+    "dagger": [],
+    "train": [f"--dataset.root={SAMPLE}", "--steps=1"],
+    "compare": ["left.json", "right.json"],
+    "merge": ["left.json", "right.json"],
+    "study": ["study.yaml"],
+    "certify": ["--robot.type=fetch", "--task.type=reach", "--workers=1"],
+    "quickstart": [],
+}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    make_eval(tmp_path / "left.json", [True, False])
+    make_eval(tmp_path / "right.json", [False, False], seed=4_000_002)
+    (tmp_path / "study.yaml").write_text(STUDY)
+    return tmp_path
+
+
+@pytest.mark.parametrize("how", ["", "--overwrite=true"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_that_is_in_use_is_refused(command, how, here, capsys):
+    if command == "compare":  # on the same episodes
+        make_eval(here / "right.json", [False, False])
+    out = here / "out"
+    with exclusive(out):
+        assert main([command, *COMMANDS[command], f"--output_dir={out}", *([how] if how else [])]) == 1
+        errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
+        assert errors == [
+            f"manip-il: error: {out} is in use by process {os.getpid()}; wait until that is done, or choose another "
+            "folder"
+        ]
+        assert not out.exists()
+
+
+def test_where_nothing_may_be_written_beside_it_the_folder_itself_is_held(tmp_path, monkeypatch):
+    folder = tmp_path / "volume"
+    folder.mkdir()
+
+    def refused(*_: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("manip_il.data.atomic._lock", refused)
+    with exclusive(folder):
+        with pytest.raises(FolderBusyError), exclusive(folder):
+            pass
+        assert [path.name for path in tmp_path.iterdir()] == ["volume"]
+        assert list(folder.iterdir()) == []
+    with exclusive(folder):
+        pass
+    with pytest.raises(PermissionError), exclusive(tmp_path / "new"):
+        pass

@@ -1,4 +1,4 @@
-"""What a comparison is given: an evaluation, a policy, a DAgger run, or a folder of one of these a training seed."""
+"""What is compared: an evaluation, a policy, a DAgger run, or a folder with one of these for each training seed."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manip_il.cli.folders import read_jsonl
-from manip_il.cli.groups import CONFIG_FILE, DEFAULT_ROBOT, DEFAULT_TASK, EnvGroup, find_policy
-from manip_il.cli.options import from_yaml
-from manip_il.cli.paths import hub_hint
+from manip_il.cli.common_options import EnvGroup
+from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
+from manip_il.cli.inputs import find_policy, hub_hint
+from manip_il.cli.outputs import CONFIG_FILE, read_jsonl
+from manip_il.cli.parsing import from_yaml
+from manip_il.cli.progress import Stages
+from manip_il.cli.trials import Trial
 from manip_il.errors import MismatchError, UsageError
+from manip_il.evaluation.comparison import Measured
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import END, History, Round, Rule, budget, choose, history
 
 if TYPE_CHECKING:
-    from manip_il.cli.dagger import DaggerOptions
-    from manip_il.sim.env import EnvConfig
+    from manip_il.engine.engine import Engine
+    from manip_il.sim.config import EnvConfig
 
-METRICS_FILE = "metrics.jsonl"
-SEED_FOLDER = re.compile(r"seed_(\d+)")
-EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
+_SEED_FOLDER = re.compile(r"seed_(\d+)")
+_EXPECTED = "expected an eval.json, a policy, a run of manip-il dagger, or a folder of seed_0, seed_1, ... of these"
 
 
 @dataclass(frozen=True)
 class Source:
-    """One policy to compare, or what was found of one.
+    """One policy to compare, or an evaluation or a run of one.
 
     training_seed: None where nothing says it. result: of an evaluation that is taken as it is. policy: a policy that
     is no run's. history, env, finished: of a run; env is None where its options are not beside it.
@@ -43,42 +46,60 @@ class Source:
 
     @property
     def name(self) -> str:
-        """For tables and errors."""
+        """Path, for tables and errors."""
         return str(self.path)
 
-    def chosen(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
-        """Return the policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
+    def select(self, rule: Rule, limit: float | None) -> tuple[Path, Round | None]:
+        """Return the policy's folder, and the round that `rule` selects of a run; `UsageError` where there is none."""
         if self.policy is not None:
             return self.policy, None
         round_ = choose(rule, self.history, limit, self.name)
         return round_policy(self.path, round_.round), round_
 
+    def measure(
+        self, rule: Rule, limit: float | None, trial: Trial | None, folder: Path, engine: Engine, stages: Stages
+    ) -> Measured:
+        """Return the evaluation itself, or that of the policy that `rule` selects, which is stored in `folder`."""
+        if self.result is not None or trial is None:
+            return Measured(self.name, self.evaluation, self.path, self.training_seed)
+        policy, round_ = self.select(rule, limit)
+        file = trial.file(folder, policy)
+        result = replace(trial.measure(policy, self.name, file, engine, stages), policy=self.name)
+        return Measured(self.name, result, file, self.training_seed, policy, round_, self.history)
+
+    @property
+    def evaluation(self) -> EvalResult:
+        """The evaluation, of a source that is one."""
+        assert self.result is not None
+        return self.result
+
 
 @dataclass(frozen=True)
-class Side:
-    """LEFT or RIGHT: one source, or one a training seed (`several`)."""
+class Candidate:
+    """LEFT or RIGHT: one source, or one for each training seed (`several`)."""
 
     path: Path
     sources: tuple[Source, ...]
     several: bool = False
 
 
-def require_side(path: Path) -> None:
+def require_candidate(path: Path) -> None:
     """Raise `UsageError` where nothing is at `path`."""
     if not path.exists():
-        raise UsageError(f"{path} does not exist; {EXPECTED}{hub_hint(path)}")
+        raise UsageError(f"{path} does not exist; {_EXPECTED}{hub_hint(path)}")
 
 
-def read_side(path: Path) -> Side:
-    """What lies at `path`; `UsageError` in one line where it is nothing that can be compared."""
-    require_side(path)
-    seeds = seed_folders(path) if path.is_dir() else {}
+def read_candidate(path: Path) -> Candidate:
+    """Return what lies at `path`; `UsageError` in one line where it is nothing that can be compared."""
+    require_candidate(path)
+    folders = [folder for folder in path.iterdir() if folder.is_dir()] if path.is_dir() else []
+    seeds = {int(match[1]): folder for folder in folders if (match := _SEED_FOLDER.fullmatch(folder.name))}
     if not seeds:
-        return Side(path, (_read_source(path),))
-    return Side(path, tuple(_of_seed(folder, seed) for seed, folder in sorted(seeds.items())), several=True)
+        return Candidate(path, (_read_source(path),))
+    return Candidate(path, tuple(_of_seed(folder, seed) for seed, folder in sorted(seeds.items())), several=True)
 
 
-def matched(left: Side, right: Side) -> tuple[Side, Side, list[str]]:
+def match_seeds(left: Candidate, right: Candidate) -> tuple[Candidate, Candidate, list[str]]:
     """Return both sides with the training seeds that both have, and a line for each side that loses some.
 
     Raises `UsageError` where a single policy meets several training seeds, or none is shared.
@@ -95,15 +116,15 @@ def matched(left: Side, right: Side) -> tuple[Side, Side, list[str]]:
     shared = ours & theirs
     if not shared:
         raise UsageError(
-            f"no training seed is shared: {left.path} has {_listed(ours)}, {right.path} {_listed(theirs)}; runs are "
+            f"no training seed is shared: {left.path} has {_numbers(ours)}, {right.path} {_numbers(theirs)}; runs are "
             "paired by seed"
         )
     lines = [
-        f"{side.path}: training seeds {_listed(seeds - shared)} have no partner and are left out"
+        f"{side.path}: training seeds {_numbers(seeds - shared)} have no partner and are left out"
         for side, seeds in ((left, ours), (right, theirs))
         if seeds - shared
     ]
-    return _only(left, shared), _only(right, shared), lines
+    return _with_seeds(left, shared), _with_seeds(right, shared), lines
 
 
 def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
@@ -143,12 +164,6 @@ def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) ->
             raise MismatchError(field.name, left, ours, right, theirs)
 
 
-def seed_folders(path: Path) -> dict[int, Path]:
-    """Return training seed -> its folder in `path`."""
-    named = ((SEED_FOLDER.fullmatch(folder.name), folder) for folder in path.iterdir() if folder.is_dir())
-    return {int(match.group(1)): folder for match, folder in named if match}
-
-
 def run_history(folder: Path) -> History:
     """Return the rounds of a DAgger run so far."""
     return history(read_jsonl(folder / METRICS_FILE), str(folder))
@@ -172,15 +187,17 @@ def _read_source(path: Path) -> Source:
     options = _run_options(path)
     records = read_jsonl(path / METRICS_FILE) if (path / METRICS_FILE).is_file() else []
     if options is not None or any("round" in record for record in records):  # `manip-il train` counts steps there
-        env = None if options is None else options.env.config(options.robot.type, options.task.type)
-        rounds, seed = history(records, str(path)), None if options is None else options.seed
-        return Source(path, seed, history=rounds, env=env, finished=run_finished(path))
+        source = Source(path, history=history(records, str(path)), finished=run_finished(path))
+        if options is None:
+            return source
+        env = options.env_config()
+        return replace(source, training_seed=options.seed, env=env)
     if (path / FILE_NAME).is_file():
         return Source(path, result=EvalResult.read(path))
     try:
         return Source(path, policy=find_policy(path))
     except UsageError:
-        raise UsageError(f"{path} holds nothing to compare; {EXPECTED}") from None
+        raise UsageError(f"{path} holds nothing to compare; {_EXPECTED}") from None
 
 
 def _of_seed(folder: Path, seed: int) -> Source:
@@ -191,9 +208,7 @@ def _of_seed(folder: Path, seed: int) -> Source:
 
 
 def _run_options(folder: Path) -> DaggerOptions | None:
-    """The options of the DAgger run in `folder`; None where it is none."""
-    from manip_il.cli.dagger import DaggerOptions
-
+    """Return the options of the DAgger run in `folder`; None where there is no such run."""
     path = folder / CONFIG_FILE
     if not path.is_file() or f"({DaggerOptions.__name__})" not in path.read_text(errors="replace").partition("\n")[0]:
         return None
@@ -203,20 +218,18 @@ def _run_options(folder: Path) -> DaggerOptions | None:
 def _policy_env(
     source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: str | None
 ) -> EnvConfig:
-    """Of a policy, which knows its robot, task and rate, but neither tolerance nor horizon."""
+    """Return the environment of a policy, whose checkpoint holds robot, task and rate, but no tolerance or horizon."""
     from manip_il.learn.checkpoint import read_meta
 
     meta = read_meta(source.policy or round_policy(source.path, 0))
     if run is not None:
         return run if meta is None else replace(run, robot=meta.robot, task=meta.task, control_hz=meta.fps)
-    robot = robot or (meta.robot if meta else DEFAULT_ROBOT)
-    task = task or (meta.task if meta else DEFAULT_TASK)
-    return group.config(robot, task, meta.fps) if meta else group.config(robot, task)
+    return group.config(robot, task, meta)
 
 
-def _only(side: Side, seeds: set[int | None]) -> Side:
-    return replace(side, sources=tuple(source for source in side.sources if source.training_seed in seeds))
+def _with_seeds(candidate: Candidate, seeds: set[int | None]) -> Candidate:
+    return replace(candidate, sources=tuple(source for source in candidate.sources if source.training_seed in seeds))
 
 
-def _listed(seeds: Iterable[int | None]) -> str:
+def _numbers(seeds: Iterable[int | None]) -> str:
     return ", ".join(str(seed) for seed in sorted(seed for seed in seeds if seed is not None))

@@ -1,4 +1,4 @@
-"""Help and mistakes are answered before anything heavy is imported."""
+"""Mistakes are one line and exit code 2; like help, they are answered before anything heavy is imported."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from manip_il.cli.main import COMMANDS, load
+from manip_il.cli.main import COMMANDS, load, main
 from manip_il.cli.options import options_of
 
 SLOW = ["torch", "lerobot"]  # seconds
@@ -70,6 +70,7 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
     no_dataset = "missing does not exist; expected the folder of a LeRobot dataset"
     mistakes(
         {
+            "train": "--dataset.root is missing",
             "train --dataset.root=missing": no_dataset,
             f"train --dataset.root={ROOT / 'docs'}": "is not a LeRobot dataset: it has no meta/info.json",
             f"train --dataset.root={SAMPLE.parent}": "it holds the datasets sample",
@@ -87,7 +88,26 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "doctor missing": no_dataset,
             "mcap export missing out": no_dataset,
             "mcap import missing out --mapping=m.yaml": "missing does not exist; expected an MCAP file",
+            "mcap import . out --mapping=m.yaml": "m.yaml does not exist; expected a mapping file",
+            "mcap import missing out": "--mapping is missing",
+            "mcap import missing out --maping=m.yaml": "(did you mean '--mapping'?)",
+            "mcap export": "DATASET is missing",
+            "mcap expotr a b": "unknown command 'mcap expotr' (did you mean 'mcap export'?); known: mcap export, ",
             "build missing out": "missing does not exist; expected one of episode-*.mcap files",
+            f"build {ROOT}": "DATASET is missing",
+            "render SAMPLE": "TARGET is missing",
+            "doctor": "DATASET is missing",
+            "doctor a b": "unexpected 'b'",
+            "doctor . --fix": "unknown option '--fix'",
+            "merge": "FILES",
+            "merge a": "two or more",
+            "merge a a": "given twice",
+            "eval": "--policy.path=DIR",
+            f"eval --policy.path={ROOT}": "no policy in",
+            "push SAMPLE": "REMOTE is missing",
+            "push SAMPLE ftp://x/y": "unknown scheme 'ftp://' (did you mean 'sftp://'?)",
+            "pull file:///nowhere got --revision=main": "--revision=main is only for the Hub",
+            "pull hf://me/x@a got --revision=b": "hf://me/x@a and --revision=b differ",
             "push missing hf://me/x": "missing does not exist; expected the folder of a dataset, a run or a policy",
             "push SAMPLE me/x": "'me/x' is not a URL",
             "pull me/x out": "'me/x' is not a URL",
@@ -110,31 +130,81 @@ def test_resume_with_nothing_to_resume_is_refused_before_anything_heavy_is_impor
 
 
 def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
+    train, expert = "train --dataset.root=SAMPLE", "eval --policy.type=expert"
     mistakes(
         {
-            "train --dataset.root=SAMPLE --policy.type=atc": "unknown policy 'atc' (did you mean 'act'?)",
-            "train --dataset.root=SAMPLE --policy.widht=3": "(did you mean 'width'?)",
-            "train --dataset.root=SAMPLE --policy.type=act --policy.chunksize=3": "(did you mean 'chunk_size'?)",
-            "train --dataset.root=SAMPLE --steps=0": "steps is 0; expected at least 1",
-            "train --dataset.root=SAMPLE --lr=-1": "lr is -1.0; expected more than 0",
-            "train --dataset.root=SAMPLE --dataset.eval_split=1": "dataset.eval_split is 1.0; expected at least 0",
-            "train --dataset.root=SAMPLE --seed=5000": "seed is 5000",
+            "record --robot.type=pandas": "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda",
+            "record --task.type=pick": "did you mean 'pick_place'?",
+            "record --num_episodes=3": "did you mean '--dataset.num_episodes'?",
+            "record --cameras=front,wirst": "unknown camera 'wirst' (did you mean 'wrist'?); known: front, wrist",
+            "record --cameras=front --image.height=127": "pictures of height 127 and width 128; expected even numbers",
+            "record --cameras=front --dataset.rgb_encoder.vcodec=h265": "did you mean 'h264'?",
+            "record --cameras=front --dataset.rgb_encoder.preset=99": "preset",
+            "record --engine=rai": "did you mean 'ray'?",
+            "record --dataset.num_episodes=0": "expected at least 1",
+            "record --dataset.repo_id=name": "expected USER/NAME",
+            "render SAMPLE x --cameras=": "--cameras names none; expected front, wrist or both",
+            "render SAMPLE x --look.brightness=9": "brightness is 9.0; expected a factor from 0.1 to 2.0",
+            f"{train} --policy.type=atc": "unknown policy 'atc' (did you mean 'act'?)",
+            f"{train} --policy.type=mpl": "did you mean 'mlp'?",
+            f"{train} --policy.lr=1": "unknown option of --policy.type=mlp: 'lr'",
+            f"{train} --policy.widht=3": "(did you mean 'width'?)",
+            f"{train} --policy.type=act --policy.chunksize=3": "(did you mean 'chunk_size'?)",
+            f"{train} --policy.type=act --observation=eyes": "one of state, images, both",
+            f"{train} --policy=act": "--policy.NAME=VALUE",
+            f"{train} --steps=0": "steps is 0; expected at least 1",
+            f"{train} --lr=-1": "lr is -1.0; expected more than 0",
+            f"{train} --dataset.eval_split=1": "dataset.eval_split is 1.0; expected at least 0",
+            f"{train} --seed=5000": "seed is 5000",
             "dagger --beta=0.5": "beta is '0.5'; expected constant:0.5, linear:ROUNDS or exponential:B",
-            "dagger --robot.type=ur5": "unknown robot 'ur5'; known: fetch, panda",
-            "dagger --rounds=-1": "rounds is -1",
+            "dagger --beta=lineal:5": "did you mean 'linear'?",
+            "dagger --rounds=-1": "rounds is -1; expected at least 0",
+            "dagger --label=takover": "did you mean 'takeover'?",
+            "dagger --query=evry": "did you mean 'every'?",
+            "dagger --query=ensemble:0.1": "give ensemble=2 or more",
+            "dagger --label_budget=0": "label_budget is 0",
+            "dagger --sampling.corrections=-1": "sampling.corrections is -1.0; expected 0 or more",
             "dagger --policy.type=cnn": "give --cameras=front,wrist",
+            "dagger --policy.lr=1": "unknown option of --policy.type=mlp: 'lr'",
             "dagger --dataset.root=x": "unknown option '--dataset.root'; manip-il dagger --help lists all",
-            "eval --policy.type=expert --suite=hard": "unknown suite 'hard'",
-            "eval --policy.type=expert --workers=0": "--workers is 0",
-            "eval --policy.type=expert --task.type=push": "unknown task 'push'",
+            f"{expert} --suite=hard": "unknown suite 'hard'",
+            f"{expert} --suite=nominall": "did you mean 'nominal'?",
+            f"{expert} --env.tolerance=2": "tolerance is 2.0",
+            f"{expert} --env.control_hz=0": "control_hz is 0; expected a divisor of 500",
+            f"{expert} --until_width=2": "--until_width is 2.0; expected between 0 and 1",
+            f"{expert} --eval.n_episodes=0": "--eval.n_episodes is 0",
+            f"{expert} --eval.films=-1": "--eval.films is -1",
+            f"{expert} --eval.first=-1": "--eval.first is -1",
+            f"{expert} --eval.batch_size=0": "--eval.batch_size is 0",
+            "eval --policy.type=exprt": "did you mean 'expert'?",
             "eval runs/x": "did you mean --policy.path=runs/x?",
-            "record --cameras=top": "unknown camera 'top'; known: front, wrist",
+            "certify --cases=0": "--cases is 0; expected at least 1",
+            "certify --cases=2000000": "2000000 seeds asked of stream 'certificate'",
+            "certify --seed=-1": "seed is -1",
+            "certify --env.horizon=2": "horizon is 2",
+            "certify --case=3": "did you mean '--cases'?",
             "quickstart --rounds=-1": "rounds is -1",
+            "quickstart --test_episodes=0": "expected at least 1",
             "quickstart --policy.widht=3": "(did you mean '--policy.width'?)",
+            **{f"{command} --workers=0": "--workers is 0" for command in ("record", "dagger", expert, "certify")},
         },
         tmp_path,
         SLOW,
     )
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (f"train --dataset.root={SAMPLE} --wandb.projekt=a --policy.type=act", "did you mean 'project'"),
+        (f"train --dataset.root={SAMPLE} --policy.loss=mes", "did you mean 'mse'?"),
+        ("dagger --policy.type=act --query=one", "use label=branch or label=takeover"),
+    ],
+)
+def test_a_bad_value_that_only_lerobot_knows_is_one_line(line, says, here, error):
+    assert main(line.split()) == 2
+    assert says in error()
+    assert list(here.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
-"""`manip-il build` gives again what `manip-il record` gave, and says what it could not read."""
+"""Datasets: built again from journals to the bytes that were recorded, and rendered again with other pictures."""
 
 from __future__ import annotations
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,19 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.data.journal import list_episodes
-from manip_il.data.lerobot_read import dataset_info, read_episodes, read_table
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_provenance, read_spec, read_table
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.sim import render
+from manip_il.sim.env import EnvConfig
+from manip_il.sim.look import CameraConfig, Look
+
+from .made_runs import files
 
 
 def record(root: Path, *words: str) -> list[str]:
     return ["record", "--robot.type=fetch", f"--dataset.root={root}", "--dataset.num_episodes=3", "--workers=1", *words]
-
-
-def files(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -95,3 +100,75 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     shutil.copytree(journals_of(tmp_path / "one"), journals_of(tmp_path / "again"))
     assert main(["doctor", str(tmp_path / "again"), "--repair=true"]) == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
+
+
+ENV = EnvConfig("panda", "reach", horizon=6, success_steps=1)
+
+
+@pytest.fixture
+def demos(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    episodes = run_job(RolloutJob(ENV, "expert"), range(3))
+    write_dataset(episodes, Path("demos"), env_spec(ENV), repo_id="local/demos", fingerprint=env_fingerprint(ENV))
+    return Path("demos")
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
+    assert main(["render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
+    said = capsys.readouterr()
+    assert "rendered 3 episodes, 18 frames: front, wrist, 48 x 64 pixels\ndataset: seen\n" in said.out
+    assert "render demos: 3/3" in said.err
+    assert read_spec(Path("seen")) == env_spec(ENV, CameraConfig(("front", "wrist"), 48, 64))
+    np.testing.assert_array_equal(read_table(Path("seen"))["sim_state"], read_table(demos)["sim_state"])
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_two_workers_write_the_bytes_of_one(demos):
+    words = ["--cameras=wrist", "--image.height=32", "--image.width=32", "--look.shadows=true", "--look.light_turn=30"]
+    assert main(["render", "demos", "one", "--workers=1", *words]) == 0
+    Path("again").mkdir()
+    assert main(["render", "demos", "again/one", "--workers=2", *words]) == 0
+    assert files(Path("one")) == files(Path("again/one"))
+    assert read_provenance(Path("one"))["rendered"]["cameras"]["look"] == asdict(Look(shadows=True, light_turn=30))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["demos", "demos", "--overwrite=true"], 2, "TARGET demos overlaps SOURCE demos"),
+        (["demos", ".", "--overwrite=true"], 2, "overlaps SOURCE demos"),
+        (["demos", "demos/meta", "--overwrite=true"], 2, "overlaps SOURCE demos"),
+        (["demos", "full"], 2, "full exists already; replace it with --overwrite=true"),
+        (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
+    ],
+)
+def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, capsys, words, code, message):
+    Path("full").mkdir()
+    Path("full/thesis.txt").touch()
+    before = files(Path())
+    assert main(["render", *words]) == code
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 1
+    assert message in errors[0]
+    assert files(Path()) == before
+
+
+@pytest.fixture
+def no_context(monkeypatch):
+    def broken(*_: object) -> None:
+        raise ImportError("cannot load libEGL.so.1")
+
+    render.close()
+    monkeypatch.setattr("mujoco.gl_context.GLContext", broken)
+
+
+@pytest.mark.usefixtures("no_context")
+def test_without_opengl_what_was_there_stays(demos, capsys):
+    shutil.copytree("demos", "x")
+    before = files(Path())
+    assert main(["render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
+    assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); on Debian: apt" in capsys.readouterr().err
+    assert files(Path()) == before

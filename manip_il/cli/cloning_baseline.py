@@ -1,0 +1,64 @@
+"""The quickstart's baseline: cloning from demonstrations alone, with as many labels as DAgger used."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.fitting import fit_table, round_fit
+from manip_il.algorithms.run import round_folder
+from manip_il.cli.progress import Stages
+from manip_il.data.atomic import write_file
+from manip_il.data.build import Recording
+from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.lerobot_read import read_table
+from manip_il.data.schema import LABEL_VALID
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.learn.columns import LEARNING_COLUMNS
+from manip_il.recording import MAX_TRIES, collect_successes, provenance, record
+from manip_il.seeding import stream_seeds
+
+
+def clone_with_labels(
+    config: RunConfig, labels: int, run: Path, folder: Path, engine: Engine, stages: Stages
+) -> tuple[Path, int]:
+    """Fit a policy as every round's is fitted, to `labels` labels of demonstrations alone.
+
+    The demonstrations are those of round 0 of the DAgger `run`, and the ones that follow in their stream of seeds.
+    Returns the checkpoint and the number of labels.
+    """
+    if not (folder / "dataset").is_dir():
+        _demonstrate(config, labels, round_folder(run, 0), folder, engine, stages)
+    table = read_table(folder / "dataset", LEARNING_COLUMNS)
+    so_far = np.cumsum(table[LABEL_VALID])
+    rows = int(np.searchsorted(so_far, labels)) + 1
+    stages.start("cloning with as many labels, fit", round_fit(config, False).total_steps)
+    table = {key: column[:rows] for key, column in table.items()}
+    policy = fit_table(config, table, folder / "policy", on_log=stages.log)
+    stages.close()
+    return policy, min(labels, int(so_far[-1]))
+
+
+def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, engine: Engine, stages: Stages) -> None:
+    """Record until the demonstrations hold `labels` frames; those of round 0 count."""
+    journals = folder / "journals"
+    journals.mkdir(parents=True, exist_ok=True)
+    for path in list_episodes(round_0 / "journals"):
+        write_file(journals / path.name, path.read_bytes())
+    job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
+    count = config.demonstrations
+    stages.start("cloning with as many labels, record", count)
+    while True:
+        seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
+        found = list(collect_successes(engine, job, seeds, count, journals, stages.episode))
+        frames = sum(read_header(one.path).frames for one in found if one.success)
+        if frames >= labels:
+            break
+        count = max(count + 1, math.ceil(count * labels / frames))
+        stages.start("cloning with as many labels, record", max(0, count - len(found)))
+    name = f"local/{config.env.robot}_{config.env.task}_demonstrations"
+    record(found, journals, folder / "dataset", job, Recording(name, True, count, provenance(job)))

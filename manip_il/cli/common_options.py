@@ -1,0 +1,142 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from manip_il.errors import UsageError
+from manip_il.option import option, option_of
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.look import CameraConfig, Look
+
+if TYPE_CHECKING:
+    from manip_il.learn.checkpoint import CheckpointMeta
+
+_TRUST = (
+    "load models, and run code, that a checkpoint names (smolvla, pi0, groot, ...): only for sources that you trust; "
+    "only on the command line"
+)
+
+
+def seed_option() -> Any:
+    """Return the field of `--seed`."""
+    return option(0, "shifts every random stream, 0 to 1000")
+
+
+def engine_option() -> Any:
+    """Return the field of `--engine`."""
+    return option("local", "where episodes run: local processes, or a Ray cluster (RAY_ADDRESS, or one started here)")
+
+
+def workers_option() -> Any:
+    """Return the field of `--workers`."""
+    return option(None, "processes, or tasks at once on Ray; by default one per core")
+
+
+def trust_option() -> Any:
+    """Return the field of `--trust`, which only the command line may set."""
+    return option(False, _TRUST, command_line_only=True)
+
+
+def require_workers(workers: int | None) -> None:
+    """Raise `UsageError` for less than one process."""
+    if workers is not None and workers < 1:
+        raise UsageError(f"--workers is {workers}; expected at least 1")
+
+
+@dataclass
+class RobotGroup:
+    """`--robot.*`."""
+
+    type: str = option_of(EnvConfig, "robot")
+
+
+@dataclass
+class TaskGroup:
+    """`--task.*`."""
+
+    type: str = option_of(EnvConfig, "task")
+
+
+@dataclass
+class MaybeRobotGroup:
+    """`--robot.*` where a checkpoint may say it."""
+
+    type: str | None = option(None, f"panda or fetch; by default the policy's, else {EnvConfig.robot}")
+
+
+@dataclass
+class MaybeTaskGroup:
+    """`--task.*` where a checkpoint may say it."""
+
+    type: str | None = option(None, f"reach, lift or pick_place; by default the policy's, else {EnvConfig.task}")
+
+
+@dataclass
+class EnvGroup:
+    """`--env.*`: what makes an environment beside robot and task."""
+
+    tolerance: float = option_of(EnvConfig, "tolerance")
+    horizon: int = option_of(EnvConfig, "horizon")
+    control_hz: int | None = option(
+        None, f"control steps a second; by default the policy's, else {EnvConfig.control_hz}"
+    )
+    success_steps: int = option_of(EnvConfig, "success_steps")
+
+    def config(self, robot: str | None, task: str | None, meta: CheckpointMeta | None = None) -> EnvConfig:
+        """Return the environment; `UnknownName` for a robot or task, `UsageError` for a value.
+
+        robot, task: None for those of the policy. meta: what a policy says of itself, where there is one.
+        """
+        from manip_il.robots.robot import get_robot
+        from manip_il.tasks.table import get_task
+
+        robot = robot or (meta.robot if meta else EnvConfig.robot)
+        task = task or (meta.task if meta else EnvConfig.task)
+        get_robot(robot)
+        get_task(task)
+        hz = (meta.fps if meta else EnvConfig.control_hz) if self.control_hz is None else self.control_hz
+        return EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon)
+
+
+@dataclass
+class EnvOptions:
+    """First options of a command that names robot and task itself."""
+
+    robot: RobotGroup = field(default_factory=RobotGroup)
+    task: TaskGroup = field(default_factory=TaskGroup)
+    env: EnvGroup = field(default_factory=EnvGroup)
+
+    def env_config(self) -> EnvConfig:
+        """Return the environment, see `EnvGroup.config`."""
+        return self.env.config(self.robot.type, self.task.type)
+
+
+@dataclass
+class ImageGroup:
+    """`--image.*`: the pictures of every camera."""
+
+    height: int = option_of(CameraConfig, "height")
+    width: int = option_of(CameraConfig, "width")
+
+    def config(self, cameras: Sequence[str], look: Look | None = None) -> CameraConfig | None:
+        """Return the cameras and their pictures; None without cameras.
+
+        `UnknownName` for a camera, `UsageError` for a size.
+        """
+        return CameraConfig(tuple(cameras), self.height, self.width, look or Look()) if cameras else None
+
+
+def policy_help(words: Iterable[str]) -> str:
+    """Return the options of the policy that `--policy.type=` in a command's words names; nothing where none does."""
+    kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
+    if not kind:
+        return ""
+    from manip_il.learn.lerobot_config import option_lines, policy_class
+
+    rows = option_lines(policy_class(kind), "policy")
+    width = max(len(left) for left, _ in rows) + 2
+    lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
+    return f"\n\noptions of {kind}:\n{lines}"

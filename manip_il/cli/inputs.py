@@ -1,0 +1,183 @@
+"""Datasets, policies and evaluations that a command is given.
+
+A wrong path is found by its files alone, before anything heavy is imported.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from manip_il.cli.options import Open
+from manip_il.cli.progress import warn
+from manip_il.errors import UsageError
+
+if TYPE_CHECKING:  # the environment and the learner take a second to import
+    from manip_il.data.schema import RobotTaskSpec
+    from manip_il.learn.checkpoint import CheckpointMeta
+    from manip_il.mdp import Observation
+    from manip_il.sim.config import EnvConfig
+    from manip_il.sim.look import CameraConfig
+
+_POLICY_FOLDERS = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
+_NEWEST_POLICY = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")
+_REPO = re.compile(r"[A-Za-z0-9_][\w.-]*/[A-Za-z0-9_][\w.-]*")
+
+
+def require_dataset(root: Path) -> None:
+    """Raise `UsageError` unless `root` is a folder with a LeRobot dataset's `meta/info.json`."""
+    if not root.exists():
+        hint = hub_hint(root, "datasets/")
+        raise UsageError(f"{root} does not exist; expected the folder of a LeRobot dataset{hint}")
+    if not (root / "meta" / "info.json").is_file():
+        raise UsageError(f"{root} is not a LeRobot dataset: it has no meta/info.json{_inside(root)}")
+
+
+def require_eval(path: Path) -> None:
+    """Raise `UsageError` unless `path` is a file, an `eval.json`, or a folder that holds one."""
+    if not path.exists():
+        raise UsageError(f"{path} does not exist; expected an eval.json of manip-il eval, or its folder")
+    if path.is_dir() and not (path / "eval.json").is_file():
+        raise UsageError(f"{path} holds no eval.json; expected the folder of a finished manip-il eval")
+
+
+def require_folder(path: Path, what: str) -> None:
+    """Raise `UsageError` unless there is such a folder. what: its expected content."""
+    if not path.is_dir():
+        raise UsageError(f"{path} {'is not a folder' if path.exists() else 'does not exist'}; expected {what}")
+
+
+def hub_hint(path: Path, kind: str = "") -> str:
+    """Return how to pull a path that looks like a repo on the Hub; nothing for others. kind: `datasets/`."""
+    if path.exists() or path.parent.exists() or not _REPO.fullmatch(str(path)):
+        return ""
+    return f"; if it is on the Hub, get it by manip-il pull hf://{kind}{path} FOLDER and give that FOLDER"
+
+
+def _inside(root: Path) -> str:
+    """Name the datasets in a folder that is none itself, where it holds some."""
+    found = sorted(path.parents[1].name for path in root.glob("*/meta/info.json")) if root.is_dir() else []
+    return f"; it holds the datasets {', '.join(found[:3])}{' ...' if len(found) > 3 else ''}" if found else ""
+
+
+def find_policy(path: Path) -> Path:
+    """Return the `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run.
+
+    Of a run it is the best policy, else the newest checkpoint.
+    """
+    for place in _POLICY_FOLDERS:
+        if (path / place / "config.json").is_file():
+            return path / place
+    for place in _NEWEST_POLICY:
+        if found := sorted(path.glob(f"{place}/config.json")):
+            return found[-1].parent
+    raise UsageError(
+        f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
+    )
+
+
+def start_policy(settings: Open) -> Open:
+    """Return `--policy.*` of what is fitted, with the `pretrained_model` folder that its `path` means."""
+    if "path" not in settings:
+        return settings
+    path = settings["path"]
+    if not isinstance(path, str) or not path:
+        raise UsageError(f"--policy.path is {path!r}; expected a checkpoint or a run")
+    return {**settings, "path": str(find_policy(Path(path).expanduser()))}
+
+
+def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:
+    """Warn where a dataset was made by other versions or another model than this machine has.
+
+    Raises `MismatchError` where its numbers mean something else. A robot that is not known here is not compared.
+    """
+    from manip_il.data.fingerprint import compare_fingerprints
+    from manip_il.data.schema import check_same_spec
+    from manip_il.engine.environments import env_fingerprint, env_spec
+    from manip_il.robots.robot import ROBOTS
+    from manip_il.sim.env import EnvConfig
+    from manip_il.tasks.table import TASKS
+
+    if spec.robot not in ROBOTS or spec.task not in TASKS:
+        warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])
+        return
+    env = EnvConfig(spec.robot, spec.task, spec.fps)
+    check_same_spec(str(root), spec, "this program", env_spec(env))
+    # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
+    here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
+    theirs = {key: value for key, value in fingerprint.items() if key not in ("config_sha256", "cameras_sha256")}
+    warn(compare_fingerprints(str(root), theirs, "this machine", here))
+
+
+def check_policy(
+    path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
+) -> CameraConfig | None:
+    """Return the cameras whose pictures the policy takes, None for none.
+
+    Warns where it was trained on something else than `env`.
+
+    draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
+    `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
+    `LearnedPolicy.load` raises.
+    """
+    from manip_il.engine.environments import env_spec, policy_cameras
+    from manip_il.learn.checkpoint import check_fits
+    from manip_il.learn.policy import LearnedPolicy
+    from manip_il.learn.pretrained import check_interface, read_interface
+
+    cameras = policy_cameras(path)
+    spec = env_spec(env, cameras)
+    if meta is not None:
+        check_fits(meta, spec)
+    check_interface(read_interface(path), spec)
+    warn(_differences(path, meta, env, cameras))
+    policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
+    # One action now finds what else does not fit before a worker does.
+    observation = _first_observation(env, cameras, draw)
+    images = {camera: picture[None] for camera, picture in observation.images.items()}
+    policy.act(observation.state[None], observation.environment_state[None], images)
+    return cameras
+
+
+def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
+    from manip_il.data.fingerprint import compare_fingerprints
+    from manip_il.engine.environments import env_fingerprint
+
+    if meta is None:
+        lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
+        return [*lines, f"nor how its pictures were lit: {cameras.look} is assumed"] if cameras else lines
+    if meta.task != env.task:  # and with it the model and its hash
+        return [f"task differs: {path} has {meta.task}, the environment has {env.task}"]
+    theirs = dict(meta.fingerprint)
+    if cameras is None:
+        theirs.pop("cameras_sha256", None)  # it takes no pictures
+    return compare_fingerprints(str(path), theirs, "the environment", env_fingerprint(env, cameras))
+
+
+def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
+    import numpy as np
+
+    from manip_il.sim.env import ManipEnv
+
+    if cameras is None or not draw:
+        world = ManipEnv(config=env)
+    else:
+        world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+    world.start(0)
+    observation = world.observe()
+    if cameras is not None and not draw:
+        return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
+    return observation
+
+
+def observation_text(cameras: CameraConfig, path: Path) -> str:
+    """Return in words which pictures a policy takes."""
+    from manip_il.learn.pretrained import observation_of, read_interface
+
+    observation = observation_of(read_interface(path).columns)
+    lights = ", ".join(f"{name} {value}" for name, value in asdict(cameras.look).items())
+    size = f"{cameras.height} x {cameras.width} pixels"
+    return f"observation {observation!r}: the policy uses {', '.join(cameras.names)}, {size}, {lights}"

@@ -1,0 +1,271 @@
+"""Options from the command line (`--a.b=c`) and from YAML, in LeRobot's style; words beat YAML beats defaults.
+
+The parser is our own, as draccus cannot be taught to answer with one line: it exits through argparse, turns a range
+error of a nested dataclass into a decoding error, takes `true` for a number, and loads YAML with tags that read other
+files.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Any
+
+from manip_il import __version__
+from manip_il.checks import shorten
+from manip_il.cli.options import Open, Option, choices, decode, default_of, expected, options_of, to_plain, typed_fields
+from manip_il.errors import UsageError, did_you_mean, nearest
+
+CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
+CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
+_FEW = 3
+_NEAR = 0.65  # ratio of difflib from which on a name is offered
+_AS_NEAR = 0.1  # of the best one: others that are offered beside it
+_LONGEST = 100  # [characters] of a name that is compared
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A value as the user gave it, and its origin, for the error message."""
+
+    value: Any
+    origin: str
+    is_word: bool  # from the command line, where everything is text
+
+
+def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
+    """Read options from the command line; `UsageError` for an unknown name, a bad or a missing value.
+
+    command: whose options they are, for the message.
+    """
+    known = {option.name: option for option in options_of(cls)}
+    from_words, config_paths = _read_words(words, known, command)
+    from_files: dict[str, _Given] = {}
+    for path in config_paths:
+        from_files |= _read_tree(_read_yaml(Path(path)), known, path)
+    return _build(cls, from_files | from_words)
+
+
+def from_yaml[T](path: Path, cls: type[T]) -> T:
+    """Read options from a YAML file of differences, or from one that `dump_yaml` wrote."""
+    return from_layers(cls, [(str(path), _read_yaml(path))])
+
+
+def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]) -> T:
+    """Read options from trees of differences, as YAML gives them; a later tree wins.
+
+    layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
+    """
+    known = {option.name: option for option in options_of(cls)}
+    given: dict[str, _Given] = {}
+    for origin, tree in layers:
+        given |= _read_tree(tree, known, origin)
+    return _build(cls, given)
+
+
+def dump_yaml(options: Any) -> str:
+    """Return the resolved options as YAML: `from_yaml` gives them back equal."""
+    import yaml
+
+    header = f"{CONFIG_HEADER} {__version__}: resolved options ({type(options).__name__})\n"
+    return header + yaml.safe_dump(to_plain(options), sort_keys=False)
+
+
+def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str) -> tuple[dict[str, _Given], list[str]]:
+    given: dict[str, _Given] = {}
+    config_paths: list[str] = []
+    places = [option for option in known.values() if option.positional]
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("--"):
+            if not places:
+                raise unexpected_word(word, known, command)
+            option = places[0] if places[0].is_list else places.pop(0)
+            _place(word, option, given)
+            continue
+        name, equals, value = word[2:].partition("=")
+        if name not in known and name.replace("-", "_") in known:  # as other programs write it
+            name = name.replace("-", "_")
+        if group := _open_group(name, known):
+            if not equals and (not rest or rest[0].startswith("--")):
+                raise UsageError(f"--{name} has no value; expected --{name}=VALUE")
+            given[name] = _Given(_as_yaml(value if equals else rest.pop(0), group), f"--{name}", False)
+            continue
+        if name != CONFIG_PATH and (name not in known or known[name].positional or known[name].is_open):
+            raise unknown_option("option", name, known, "--", command)
+        if not equals:
+            value = _next_value(name, known, rest)
+        if name == CONFIG_PATH:
+            config_paths.append(value)
+        else:
+            given[name] = _Given(value, f"--{name}", True)
+    return given, config_paths
+
+
+def _place(word: str, option: Option, given: dict[str, _Given]) -> None:
+    """Give an option without a name its value; a list takes every word that is left."""
+    if not option.is_list:
+        given[option.name] = _Given(word, option.label, True)
+        return
+    before = given[option.name].value if option.name in given else []
+    given[option.name] = _Given([*before, word], option.label, False)
+
+
+def _open_group(name: str, known: Mapping[str, Option]) -> str:
+    """Return the open group that `name` is an option of, or nothing."""
+    if name in known:
+        return ""
+    return next((option.name for option in known.values() if option.is_open and name.startswith(f"{option.name}.")), "")
+
+
+def _as_yaml(word: str, group: str) -> Any:
+    from manip_il.yaml_file import parse_yaml
+
+    try:
+        return parse_yaml(word)
+    except ValueError as error:
+        raise UsageError(f"--{group}: {shorten(word)} is not a YAML value: {error}") from error
+
+
+def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
+    """Take the value of `--name value` from `rest`; a flag without one is true."""
+    if name in known and known[name].type is bool and not (rest and rest[0] in ("true", "false")):
+        return "true"
+    if not rest or rest[0].startswith("--"):
+        wanted = expected(known[name].type) if name in known else "a path"
+        raise UsageError(f"--{name} has no value; expected {wanted}")
+    return rest.pop(0)
+
+
+def _read_yaml(path: Path) -> dict[Any, Any]:
+    from manip_il.yaml_file import read_yaml
+
+    tree = read_yaml(path, "a YAML file of options")
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of option names to values")
+    return tree or {}
+
+
+def _read_tree(tree: Mapping[Any, Any], known: Mapping[str, Option], origin: str) -> dict[str, _Given]:
+    return {name: _Given(value, f"{origin}: {name}", False) for name, value in _leaves(tree, known, origin)}
+
+
+def _leaves(
+    tree: Mapping[Any, Any], known: Mapping[str, Option], origin: str, prefix: str = ""
+) -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        name = f"{prefix}{key}"
+        if name in known and known[name].is_open:
+            if not isinstance(value, dict | None):
+                raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
+            yield from ((f"{name}.{inner}", one) for inner, one in (value or {}).items())
+        elif name in known or _open_group(name, known):
+            yield name, value
+        elif not any(option.startswith(f"{name}.") for option in known):
+            raise unknown_option(f"key in {origin}:", name, known, "", "")
+        elif isinstance(value, dict):
+            yield from _leaves(value, known, origin, f"{name}.")
+        elif value is not None:
+            raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
+
+
+def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
+    """Return an instance of `cls` of the given values, else `base`'s, else the defaults."""
+    arguments: dict[str, Any] = {}
+    for field, field_type in typed_fields(cls):
+        name, default = prefix + field.name, default_of(field, base)
+        if dataclasses.is_dataclass(field_type):
+            nested = None if default is MISSING else default
+            arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")
+        elif field_type == Open:
+            before = {} if default is MISSING else default
+            arguments[field.name] = before | _inside(name, given)
+        elif name in given:
+            if field.metadata.get("command_line_only") and not given[name].is_word:
+                raise UsageError(f"{given[name].origin}: this can only be set on the command line; give --{name}=...")
+            arguments[field.name] = _decode_given(field_type, given[name])
+        elif default is MISSING:
+            label = name.upper() if field.metadata.get("positional") else f"--{name}"
+            raise UsageError(f"{label} is missing; expected {expected(field_type)}")
+        else:
+            arguments[field.name] = default
+    return cls(**arguments)
+
+
+def _inside(group: str, given: Mapping[str, _Given]) -> Open:
+    return {name.removeprefix(f"{group}."): one.value for name, one in given.items() if name.startswith(f"{group}.")}
+
+
+def _decode_given(field_type: Any, given: _Given) -> Any:
+    try:
+        return decode(field_type, given.value, is_word=given.is_word)
+    except (ValueError, OverflowError):
+        hint = nearest(given.value, choices(field_type)) if isinstance(given.value, str) else ""
+        quotes = "; YAML needs quotes around text like this" if field_type is str and not given.is_word else ""
+        text = f"{given.origin}: expected {expected(field_type)}, got {shorten(given.value)}{hint}{quotes}"
+        raise UsageError(text) from None
+
+
+def unknown_option(kind: str, name: str, known: Mapping[str, Option], dashes: str, command: str) -> UsageError:
+    """Return the error for an option or a key that is not there: the nearest names, and the command that lists all.
+
+    kind: `option`, or which file's key. dashes: before the names. command: empty where none is known.
+    """
+    if name in known and known[name].is_open:
+        return UsageError(f"{dashes}{name} is a group of options; expected {dashes}{name}.NAME=VALUE")
+    inside = [option for option in known if option.startswith(f"{name}.")]
+    if inside:
+        return UsageError(f"{dashes}{name} is a group of options; known: {', '.join(dashes + one for one in inside)}")
+    named = [one.name for one in known.values() if not (dashes and one.positional) and not one.is_open]
+    near = did_you_mean([dashes + one for one in nearest_options(name, named)])
+    return UsageError(f"unknown {kind} {shorten(dashes + name)}{near}; {_help(command)} lists all")
+
+
+def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> UsageError:
+    """Return the error for a word that is neither an option nor a value: how it may have been meant."""
+    text = f"unexpected {shorten(word)}"
+    name = word.lstrip("-").partition("=")[0]
+    if name in known or (word.startswith("-") and nearest_options(name, known)):
+        return UsageError(f"{text}; options begin with two dashes: --{word.lstrip('-')}")
+    if "=" in word:
+        return unknown_option("option", name, known, "--", command)
+    if word.endswith((".yaml", ".yml")):
+        return UsageError(f"{text}; a file of options is given as --config_path={word}")
+    paths = [one.name for one in known.values() if Path in _types(one.type) and one.name != "output_dir"]
+    opens = [f"{one.name}.path" for one in known.values() if one.is_open and one.name == "policy"]
+    if paths or opens:
+        return UsageError(f"{text}; options are written --name=value (did you mean --{(paths or opens)[0]}={word}?)")
+    return UsageError(f"{text}; options are written --name=value, and {_help(command)} lists them")
+
+
+def nearest_options(name: str, known: Iterable[str]) -> list[str]:
+    """Return the options that a name may have meant, nearest first: `num_episodes` finds `dataset.num_episodes`."""
+    scores = {option: _likeness(name[:_LONGEST].replace("-", "_"), option) for option in known}
+    best = max(scores.values(), default=0.0)
+    near = [option for option, score in scores.items() if score >= max(_NEAR, best - _AS_NEAR)]
+    return sorted(near, key=lambda option: -scores[option])[:_FEW]
+
+
+def _likeness(name: str, option: str) -> float:
+    """Return the likeness of two dotted names, 0 to 2; 1 and more where their last words are equal."""
+    leaf, other = name.rpartition(".")[2], option.rpartition(".")[2]
+    whole = SequenceMatcher(None, name, option).ratio()
+    if leaf == other:
+        return 1 + whole
+    if len(leaf) >= 3 and (other.startswith(leaf) or leaf.startswith(f"{other}_")):
+        return max(0.8, whole)
+    return max(whole, 0.95 * SequenceMatcher(None, leaf, other).ratio())
+
+
+def _help(command: str) -> str:
+    return f"manip-il {command or 'COMMAND'} --help"
+
+
+def _types(option_type: object) -> tuple[object, ...]:
+    """Return the members of a union, or the type alone."""
+    return typing.get_args(option_type) or (option_type,)

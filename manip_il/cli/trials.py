@@ -1,0 +1,186 @@
+"""Policies on the same test episodes, under the conditions of a suite (`--suite=`); each policy is measured once."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import manip_il
+from manip_il.cli.progress import Stages
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.option import option
+
+if TYPE_CHECKING:
+    from manip_il.engine.engine import Engine
+    from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.results import EvalResult
+    from manip_il.sim.conditions import Condition
+    from manip_il.sim.config import EnvConfig
+
+FOLDER = "evaluations"
+SUITES = {
+    "nominal": ("nominal",),
+    "disturbed": ("knocked", "sensing"),
+    "randomised": ("object", "view"),
+    "all": ("nominal", "knocked", "sensing", "object", "view"),
+}
+CONDITIONS = SUITES["all"]
+SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
+
+
+@dataclass
+class TrialGroup:
+    """`--eval.*` of policies that are compared."""
+
+    n_episodes: int = option(500, "test episodes, the same for both sides")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Environment, seeds and conditions in which policies are tested.
+
+    trust: whether models that their checkpoints name may be loaded.
+    """
+
+    env: EnvConfig
+    seeds: range
+    suite: str = "nominal"
+    conditions: tuple[Condition, ...] = ()
+    trust: bool = False
+
+    @classmethod
+    def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path], trust: bool = False) -> Trial:
+        """Make one of a suite's conditions, without those of cameras where none of the policies uses any."""
+        from manip_il.engine.environments import policy_cameras
+
+        sees = any(policy_cameras(policy) is not None for policy in policies)
+        return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees), trust)
+
+    def job(self, policy: Path | None) -> RolloutJob:
+        """Return the rollouts of one policy; None: of the expert."""
+        from manip_il.engine.jobs import RolloutJob
+        from manip_il.evaluation.runner import HOLD
+
+        job = RolloutJob(self.env, "expert" if policy is None else "policy", policy=policy, conditions=self.conditions)
+        return replace(job, hold=HOLD, label="last", trust=self.trust)
+
+    def file(self, folder: Path, policy: Path) -> Path:
+        """Return the file of a policy's evaluation, named after its files, the environment and the episodes.
+
+        So another policy of the same name is another file, and what was measured before stays true.
+        """
+        from manip_il.data.fingerprint import canonical_json
+        from manip_il.engine.environments import env_fingerprint, policy_sha256
+        from manip_il.evaluation.results import EvalSettings
+
+        settings = EvalSettings.of(self.job(policy), self.suite).to_json()
+        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, policy_sha256(policy))
+        return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
+
+    def measure(
+        self, policy: Path | None, name: str, file: Path, engine: Engine, stages: Stages, *, complete: bool = True
+    ) -> EvalResult:
+        """Return the evaluation of a policy from its file, which is made first where it is not there.
+
+        name: in progress and results. complete: raise `ManipError` where workers died of a seed, which leaves it out.
+        """
+        from manip_il.evaluation.results import EvalResult
+        from manip_il.evaluation.runner import evaluate
+
+        if not file.is_file():
+            stages.start(f"test {name}{'' if self.suite == 'nominal' else ', ' + self.suite}", len(self.seeds))
+            result = evaluate(engine, self.job(policy), self.seeds, name, stages.episode, suite=self.suite)
+            stages.close()
+            if complete and len(result.episodes) < len(self.seeds):
+                raise ManipError(
+                    f"{name} has {len(result.episodes)} of {len(self.seeds)} test episodes, because workers died"
+                )
+            result.write(file)
+        return EvalResult.read(file)
+
+    def check_result(self, name: str, result: EvalResult) -> None:
+        """Raise `MismatchError` or `ManipError` unless a given evaluation is of this trial."""
+        from manip_il.evaluation.results import EvalSettings
+
+        settings = EvalSettings.of(self.job(Path()), self.suite)
+        wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
+        for what, value in wanted.items():
+            if getattr(result, what) != value:
+                raise MismatchError(what, name, getattr(result, what), "this comparison", value)
+        theirs = {episode.seed for episode in result.episodes}
+        if theirs != set(self.seeds):
+            raise ManipError(
+                f"test episodes differ: {name} has {len(theirs)}, this comparison {len(self.seeds)}, of which "
+                f"{len(theirs & set(self.seeds))} are the same; give its --seed and --eval.n_episodes here"
+            )
+
+    def check_policies(self, policies: dict[str, Path], folder: Path, engine: str) -> None:
+        """Raise, before any episode runs, where one of the policies (name -> folder) cannot be measured."""
+        from manip_il.cli.inputs import check_policy
+        from manip_il.learn.checkpoint import read_meta
+
+        for name, policy in policies.items():
+            if not self.file(folder, policy).is_file():
+                meta = read_meta(policy)
+                if meta is not None and meta.task != self.env.task:
+                    raise MismatchError("task", name, meta.task, "the comparison", self.env.task)
+                check_policy(policy, meta, self.env, draw=engine == "local", trust=self.trust)
+
+
+def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, ...]:
+    """Return the conditions of a suite, in the order in which seeds take turns.
+
+    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera.
+    Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where nothing is left.
+    """
+    from manip_il.tasks.table import get_task
+
+    has_object = bool(get_task(task).grasped)
+    asked = [_read(name) for name in SUITES.get(suite, (suite,))]
+    left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
+    if not left:
+        blind = "" if sees else " and a policy without cameras"
+        raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
+    return tuple(left)
+
+
+def require_suite(suite: str) -> None:
+    """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
+    if _is_file(suite):
+        if not Path(suite).is_file():
+            raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
+    elif suite not in (*SUITES, *CONDITIONS):
+        raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
+
+
+def _is_file(suite: str) -> bool:
+    return suite.endswith((".yaml", ".yml"))
+
+
+def _read(name: str) -> Condition:
+    require_suite(name)
+    return read_condition(Path(name) if _is_file(name) else _suites_folder() / f"{name}.yaml")
+
+
+def read_condition(path: Path) -> Condition:
+    """Return a YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
+    from manip_il.sim.conditions import Condition
+    from manip_il.yaml_file import read_yaml
+
+    tree = read_yaml(path, "a YAML of ranges")
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
+    return Condition.from_mapping(path.stem, tree or {})
+
+
+def _suites_folder() -> Path:
+    """Return the suites' folder: beside the package in a checkout, else where an installation puts data."""
+    places = (Path(manip_il.__file__).parents[1] / "configs", Path(sys.prefix) / "share" / "manip_il")
+    for place in places:
+        if (place / "suites" / "nominal.yaml").is_file():
+            return place / "suites"
+    raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")
