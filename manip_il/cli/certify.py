@@ -73,8 +73,7 @@ class CertifyOptions:
         env, policy = self._who()
         from manip_il.data.atomic import exclusive
         from manip_il.engine.engine import Engine
-        from manip_il.evaluation.certificate import FILE_NAME
-        from manip_il.evaluation.certificate_table import certificate_lines
+        from manip_il.evaluation.certificate import FILE_NAME, summary_lines
         from manip_il.seeding import stream_seeds
 
         stream_seeds("certificate", self.cases, self.seed)  # numbers out of range are said before a folder is made
@@ -87,7 +86,7 @@ class CertifyOptions:
             save_options(self.output_dir, self)
             certificate = self._certify(engine, env, policy)
             certificate.write(self.output_dir / FILE_NAME)
-        for line in certificate_lines(certificate):
+        for line in summary_lines(certificate):
             say(line)
         say(f"result: {self.output_dir / FILE_NAME}")
 

@@ -30,8 +30,8 @@ from manip_il.cli.progress import say
 from manip_il.cli.sides import Side, Source, common_env, limit_of, matched, read_side, require_side
 from manip_il.cli.suites import SUITE_HELP, require_suite
 from manip_il.errors import UsageError
-from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, Measured, require_same_episodes, write_json
-from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, Member, require_same_episodes
+from manip_il.evaluation.results import EvalResult, write_json
 from manip_il.evaluation.rounds import Rule
 
 if TYPE_CHECKING:
@@ -150,26 +150,22 @@ class CompareOptions:
 
     def _measured(
         self, source: Source, rule: Rule, limit: float | None, trial: Trial | None, engine: Engine, stages: Stages
-    ) -> Measured:
+    ) -> Member:
         if source.result is not None or trial is None:
-            return Measured(source.name, _result(source), source.path, source.training_seed)
+            return Member(source.name, _result(source), source.path, source.training_seed)
         return measured(source, rule, limit, trial, self.output_dir, engine, stages)
 
     def _report(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.compare_report import CompareReport, compare_page
-        from manip_il.evaluation.comparison_table import comparison_facts
-        from manip_il.evaluation.report import write_page
+        from manip_il.evaluation.compare_report import compare_report
+        from manip_il.evaluation.comparison import comparison_facts
 
-        report = CompareReport(
-            comparison,
-            command=command_line("compare", self),
-            more_facts=tuple(comparison_facts(comparison, rule, limit)),
-            config=to_plain(self),
-        )
-        write_page(self.output_dir / REPORT_FILE, compare_page(report))
+        facts = comparison_facts(comparison, rule, limit)
+        report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
+        report.write(self.output_dir / REPORT_FILE)
 
     def _say(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.comparison_table import comparison_facts, comparison_table
+        from manip_il.evaluation.compare_report import comparison_table
+        from manip_il.evaluation.comparison import comparison_facts
         from manip_il.evaluation.tables import print_table
 
         print_table(comparison_table(comparison))

@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from manip_il.algorithms.rounds import RoundResult
     from manip_il.cli.stages import Stages
     from manip_il.engine.engine import Engine
-    from manip_il.evaluation.report_data import LearningCurve, Report
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import LearningCurve
 
 METRICS_FILE, FINGERPRINT_FILE, REPORT_FILE = "metrics.jsonl", "fingerprint.json", "report.html"
 METHOD_HELP = f"who drives after round 0: {', '.join(one.who for one in ALGORITHMS.values())}"
@@ -130,13 +131,12 @@ class DaggerOptions:
         save_options(self.output_dir, self)
         from manip_il.cli.stages import Stages
         from manip_il.engine.engine import Engine
-        from manip_il.evaluation.report import write_report
 
         kept = f"every finished episode and round, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
             engine.warm_up(learned=True)
             results = run_rounds(config, self.output_dir, engine, stages)
-        write_report(self.output_dir / REPORT_FILE, _report(self, config, results))
+        _report(self, config, results).write(self.output_dir / REPORT_FILE)
         best = self.output_dir / "best" / "pretrained_model"
         say(f"best policy: {best}")
         say(f"all rounds' labels as one dataset: {self.output_dir / 'dataset'}")
@@ -214,9 +214,10 @@ def _line(result: RoundResult) -> str:
     )
 
 
-def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> Report:
+def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> RunReport:
     from manip_il.algorithms.rounds import best_round
-    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import PolicyRow
     from manip_il.evaluation.results import compare_results
 
     best = best_round(results)
@@ -230,7 +231,7 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
     if best.round > 0:
         comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
-    return Report(
+    return RunReport(
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=best_verdict(names, results),
         command=command_line("dagger", options),

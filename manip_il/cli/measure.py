@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from manip_il.cli.suites import suite_conditions
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.comparison import Measured
+from manip_il.evaluation.comparison import Member
 from manip_il.evaluation.results import EvalResult, EvalSettings
 
 if TYPE_CHECKING:
@@ -116,11 +116,11 @@ def measure(
 
 def measured(
     source: Source, rule: Rule, limit: float | None, trial: Trial, folder: Path, engine: Engine, stages: Stages
-) -> Measured:
+) -> Member:
     """Return the policy that `rule` takes of `source`, with its evaluation."""
     policy, chosen = source.chosen(rule, limit)
     result, file = measure(trial, policy, source.name, folder, engine, stages)
-    return Measured(source.name, result, file, source.training_seed, policy, chosen, source.history)
+    return Member(source.name, result, file, source.training_seed, policy, chosen, source.history)
 
 
 def rule_json(rule: Rule, limit: float | None) -> dict[str, Any]:

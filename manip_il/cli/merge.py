@@ -42,12 +42,9 @@ class MergeOptions:
         """Read all, merge, write, print the table."""
         from manip_il.data.atomic import exclusive
         from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.evaluation.eval_report import EvalReport, eval_page
-        from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
-        from manip_il.evaluation.merged import merge_results
-        from manip_il.evaluation.report import write_page
-        from manip_il.evaluation.results import FILE_NAME, EvalResult
-        from manip_il.evaluation.tables import print_table
+        from manip_il.evaluation.eval_report import eval_report
+        from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
+        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table
 
         parts = {str(path): EvalResult.read(path) for path in self.files}
         merged = merge_results(parts)
@@ -61,8 +58,8 @@ class MergeOptions:
                 raise UsageError(f"{self.output_dir} exists already; replace it with --overwrite=true") from None
             save_options(self.output_dir, self)
             merged.write(self.output_dir / FILE_NAME)
-            report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))
-            write_page(self.output_dir / REPORT_FILE, eval_page(report))
+            report = eval_report(merged, command=command_line("merge", self), config=to_plain(self))
+            report.write(self.output_dir / REPORT_FILE)
         print_table(evaluation_table(merged))
         for line in evaluation_lines(merged):
             say(line)

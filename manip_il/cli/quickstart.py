@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from manip_il.cli.stages import Stages
     from manip_il.cli.story import Contestant, Pictures
     from manip_il.engine.engine import Engine
-    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import PolicyRow
     from manip_il.evaluation.results import EvalResult
 
     Measured = dict[str, dict[str, EvalResult]]
@@ -128,8 +129,7 @@ class _Story:
     def tell(self) -> None:
         """Every chapter, then table and report."""
         from manip_il.cli.story import picture, telling_seed
-        from manip_il.evaluation.report import write_report
-        from manip_il.evaluation.terminal import print_results
+        from manip_il.evaluation.tables import print_table
 
         with self._timed("demonstrations and DAgger"):
             results = run_rounds(self.config, self.folder / "dagger", self.engine, self.stages)
@@ -144,8 +144,8 @@ class _Story:
         if pictures.note:
             warn([f"the report shows paths in place of films: {pictures.note}"])
         report = self._report(results, contestants, measured, pictures)
-        write_report(self.folder / REPORT_FILE, report)
-        print_results(report.rows)
+        report.write(self.folder / REPORT_FILE)
+        print_table(report.table, empty="-")
         for sentence in (report.verdict, *report.facts):
             say(sentence)
         self._close(dagger)
@@ -194,9 +194,10 @@ class _Story:
         contestants: tuple[Contestant, ...],
         measured: Measured,
         pictures: Pictures,
-    ) -> Report:
+    ) -> RunReport:
         from manip_il.cli.story import compare
-        from manip_il.evaluation.report_data import CurvePoint, PolicyRow, Report
+        from manip_il.evaluation.report import RunReport
+        from manip_il.evaluation.report_data import CurvePoint, PolicyRow
         from manip_il.evaluation.results import compare_results
 
         _, cloned, more, dagger = contestants
@@ -205,7 +206,7 @@ class _Story:
         pairs = [(cloned, dagger), (more, dagger)]
         curve = learning_curve(self.folder / "dagger")
         points = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
-        return Report(
+        return RunReport(
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
             verdict=told_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
             command=command_line("quickstart", self.options),
@@ -259,7 +260,7 @@ def told_verdict(rows: Sequence[PolicyRow], shown: bool) -> str:
 
     shown: whether DAgger and cloning with as many labels are shown to differ.
     """
-    from manip_il.evaluation.report_data import format_percent
+    from manip_il.evaluation.intervals import format_percent
 
     _, cloned, more, dagger = rows
     return (

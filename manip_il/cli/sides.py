@@ -14,7 +14,7 @@ from manip_il.cli.options import from_yaml
 from manip_il.cli.paths import hub_hint
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import END, History, Round, Rule, budget, choose, history
+from manip_il.evaluation.rounds import END, History, Round, Rule, budget, history, select_round
 
 if TYPE_CHECKING:
     from manip_il.cli.dagger import DaggerOptions
@@ -50,7 +50,7 @@ class Source:
         """Return the policy's folder, and of a run the round that `rule` takes; `UsageError` where there is none."""
         if self.policy is not None:
             return self.policy, None
-        round_ = choose(rule, self.history, limit, self.name)
+        round_ = select_round(rule, self.history, limit, self.name)
         return round_policy(self.path, round_.round), round_
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.merged import merge_results
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
+from manip_il.evaluation.results import EvalResult, merge_results
 from manip_il.sim.conditions import Condition
 
 

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from manip_il.evaluation.statistics import confidence_sequence, wilson_interval
 
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, compare_results
-from manip_il.evaluation.statistics import confidence_sequence, wilson_interval
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
+from manip_il.evaluation.results import EvalResult, compare_results
 from manip_il.sim.conditions import Condition
 
 SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
