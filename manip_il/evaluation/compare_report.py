@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 from manip_il.evaluation.comparison import Comparison, Member
 from manip_il.evaluation.curves import CurveCharts
-from manip_il.evaluation.eval_report import AXES_NOTE, moving_thing, thinning_note
+from manip_il.evaluation.eval_report import AXES_NOTE
 from manip_il.evaluation.failures import PhaseRow, phase_rows
 from manip_il.evaluation.intervals import format_percent
-from manip_il.evaluation.maps import FailureMap, Outcome, paired_marks
+from manip_il.evaluation.maps import FailureMap, Outcome, paired_maps
 from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.report_data import format_seconds
 from manip_il.evaluation.results import EvalResult
@@ -129,11 +129,7 @@ class CompareReport(Report):
     @property
     def maps(self) -> list[FailureMap]:
         """Starts and goals of both arms; empty where episodes lack them."""
-        both = paired_marks(self.comparison)
-        if not all(both):
-            return []
-        pairs = zip(both, self.comparison.names, strict=True)
-        return [FailureMap(marks, name, moving_thing(self._first)) for marks, name in pairs]
+        return paired_maps(self.comparison)
 
     @property
     def map_names(self) -> dict[Outcome, str]:
@@ -142,13 +138,13 @@ class CompareReport(Report):
         return {
             "failed": f"only this one failed{more}",
             "shared": "failed, and so did the other",
-            "solved": f"solved: {moving_thing(self._first)}'s start (circle) and goal (square)",
+            "solved": f"solved: {self.maps[0].moving}'s start (circle) and goal (square)",
         }
 
     @property
     def map_note(self) -> str:
         """Axes of the maps."""
-        return f"Both maps show the same starts and goals. {AXES_NOTE}.{thinning_note(self.maps[0])}"
+        return f"Both maps show the same starts and goals. {AXES_NOTE}. {self.maps[0].thinning_note}"
 
     @property
     def phases(self) -> tuple[PhaseRow, ...]:

@@ -120,7 +120,7 @@ class Chart:
 
     @property
     def title(self) -> str:
-        """What the chart shows."""
+        """Title of the chart."""
         return f"Validation success over {_COST_NAMES[self.x.cost]}"
 
     @property

@@ -127,10 +127,10 @@ class EpisodeResult:
         )
 
 
-def has_object(episodes: Sequence[EpisodeResult]) -> bool:
-    """Return whether any episode has an object's start, or none has any; else the hand itself goes to the goal."""
+def moving_thing(episodes: Sequence[EpisodeResult]) -> Literal["object", "hand"]:
+    """Return what is to reach the goal: the hand where episodes have starts, but none of an object."""
     starts = [start for one in episodes if isinstance(start := one.detail.get("start"), Mapping)]
-    return not starts or any(_place(start.get("object")) is not None for start in starts)
+    return "object" if not starts or any(_place(start.get("object")) is not None for start in starts) else "hand"
 
 
 @dataclass(frozen=True, slots=True)

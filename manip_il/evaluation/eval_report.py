@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-from manip_il.evaluation.curves import CurveCharts
-from manip_il.evaluation.episodes import has_object
 from manip_il.evaluation.factors import Factor, factor_table, find_factors
 from manip_il.evaluation.failures import PhaseRow, evaluation_facts, evaluation_verdict, phase_rows
-from manip_il.evaluation.maps import FailureMap, Outcome, map_marks
+from manip_il.evaluation.maps import FailureMap, Outcome, failure_map
 from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.report_data import Film, LearningCurve, Paths
 from manip_il.evaluation.results import EvalResult
@@ -53,7 +51,6 @@ class EvalReport(Report):
     template: ClassVar[str] = "eval.html.j2"
     result: EvalResult
     factors: tuple[Factor, ...]
-    curve: LearningCurve | None = None
 
     @property
     def table(self) -> Table:
@@ -103,11 +100,6 @@ class EvalReport(Report):
         }
 
     @property
-    def curves(self) -> CurveCharts | None:
-        """Learning curve of the policy's run; None where it is not known."""
-        return CurveCharts.of(self.curve) if self.curve else None
-
-    @property
     def failed(self) -> int:
         """Number of failed episodes."""
         return self.result.success.n - self.result.success.successes
@@ -115,17 +107,14 @@ class EvalReport(Report):
     @property
     def map(self) -> FailureMap | None:
         """Starts and goals; None where no episode has them."""
-        marks = map_marks(self.result)
-        return FailureMap(marks, self.result.policy, moving_thing(self.result)) if marks else None
+        return failure_map(self.result)
 
     @property
     def map_names(self) -> dict[Outcome, str]:
         """Outcomes in words."""
-        moving = moving_thing(self.result)
-        return {
-            "solved": f"solved: {moving}'s start (circle) and goal (square)",
-            "failed": "failed: from start to goal",
-        }
+        assert self.map is not None
+        solved = f"solved: {self.map.moving}'s start (circle) and goal (square)"
+        return {"solved": solved, "failed": "failed: from start to goal"}
 
     @property
     def map_note(self) -> str:
@@ -134,7 +123,7 @@ class EvalReport(Report):
         solved = len(self.map.marks) - self.map.failed
         return (
             f"{self.failed:,} failed and {solved:,} solved episodes by where the {self.map.moving} started and was to "
-            f"go. {AXES_NOTE}; z is the height above the table." + thinning_note(self.map)
+            f"go. {AXES_NOTE}; z is the height above the table. {self.map.thinning_note}"
         )
 
     @property
@@ -149,24 +138,21 @@ class EvalReport(Report):
         return f"{count} by the phase of the task that the expert assigned to the last state, in task order."
 
     @property
-    def significant(self) -> Table | None:
-        """Factors that failures are associated with; None without any."""
-        found = [factor for factor in self.factors if factor.significant]
-        return factor_table(found) if found else None
+    def significant(self) -> Table:
+        """Factors that failures are associated with."""
+        return factor_table([factor for factor in self.factors if factor.significant])
 
     @property
-    def insignificant(self) -> Table | None:
-        """The other factors; None without any."""
-        others = [factor for factor in self.factors if not factor.significant]
-        return factor_table(others) if others else None
+    def insignificant(self) -> Table:
+        """The other factors."""
+        return factor_table([factor for factor in self.factors if not factor.significant])
 
     @property
     def insignificant_heading(self) -> str:
         """Heading of the folded table."""
-        count = sum(not factor.significant for factor in self.factors)
-        return (
-            f"{count} more that varied, without a difference beyond chance" if self.significant else "All that varied"
-        )
+        if not self.significant.rows:
+            return "All that varied"
+        return f"{len(self.insignificant.rows)} more that varied, without a difference beyond chance"
 
     @property
     def no_factor(self) -> str:
@@ -186,18 +172,6 @@ class EvalReport(Report):
             f"three, corrected (Holm) for the {count}. An association with a number does not show that it causes the "
             "failures."
         )
-
-
-def moving_thing(result: EvalResult) -> Literal["object", "hand"]:
-    """Return what is to reach the goal: the object, or the hand where the task has none."""
-    return "object" if has_object(result.episodes) else "hand"
-
-
-def thinning_note(drawn: FailureMap) -> str:
-    """Return a sentence about episodes that are not drawn; empty where all are."""
-    if not drawn.left_out:
-        return ""
-    return f" {drawn.left_out:,} of {len(drawn.marks):,} episodes are left out of the map, evenly, to keep it readable."
 
 
 def _range(low: float, high: float) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from manip_il.evaluation.episodes import EpisodeResult, has_object
+from manip_il.evaluation.episodes import EpisodeResult, moving_thing
 from manip_il.evaluation.intervals import Proportion, format_percent
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.significance import fisher_exact, format_p_cell, holm
@@ -127,7 +127,7 @@ def _bin_cell(one: Bin, marked: bool) -> str:
 
 
 def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[float, bool]]]:
-    thing = "object" if has_object(episodes) else "hand"
+    thing = moving_thing(episodes)
     columns: dict[str, list[tuple[float, bool]]] = {}
     for episode in episodes:
         start, goal = episode.start, episode.goal

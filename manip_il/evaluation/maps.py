@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from manip_il.evaluation.comparison import Arm, Comparison
-from manip_il.evaluation.episodes import EpisodeResult, Place
+from manip_il.evaluation.episodes import EpisodeResult, Place, moving_thing
 from manip_il.evaluation.report_data import Paths
 from manip_il.evaluation.results import EvalResult
 from manip_il.mdp import F64
@@ -91,7 +91,7 @@ class DrawnMark:
 
 @dataclass(frozen=True)
 class FailureMap:
-    """Two views of the same marks. name: of the policy, for those who listen. moving: what moves, object or hand."""
+    """Two views of the same marks. name: of the policy. moving: what is to reach the goal."""
 
     marks: tuple[MapMark, ...]
     name: str
@@ -99,7 +99,7 @@ class FailureMap:
 
     @property
     def views(self) -> list[tuple[View, list[DrawnMark]]]:
-        """From above and from the side, with the marks that are drawn, the lowest layer first."""
+        """Views from above and from the side, with the marks that are drawn, the lowest layer first."""
         places = np.array([place for mark in self.marks for place in (mark.start, mark.goal)], dtype=np.float64)
         views = [fit_view(places, 0, up, MAP_HEIGHT) for up in (1, 2)]
         kept = _thinned(self.marks)
@@ -116,9 +116,26 @@ class FailureMap:
         return self.failed > CROWDED
 
     @property
-    def left_out(self) -> int:
-        """Number of episodes that are not drawn, as there are too many."""
-        return len(self.marks) - len(_thinned(self.marks))
+    def thinning_note(self) -> str:
+        """Sentence about episodes that are not drawn; empty where all are."""
+        left_out = len(self.marks) - len(_thinned(self.marks))
+        if not left_out:
+            return ""
+        return f"{left_out:,} of {len(self.marks):,} episodes are left out of the map, evenly, to keep it readable."
+
+
+def failure_map(result: EvalResult) -> FailureMap | None:
+    """Return the map of an evaluation; None where no episode has its places."""
+    marks = map_marks(result)
+    return FailureMap(marks, result.policy, moving_thing(result.episodes)) if marks else None
+
+
+def paired_maps(comparison: Comparison) -> list[FailureMap]:
+    """Return the maps of both arms; none where no episode has its places."""
+    both = paired_marks(comparison)
+    moving = moving_thing(comparison.left.members[0].result.episodes)
+    maps = [FailureMap(marks, name, moving) for marks, name in zip(both, comparison.names, strict=True)]
+    return maps if all(both) else []
 
 
 def map_marks(result: EvalResult) -> tuple[MapMark, ...]:

@@ -57,8 +57,8 @@ class Bar:
 class Report:
     """The parts that every report has. Empty parts are left out of the page.
 
-    verdict: the first sentence, with its numbers. facts: further sentences. command: that made it. pictures_note: such
-    as why there are paths and no films. timings: by name [s]. config, fingerprint: nested mappings.
+    verdict: the first sentence, with its numbers. facts: further sentences. command: that made it. curve: of a run.
+    pictures_note: such as why there are paths and no films. timings: by name [s]. config, fingerprint: nested mappings.
     """
 
     template: ClassVar[str] = "report.html.j2"
@@ -66,6 +66,7 @@ class Report:
     verdict: str
     command: str
     facts: tuple[str, ...] = ()
+    curve: LearningCurve | None = None
     films: tuple[Film, ...] = ()
     strips: tuple[Strip, ...] = ()
     paths: tuple[Paths, ...] = ()
@@ -98,6 +99,11 @@ class Report:
         """The timings, as people read them."""
         return {name: format_seconds(seconds) for name, seconds in self.timings.items()}
 
+    @property
+    def curves(self) -> CurveCharts | None:
+        """Success against cost; None without a curve."""
+        return CurveCharts.of(self.curve) if self.curve else None
+
     def render(self) -> str:
         """Return the page as one string of HTML."""
         return _environment().get_template(self.template).render(report=self)
@@ -110,11 +116,10 @@ class Report:
 
 @dataclass(frozen=True, kw_only=True)
 class RunReport(Report):
-    """The report of a run: its policies, and its learning curve. disturbance: meaning of the disturbed column."""
+    """The report of a run: its policies. disturbance: meaning of the disturbed column."""
 
     template: ClassVar[str] = "run.html.j2"
     rows: tuple[PolicyRow, ...]
-    curve: LearningCurve | None = None
     disturbance: str = ""
 
     def __post_init__(self) -> None:
@@ -131,11 +136,6 @@ class RunReport(Report):
     def bars(self) -> list[Bar]:
         """Their success."""
         return [Bar.of(row.name, row.kind, row.success) for row in self.rows]
-
-    @property
-    def curves(self) -> CurveCharts | None:
-        """Success against cost; None without a curve."""
-        return CurveCharts.of(self.curve) if self.curve else None
 
     @property
     def note(self) -> str:

@@ -62,7 +62,7 @@ class Study:
 
     @property
     def facts(self) -> list[str]:
-        """Further sentences: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
+        """Sentences after the verdict: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
         chosen = [_chosen(member) for arm in self.arms for member in arm.members]
         return [
             *(comparison.verdict for comparison in self.comparisons.values()),

@@ -69,7 +69,7 @@ def test_a_mark_lies_at_its_cost_and_rate_with_its_interval():
     for mark, point in zip(drawn.marks, CURVE.dagger, strict=True):
         low, high = point.success.interval
         places = [100 - chart.y.percent(100 * share) for share in (point.success.rate, high, low)]
-        assert [mark.y, *mark.whisker] == pytest.approx(places)
+        assert [mark.y, *(mark.whisker or ())] == pytest.approx(places)
         assert mark.x == pytest.approx(chart.x.percent(point.labels))
         assert mark.words == f"DAgger, {point.name}, {point.labels:,} labels: {point.success}"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from manip_il.evaluation.episodes import EpisodeResult
-from manip_il.evaluation.eval_report import eval_report, thinning_note
+from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.failures import phase_rows
 from manip_il.evaluation.maps import MAP_HEIGHT, MAX_MARKS, WIDTH, FailureMap, fit_view, map_marks, paired_marks
 from manip_il.evaluation.results import EvalResult
@@ -67,8 +67,8 @@ def test_a_crowd_is_thinned_evenly_and_the_note_says_so():
     for _, marks in crowd.views:
         outcomes = [drawn.mark.outcome for drawn in marks]
         assert (outcomes.count("failed"), outcomes.count("solved")) == (17, MAX_MARKS)
-    assert thinning_note(crowd).startswith(f" {850 - 17 - MAX_MARKS} of 850 episodes are left out")
-    assert thinning_note(replace(crowd, marks=crowd.marks[:100])) == ""
+    assert crowd.thinning_note.startswith(f"{850 - 17 - MAX_MARKS} of 850 episodes are left out")
+    assert replace(crowd, marks=crowd.marks[:100]).thinning_note == ""
 
 
 def test_an_episode_without_places_is_left_out():

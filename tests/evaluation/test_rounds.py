@@ -122,3 +122,23 @@ def test_the_curve_holds_all_that_a_round_had_cost():
     point = curve_points(RUN)[2]
     assert (point.labels, point.episodes, point.seconds, point.name) == (300, 9, 30.0, "round 2")
     assert point.success == RUN[2].validation
+
+
+ODD = (None, True, -5, 2**80, 10**9, 0.5, "x" * 100_000, [], {}, [[]] * 1_000, {"a": {"a": 1}})
+VALID = dict.fromkeys(("labels", "queries", "episodes", "validation_episodes"), 10**9) | {"validation_success": 0.5}
+
+
+@pytest.mark.parametrize("key", [key for key in records()[0] if key != "round"])
+def test_an_odd_value_is_one_short_line(key: str):
+    for value in ODD:
+        if key in VALID and value == VALID[key]:
+            continue
+        with pytest.raises(ManipError) as raised:
+            history([records()[0] | {key: value}], "run")
+        assert len(str(raised.value)) < 1_000
+
+
+@pytest.mark.parametrize("value", ODD)
+def test_a_line_of_no_round_is_one_short_line(value: object):
+    with pytest.raises(ManipError, match=r"run: metrics\.jsonl has no round 0"):
+        history([records()[0] | {"round": value}], "run")
