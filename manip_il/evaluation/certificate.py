@@ -237,12 +237,11 @@ def _recoveries(certificate: Certificate, horizon: str) -> list[str]:
     rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
     rows += certificate.of("learner")
     head = ("the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out")
-    return Table(head, tuple((row.words, *_success(row)) for row in rows)).aligned_lines()
-
-
-def _success(row: Row) -> tuple[str, ...]:
-    steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
-    return (str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out))
+    cells: list[tuple[str, ...]] = []
+    for row in rows:
+        steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
+        cells.append((row.words, str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out)))
+    return Table(head, tuple(cells)).aligned_lines()
 
 
 def _wrong_actions(certificate: Certificate) -> list[str]:

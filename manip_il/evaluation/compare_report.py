@@ -15,7 +15,7 @@ from manip_il.evaluation.maps import FailureMap, Outcome, paired_maps
 from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.report_data import format_seconds
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.significance import PairedComparison, format_p, format_p_cell, holm, sign_flip_exact
+from manip_il.evaluation.significance import format_p, format_p_cell, holm, sign_flip_exact
 from manip_il.evaluation.study_report import arm_series
 from manip_il.evaluation.tables import NO_CONDITION, Table
 
@@ -29,7 +29,9 @@ def comparison_table(comparison: Comparison) -> Table:
     rows: list[tuple[str, ...]] = []
     members = zip(comparison.left.members, comparison.right.members, comparison.pairs, strict=True)
     for left, right, pair in members:
-        rows += [(*_cells(left), "", ""), (*_cells(right), *_paired_cells(pair))]
+        low, high = (100 * end for end in pair.interval)
+        difference = f"{100 * pair.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
+        rows += [(*_cells(left), "", ""), (*_cells(right), difference, format_p_cell(pair.p_value))]
     return Table(columns, tuple(rows), KINDS * len(comparison.pairs))
 
 
@@ -187,12 +189,6 @@ def _cells(member: Member) -> tuple[str, ...]:
         return (member.name, seed, "", "", "", "", "", str(member.result.success))
     costs = (str(chosen.round), f"{chosen.labels:,}", f"{chosen.episodes:,}", format_seconds(chosen.seconds))
     return (member.name, seed, *costs, format_percent(chosen.validation.rate), str(member.result.success))
-
-
-def _paired_cells(pair: PairedComparison) -> tuple[str, str]:
-    low, high = pair.interval
-    difference = f"{100 * pair.difference:+.1f} points [{100 * low:+.1f}, {100 * high:+.1f}]"
-    return difference, format_p_cell(pair.p_value)
 
 
 def _outcomes(members: Sequence[Member]) -> dict[int, list[bool]]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import av
 import numpy as np
@@ -64,7 +65,7 @@ def filmed_steps(episode: Episode, fps: int) -> int:
 
 def make_film(policy: str, frames: Frames, fps: int, caption: str = "", success: bool | None = None) -> Film:
     """Return pictures (height, width, 3) as a film; its poster is the last one."""
-    return Film(policy, encode_mp4(frames, fps), caption, success, encode_jpeg(frames[-1]))
+    return Film(policy, encode_mp4(frames, fps), caption, success, encode_picture(frames[-1], "jpeg"))
 
 
 def encode_mp4(frames: Frames, fps: int) -> bytes:
@@ -91,20 +92,13 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
 def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
     """Return `count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return tuple((index / fps, encode_png(frames[index])) for index in chosen.tolist())
+    return tuple((index / fps, encode_picture(frames[index], "png")) for index in chosen.tolist())
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture (height, width, 3) as PNG."""
+def encode_picture(picture: NDArray[np.uint8], kind: Literal["png", "jpeg"]) -> bytes:
+    """Return one picture (height, width, 3) as a file; JPEG has a fifth of the size of PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="png", optimize=True)
-    return buffer.getvalue()
-
-
-def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture (height, width, 3) as JPEG, a fifth of the size of PNG."""
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="jpeg", quality=85, optimize=True)
+    Image.fromarray(picture).save(buffer, format=kind, optimize=True, **({"quality": 85} if kind == "jpeg" else {}))
     return buffer.getvalue()
 
 

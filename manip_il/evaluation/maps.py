@@ -22,7 +22,6 @@ MAP_HEIGHT, PATHS_HEIGHT = 300.0, 230.0  # [px]
 MAX_MARKS = 600  # of one outcome; more would hide each other
 MAX_POINTS = 160  # of one line; more would only make the file larger
 CROWDED = 80  # failures from which on they are drawn smaller
-AXES = "xyz"
 _BAR_LENGTHS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m]
 
 
@@ -49,7 +48,7 @@ class View:
     @property
     def axis_names(self) -> tuple[str, str]:
         """Names of the axes to the right and upwards."""
-        return AXES[self.right], AXES[self.up]
+        return "xyz"[self.right], "xyz"[self.up]
 
     @property
     def bar(self) -> float:

@@ -66,12 +66,10 @@ class EvalResult:
 
     @property
     def by_condition(self) -> dict[str, EvalResult]:
-        """Each condition's episodes, in the settings' order; under an empty name those without a condition, last."""
+        """Each condition's episodes, in the settings' order; under an empty name those without a condition."""
         parts: dict[str, list[EpisodeResult]] = {condition.name: [] for condition in self.settings.conditions}
         for episode in self.episodes:
             parts.setdefault(episode.condition, []).append(episode)
-        if "" in parts:
-            parts[""] = parts.pop("")
         return {name: replace(self, episodes=tuple(episodes)) for name, episodes in parts.items() if episodes}
 
     @property

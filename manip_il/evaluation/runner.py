@@ -25,7 +25,6 @@ from manip_il.tasks.task import phases
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
 CHECK_EVERY = 100  # episodes after which the width of the interval is checked
-OnResult = Callable[[EpisodeResult], None]
 
 
 def evaluate(
@@ -33,7 +32,7 @@ def evaluate(
     job: RolloutJob,
     seeds: Sequence[int],
     name: str,
-    on_result: OnResult | None = None,
+    on_result: Callable[[EpisodeResult], None] | None = None,
     *,
     suite: str = NOMINAL.name,
     done: Mapping[int, EpisodeResult] | None = None,
@@ -56,8 +55,10 @@ def evaluate(
             results[episode.seed] = episode_result(job, episode)
             if on_result is not None:
                 on_result(results[episode.seed])
-        if until_width is not None and _width(list(results.values())) <= until_width:
-            break
+        if until_width is not None:
+            low, high = Proportion.of([one.success for one in results.values()], sequential=True).interval
+            if high - low <= until_width:
+                break
     run = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
     if lost := [seed for seed in run if seed not in results]:
         _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
@@ -109,8 +110,3 @@ def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence
     """All seeds at once, or as many as are run between two checks of the interval."""
     size = len(seeds) if until_width is None else CHECK_EVERY
     return (seeds[i : i + size] for i in range(0, len(seeds), max(1, size)))
-
-
-def _width(results: Sequence[EpisodeResult]) -> float:
-    low, high = Proportion.of([result.success for result in results], sequential=True).interval
-    return high - low

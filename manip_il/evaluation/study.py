@@ -83,7 +83,7 @@ class Study:
 
     def target_table(self) -> Table:
         """Return an arm a row: labels, episodes and wall-clock when validation first reached the target."""
-        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {_percent(self.target)}" for cost in COSTS]
+        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {100 * self.target:g} %" for cost in COSTS]
         rows = [(arm.name, *(self._to_target(arm, cost) for cost in COSTS), self._fewer(arm)) for arm in self.arms]
         return Table(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
 
@@ -173,7 +173,3 @@ def _plain(cost: Cost, amount: float) -> str:
 def _rates(rates: Sequence[float]) -> str:
     each = f" ({', '.join(f'{100 * rate:.1f}' for rate in rates)})" if len(rates) > 1 else ""
     return f"{format_percent(fmean(rates))}{each}"
-
-
-def _percent(rate: float) -> str:
-    return f"{100 * rate:g} %"

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 
 from manip_il.evaluation.compare_report import compare_report
 from manip_il.evaluation.eval_report import eval_report
-from manip_il.evaluation.film import encode_png
+from manip_il.evaluation.film import encode_picture
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.maps import map_marks, paired_marks
 from manip_il.evaluation.report import Report, RunReport
@@ -76,7 +76,7 @@ def compare_case() -> Case:
 
 def quickstart_case() -> Case:
     films = tuple(small_film(number, None) for number in range(3))
-    picture = encode_png(np.full((48, 64, 3), 90, dtype=np.uint8))
+    picture = encode_picture(np.full((48, 64, 3), 90, dtype=np.uint8), "png")
     report = RunReport(
         title="panda pick_place",
         verdict="DAgger solves 95.0 % of 200 unseen starts.",
