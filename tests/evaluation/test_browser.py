@@ -120,16 +120,16 @@ def test_it_opens_quietly_and_fits_the_window(
     browser: Browser, case: Case, file: Path, width: int, scheme: Literal["light", "dark"]
 ):
     with opened(browser, file, width, scheme) as seen:
-        seen.ask("document.querySelectorAll('details').forEach(one => one.open = true)")
-        wide, room = seen.ask("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        seen.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        wide, room = seen.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
         assert wide <= room == width
         assert too_wide(seen) == []
         assert first_words(seen) == case.report.verdict
-        paper, ink = seen.ask(
+        paper, ink = seen.evaluate(
             "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
         )
         assert (brightness(paper) > brightness(ink)) == (scheme == "light")
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path):
@@ -146,7 +146,7 @@ def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path)
             assert caption in film.evaluate("film => film.closest('figure').innerText")
             heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
             assert success is None or heading == ("Successes" if success else "Failures")
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, case: Case, file: Path):
@@ -155,7 +155,7 @@ def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, 
             film.scroll_into_view_if_needed()  # browsers wait with those that are out of sight
             assert seen.page.wait_for_function(STARTED, arg=film, timeout=60_000)
             assert film.evaluate(POSTER) == [64, 48]
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, case: Case, tmp_path: Path):
@@ -165,7 +165,7 @@ def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, c
     (tmp_path / "report.html").write_text(slipped_in)
     with opened(browser, tmp_path / "report.html", 1280) as seen:
         assert seen.page.title() != "slipped in"
-        assert any("Content Security Policy" in told for told in seen.told)
+        assert any("Content Security Policy" in line for line in seen.console)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
@@ -192,7 +192,7 @@ def counted(result: EvalResult) -> dict[str, int]:
 
 def marks_in(seen: Opened, index: int) -> dict[str, int]:
     """How many marks of each kind one map has, all of them inside its frame and seen."""
-    return seen.ask(
+    return seen.evaluate(
         """(index) => {
             const map = document.querySelectorAll('svg.map')[index], frame = map.getBoundingClientRect();
             const inside = (mark) => {
@@ -209,7 +209,7 @@ def marks_in(seen: Opened, index: int) -> dict[str, int]:
 
 def first_words(seen: Opened) -> str:
     """The first heading's words, which must stand in the first window without scrolling."""
-    words, bottom = seen.ask(
+    words, bottom = seen.evaluate(
         """() => {
             const first = document.querySelector('h1, h2, h3, table, svg, video');
             return [first.innerText, first.getBoundingClientRect().top];
@@ -221,7 +221,7 @@ def first_words(seen: Opened) -> str:
 
 def too_wide(seen: Opened) -> list[str]:
     """Words that stick out of the page's column."""
-    return seen.ask(
+    return seen.evaluate(
         """() => {
             const main = document.querySelector('main').getBoundingClientRect();
             const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, svg.map, .bar-line';
