@@ -244,17 +244,11 @@ def test_what_differs_is_named_with_both_sides(changes, what):
         merge_results({"a": part(0, [True]), "b": part(1, [True], **changes)})
 
 
-def test_a_seed_that_two_parts_ran_is_named_with_both():
+def test_parts_that_do_not_add_up_are_refused_by_name():
     with pytest.raises(ManipError, match="seed 2 is in a and in b"):
         merge_results({"a": part(0, [True] * 3), "b": part(2, [True])})
-
-
-def test_a_part_that_stopped_by_what_it_saw_is_refused():
     with pytest.raises(ManipError, match="b stopped by --until_width"):
         merge_results({"a": part(0, [True]), "b": part(1, [True], until_width=0.1)})
-
-
-def test_nothing_is_not_an_evaluation():
     with pytest.raises(ManipError, match="no evaluations"):
         merge_results({})
 

@@ -80,12 +80,9 @@ def test_the_verdict_names_the_better_policy_and_its_margin():
     assert compare_paired(right, left, ("DAgger", "BC")).verdict.startswith("DAgger beats BC: -40.0 points")
 
 
-def test_a_small_difference_is_not_called_one():
+def test_without_a_significant_difference_the_verdict_says_so():
     verdict = compare_paired([True, False, True], [True, True, True], ("BC", "DAgger")).verdict
     assert verdict.startswith("No difference shown between DAgger and BC")
-
-
-def test_equal_outcomes_are_called_equal():
     assert "exactly the same episodes" in compare_paired([True, False], [True, False]).verdict
 
 
