@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 from manip_il.evaluation.comparison import Comparison, Member
@@ -123,12 +124,12 @@ class CompareReport(Report):
         columns = ("", "episodes", "both solved", f"only {a}", f"only {b}", "neither", "McNemar's exact p")
         return Table(columns, tuple(rows))
 
-    @property
+    @cached_property
     def condition_table(self) -> Table | None:
         """Both arms by condition."""
         return condition_table(self.comparison)
 
-    @property
+    @cached_property
     def maps(self) -> list[FailureMap]:
         """Starts and goals of both arms; empty where episodes lack them."""
         return paired_maps(self.comparison)
@@ -148,7 +149,7 @@ class CompareReport(Report):
         """Axes of the maps."""
         return f"Both maps show the same starts and goals. {AXES_NOTE}. {self.maps[0].thinning_note}"
 
-    @property
+    @cached_property
     def phases(self) -> tuple[PhaseRow, ...]:
         """Failed episodes of both arms by phase; empty where none failed or no phase is known."""
         episodes = [[e for member in arm.members for e in member.result.episodes] for arm in self.comparison.arms]
@@ -162,7 +163,7 @@ class CompareReport(Report):
         seeds = ", all training seeds together" if self._several else ""
         return f"Failed episodes{seeds}, in the order of the task; the upper bar is {self.comparison.left.name}."
 
-    @property
+    @cached_property
     def curves(self) -> CurveCharts | None:
         """Success against cost of the arms whose policies are all of runs; None without such an arm."""
         arms = zip(self.comparison.arms, KINDS, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 from manip_il.evaluation.factors import Factor, factor_table, find_factors
@@ -62,7 +63,7 @@ class EvalReport(Report):
         rows = (("all conditions", *total), *((row[0].strip(), *row[1:]) for row in rows))
         return Table(("condition", *table.columns[1:]), rows, ("baseline", *["dagger"] * (len(rows) - 1)))
 
-    @property
+    @cached_property
     def bars(self) -> list[Bar]:
         """The same success."""
         parts = self.result.by_condition
@@ -104,7 +105,7 @@ class EvalReport(Report):
         """Number of failed episodes."""
         return self.result.success.n - self.result.success.successes
 
-    @property
+    @cached_property
     def map(self) -> FailureMap | None:
         """Starts and goals; None where no episode has them."""
         return failure_map(self.result)
@@ -126,7 +127,7 @@ class EvalReport(Report):
             f"go. {AXES_NOTE}; z is the height above the table. {self.map.thinning_note}"
         )
 
-    @property
+    @cached_property
     def phases(self) -> tuple[PhaseRow, ...]:
         """Failed episodes by phase; empty where none failed or no phase is known."""
         return phase_rows([self.result.episodes], self.result.task) if any(self.result.failures) else ()
@@ -137,12 +138,12 @@ class EvalReport(Report):
         count = "The one failed episode" if self.failed == 1 else f"The {self.failed:,} failed episodes"
         return f"{count} by the phase of the task that the expert assigned to the last state, in task order."
 
-    @property
+    @cached_property
     def significant(self) -> Table:
         """Factors that failures are associated with."""
         return factor_table([factor for factor in self.factors if factor.significant])
 
-    @property
+    @cached_property
     def insignificant(self) -> Table:
         """The other factors."""
         return factor_table([factor for factor in self.factors if not factor.significant])

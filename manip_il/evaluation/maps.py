@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -96,7 +97,7 @@ class FailureMap:
     name: str
     moving: Literal["object", "hand"]
 
-    @property
+    @cached_property
     def views(self) -> list[tuple[View, list[DrawnMark]]]:
         """Views from above and from the side, with the marks that are drawn, the lowest layer first."""
         places = np.array([place for mark in self.marks for place in (mark.start, mark.goal)], dtype=np.float64)

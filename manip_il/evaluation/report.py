@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -80,7 +80,7 @@ class Report:
             if not getattr(self, what).strip():
                 raise ManipError(f"report {self.title!r}: {what} is empty")
 
-    @property
+    @cached_property
     def pictures(self) -> list[tuple[str, list[Film], list[Strip], list[Paths]]]:
         """Pictures by outcome, each outcome under its heading, those of unknown outcome first and without one."""
         return [
@@ -99,7 +99,7 @@ class Report:
         """The timings, as people read them."""
         return {name: format_seconds(seconds) for name, seconds in self.timings.items()}
 
-    @property
+    @cached_property
     def curves(self) -> CurveCharts | None:
         """Success against cost; None without a curve."""
         return CurveCharts.of(self.curve) if self.curve else None

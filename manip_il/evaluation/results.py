@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ class EvalResult:
     def _proportion(self, outcomes: Sequence[bool]) -> Proportion:
         return Proportion.of(outcomes, self.confidence, self.until_width is not None)
 
-    @property
+    @cached_property
     def by_condition(self) -> dict[str, EvalResult]:
         """Each condition's episodes, in the settings' order; under an empty name those without a condition."""
         parts: dict[str, list[EpisodeResult]] = {condition.name: [] for condition in self.settings.conditions}

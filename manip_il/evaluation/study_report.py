@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 from manip_il.evaluation.comparison import Arm
@@ -77,7 +78,7 @@ class StudyReport(Report):
             note += " In brackets and as dots: each training seed; the bar is their mean."
         return note
 
-    @property
+    @cached_property
     def curves(self) -> CurveCharts:
         """Success against cost."""
         series = tuple(arm_series(arm, self.kinds[arm.name]) for arm in self.study.arms)
