@@ -16,9 +16,9 @@ from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages
 from manip_il.cli.trials import Trial
 from manip_il.errors import MismatchError, UsageError
-from manip_il.evaluation.comparison import Measured
+from manip_il.evaluation.comparison import Member
 from manip_il.evaluation.results import FILE_NAME, EvalResult
-from manip_il.evaluation.rounds import END, History, Round, Rule, budget, choose, history
+from manip_il.evaluation.rounds import END, History, Round, Rule, budget, history, select_round
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -53,19 +53,19 @@ class Source:
         """Return the policy's folder, and the round that `rule` selects of a run; `UsageError` where there is none."""
         if self.policy is not None:
             return self.policy, None
-        round_ = choose(rule, self.history, limit, self.name)
+        round_ = select_round(rule, self.history, limit, self.name)
         return round_policy(self.path, round_.round), round_
 
     def measure(
         self, rule: Rule, limit: float | None, trial: Trial | None, folder: Path, engine: Engine, stages: Stages
-    ) -> Measured:
+    ) -> Member:
         """Return the evaluation itself, or that of the policy that `rule` selects, which is stored in `folder`."""
         if self.result is not None or trial is None:
-            return Measured(self.name, self.evaluation, self.path, self.training_seed)
+            return Member(self.name, self.evaluation, self.path, self.training_seed)
         policy, round_ = self.select(rule, limit)
         file = trial.file(folder, policy)
         result = replace(trial.measure(policy, self.name, file, engine, stages), policy=self.name)
-        return Measured(self.name, result, file, self.training_seed, policy, round_, self.history)
+        return Member(self.name, result, file, self.training_seed, policy, round_, self.history)
 
     @property
     def evaluation(self) -> EvalResult:

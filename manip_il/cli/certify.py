@@ -64,8 +64,7 @@ class CertifyOptions:
         """Run the episodes, write `certificate.json`, print the tables."""
         env, policy = self._env_and_policy()
         from manip_il.engine.engine import Engine
-        from manip_il.evaluation.certificate import FILE_NAME
-        from manip_il.evaluation.certificate_table import certificate_lines
+        from manip_il.evaluation.certificate import FILE_NAME, summary_lines
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.seeding import stream_seeds
 
@@ -77,7 +76,7 @@ class CertifyOptions:
                 advance = bar.advance
                 certificate = certify(engine, env, self.cases, self.seed, policy, lambda _: advance(), trust=self.trust)
             certificate.write(folder / FILE_NAME)
-        for line in certificate_lines(certificate):
+        for line in summary_lines(certificate):
             say(line)
         say(f"result: {folder / FILE_NAME}")
 

@@ -32,7 +32,8 @@ from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.trials import SUITE_HELP, Trial, TrialGroup, require_suite
 from manip_il.errors import UsageError
-from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, require_same_episodes, write_json
+from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, require_same_episodes
+from manip_il.evaluation.results import write_json
 from manip_il.evaluation.rounds import Rule
 from manip_il.option import option
 
@@ -125,20 +126,16 @@ class CompareOptions:
             return [Arm(str(one.path), tuple(source.measure(*last) for source in one.sources)) for one in candidates]
 
     def _report(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.compare_report import CompareReport, compare_page
-        from manip_il.evaluation.comparison_table import comparison_facts
-        from manip_il.evaluation.report import write_page
+        from manip_il.evaluation.compare_report import compare_report
+        from manip_il.evaluation.comparison import comparison_facts
 
-        report = CompareReport(
-            comparison,
-            command=command_line("compare", self),
-            more_facts=tuple(comparison_facts(comparison, rule, limit)),
-            config=to_plain(self),
-        )
-        write_page(self.output_dir / REPORT_FILE, compare_page(report))
+        facts = comparison_facts(comparison, rule, limit)
+        report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
+        report.write(self.output_dir / REPORT_FILE)
 
     def _say(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.comparison_table import comparison_facts, comparison_table
+        from manip_il.evaluation.compare_report import comparison_table
+        from manip_il.evaluation.comparison import comparison_facts
         from manip_il.evaluation.tables import print_table
 
         print_table(comparison_table(comparison))

@@ -42,7 +42,8 @@ from manip_il.option import option, option_of
 if TYPE_CHECKING:
     from manip_il.algorithms.rounds import RoundResult
     from manip_il.engine.engine import Engine
-    from manip_il.evaluation.report_data import LearningCurve, Report
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import LearningCurve
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
@@ -108,13 +109,12 @@ class DaggerOptions(EnvOptions):
         config = self.config()
         with open_output(self, FREE, may_grow="rounds") as folder:
             from manip_il.engine.engine import Engine
-            from manip_il.evaluation.report import write_report
 
             kept = f"every finished episode and round, in {folder}"
             with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
                 engine.warm_up(learned=True)
                 results = run_rounds(config, folder, engine, stages)
-            write_report(folder / REPORT_FILE, _report(self, config, results))
+            _report(self, config, results).write(folder / REPORT_FILE)
         best = folder / "best" / "pretrained_model"
         say(f"best policy: {best}")
         say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
@@ -185,9 +185,10 @@ def _line(result: RoundResult) -> str:
     )
 
 
-def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> Report:
+def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> RunReport:
     from manip_il.algorithms.rounds import best_round
-    from manip_il.evaluation.report_data import PolicyRow, Report
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import PolicyRow
     from manip_il.evaluation.results import compare_results
 
     best = best_round(results)
@@ -201,7 +202,7 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
     if best.round > 0:
         comparison = compare_results(results[0].validation, best.validation, (names[0], names[best.round]))
         facts.append(f"{comparison.verdict} The best round was chosen on these episodes, so this flatters it.")
-    return Report(
+    return RunReport(
         title=f"{kind} on {config.env.robot} {config.env.task}",
         verdict=best_verdict(names, results),
         command=command_line("dagger", options),

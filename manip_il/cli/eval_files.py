@@ -72,12 +72,12 @@ class EpisodeJournal:
 
 def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
     from manip_il.engine.environments import env_fingerprint, policy_sha256
-    from manip_il.engine.sight import drawn_cameras
+    from manip_il.engine.jobs import observed_cameras
     from manip_il.evaluation.results import EvalSettings
 
     return {
         "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver,
-        "fingerprint": env_fingerprint(job.env, drawn_cameras(job)),
+        "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }
 
@@ -226,12 +226,9 @@ class MergeOptions:
     def run(self) -> None:
         """Read all, merge, write, print the table."""
         from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.evaluation.eval_report import EvalReport, eval_page
-        from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
-        from manip_il.evaluation.merged import merge_results
-        from manip_il.evaluation.report import write_page
-        from manip_il.evaluation.results import FILE_NAME, EvalResult
-        from manip_il.evaluation.tables import print_table
+        from manip_il.evaluation.eval_report import eval_report
+        from manip_il.evaluation.results import FILE_NAME, EvalResult, merge_results
+        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table
 
         parts = {str(path): EvalResult.read(path) for path in self.files}
         merged = merge_results(parts)
@@ -240,8 +237,8 @@ class MergeOptions:
             warn(compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
         with open_output(self):
             merged.write(self.output_dir / FILE_NAME)
-            report = EvalReport(merged, command=command_line("merge", self), config=to_plain(self))
-            write_page(self.output_dir / REPORT_FILE, eval_page(report))
+            report = eval_report(merged, command=command_line("merge", self), config=to_plain(self))
+            report.write(self.output_dir / REPORT_FILE)
         print_table(evaluation_table(merged))
         for line in evaluation_lines(merged):
             say(line)

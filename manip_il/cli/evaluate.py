@@ -210,10 +210,9 @@ class EvalOptions:
 
     def _report(self, result: EvalResult, pictures: Pictures) -> None:
         from manip_il.cli.dagger import run_curve
-        from manip_il.evaluation.eval_report import EvalReport, eval_page
-        from manip_il.evaluation.report import write_page
+        from manip_il.evaluation.eval_report import eval_report
 
-        report = EvalReport(
+        report = eval_report(
             result,
             command=command_line("eval", self),
             config=to_plain(self),
@@ -222,14 +221,13 @@ class EvalOptions:
             pictures_note=pictures.note,
             curve=run_curve(self.policy.path),
         )
-        write_page(self.output_dir / REPORT_FILE, eval_page(report))
+        report.write(self.output_dir / REPORT_FILE)
 
     def _name(self) -> str:
         return str(self.policy.type or self.policy.path)
 
     def _say(self, result: EvalResult) -> None:
-        from manip_il.evaluation.eval_table import evaluation_lines, evaluation_table
-        from manip_il.evaluation.tables import print_table
+        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table
 
         print_table(evaluation_table(result))
         for line in evaluation_lines(result):

@@ -30,8 +30,8 @@ from manip_il.option import option, option_of
 if TYPE_CHECKING:
     from manip_il.algorithms.rounds import RoundResult
     from manip_il.engine.engine import Engine
-    from manip_il.evaluation.report_data import Kind, PolicyRow, Report
-    from manip_il.evaluation.results import EvalResult
+    from manip_il.evaluation.report import RunReport
+    from manip_il.evaluation.report_data import Kind, PolicyRow
 
 POLICY_TYPES = ("mlp",)
 TIMINGS_FILE = "timings.json"
@@ -135,9 +135,8 @@ class _Quickstart:
 
     def run(self) -> None:
         """Run every part, then print the table and write the report."""
-        from manip_il.evaluation.report import write_report
         from manip_il.evaluation.report_data import format_seconds
-        from manip_il.evaluation.terminal import print_results
+        from manip_il.evaluation.tables import print_table
 
         with self._timed("demonstrations and DAgger"):
             results = run_rounds(self.config, self.folder / "dagger", self.engine, self.stages)
@@ -148,8 +147,8 @@ class _Quickstart:
         with self._timed("films"):
             pictures = self._film(contestants, measured["nominal"])
         report = self._report(contestants, measured, pictures)
-        write_report(self.folder / REPORT_FILE, report)
-        print_results(report.rows)
+        report.write(self.folder / REPORT_FILE)
+        print_table(report.table, empty="-")
         for sentence in (report.verdict, *report.facts):
             say(sentence)
         say(f"took {format_seconds(sum(self.timings.values()))} in all")
@@ -215,8 +214,9 @@ class _Quickstart:
 
     def _report(
         self, contestants: Sequence[Contestant], measured: dict[str, dict[str, EvalResult]], pictures: Pictures
-    ) -> Report:
-        from manip_il.evaluation.report_data import CurvePoint, PolicyRow, Report
+    ) -> RunReport:
+        from manip_il.evaluation.report import RunReport
+        from manip_il.evaluation.report_data import CurvePoint, PolicyRow
         from manip_il.evaluation.results import compare_results
 
         _, cloned, more, dagger = contestants
@@ -228,7 +228,7 @@ class _Quickstart:
             for one in (cloned, more)
         ]
         point = CurvePoint(more.labels or 0, measured["validation"][more.key].success, "demonstrations alone")
-        return Report(
+        return RunReport(
             title=f"Quickstart: {self.config.env.robot} {self.config.env.task}",
             verdict=quickstart_verdict(rows, compare_results(nominal[more.key], nominal[dagger.key]).significant),
             command=command_line("quickstart", self.options),
@@ -274,7 +274,7 @@ def quickstart_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
 
     significant: whether DAgger and cloning with as many labels are shown to differ.
     """
-    from manip_il.evaluation.report_data import format_percent
+    from manip_il.evaluation.intervals import format_percent
 
     _, cloned, more, dagger = rows
     return (

@@ -23,7 +23,8 @@ from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
 from manip_il.cli.trials import Trial
 from manip_il.errors import UsageError
-from manip_il.evaluation.comparison import Arm, write_json
+from manip_il.evaluation.comparison import Arm
+from manip_il.evaluation.results import write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
 from manip_il.option import option
 
@@ -76,10 +77,7 @@ class StudyOptions:
             study = self._test(plan)
             write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
             atomic_write(folder / TABLE_FILE, table_markdown(study))
-            from manip_il.evaluation.report import write_page
-            from manip_il.evaluation.study_report import render_study
-
-            write_page(folder / REPORT_FILE, render_study(self._report(plan, study)))
+            self._report(plan, study).write(folder / REPORT_FILE)
         self._say(study)
 
     def _learn(self, plan: Plan) -> None:
@@ -123,7 +121,7 @@ class StudyOptions:
         return self.output_dir / name / f"seed_{seed}"
 
     def _report(self, plan: Plan, study: Study) -> StudyReport:
-        from manip_il.evaluation.study_report import StudyReport
+        from manip_il.evaluation.study_report import study_report
 
         result = study.arms[0].members[0].result
         words = ["manip-il", "study", str(self.file), f"--output_dir={self.output_dir}"]
@@ -131,13 +129,8 @@ class StudyOptions:
             words.append(f"--training_seeds={self.training_seeds}")
         if self.trust:
             words.append("--trust=true")
-        return StudyReport(
-            title=f"Study: {result.robot} {result.task}, {self.file.stem}",
-            command=shlex.join(words),
-            study=study,
-            config=to_plain(plan.file),
-            fingerprint=result.fingerprint,
-        )
+        title = f"Study: {result.robot} {result.task}, {self.file.stem}"
+        return study_report(study, title, shlex.join(words), to_plain(plan.file))
 
     def _say(self, study: Study) -> None:
         from manip_il.evaluation.tables import print_table

@@ -1,8 +1,8 @@
-"""`certificate.json`: from where the expert recovers, and what one wrong action costs it.
+"""`certificate.json`: the states from which the expert recovers, and the cost of one wrong action.
 
 The cost of a state is the number of control steps until the task is solved. Where Q*(s, a) is the expert's cost of
-going on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is what the action a
-makes worse. Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest of them, u: a learner that errs
+going on after action a in state s, and V*(s) its cost of acting itself, the gap Q*(s, a) - V*(s) is the cost that the
+action a adds. Ross, Gordon & Bagnell (2011, Theorem 2.2) bound imitation by the largest of them, u: a learner that errs
 in a share e of the states it visits within T steps costs at most u T e more than the expert, so linearly in T where a
 mistake can be undone, and not quadratically. Rajaraman et al. (2021) call it mu-recoverability. The largest gap among
 drawn actions, as here, is a lower bound of u: `Row.above_largest` says how much of the draw may lie above it.
@@ -20,10 +20,13 @@ import numpy as np
 
 from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.statistics import CONFIDENCE, Proportion
+from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.evaluation.tables import Table
 
 FILE_NAME = "certificate.json"
 Group = Literal["start", "state", "action", "learner"]
+MAX_SEEDS = 6  # of failures in a line
+_NONE = "-"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,8 +34,8 @@ class Case:
     """One episode. moment: the control step from which the expert is judged.
 
     steps: until solved from there [control steps]; None where not within a horizon. undisturbed: the same without the
-    perturbation, where it is known. labelled: the expert's last label was sound; it is not
-    where the object is out of reach, say. Raises `ManipError` for counts that cannot be.
+    perturbation, where known. labelled: whether the expert's last label was valid. Raises `ManipError` for impossible
+    counts.
     """
 
     seed: int
@@ -47,7 +50,7 @@ class Case:
             raise ManipError(f"certificate of seed {self.seed}: {self} has impossible step counts")
 
     def gap(self, horizon: int) -> int | None:
-        """Q*(s, a) - V*(s) [control steps]; the whole horizon where the expert did not recover."""
+        """Return Q*(s, a) - V*(s) [control steps]; the whole horizon where the expert did not recover."""
         if self.undisturbed is None:
             return None
         return horizon if self.steps is None else self.steps - self.undisturbed
@@ -55,7 +58,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Of the cost-to-go, over the cases of a row [control steps]. unrecovered: counted as a whole horizon."""
+    """Gaps of the cost-to-go, over the cases of a row [control steps]. unrecovered: counted as a whole horizon."""
 
     mean: float
     p95: int
@@ -66,10 +69,10 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Row:
-    """The cases of one kind. name: of the kind; words: the same, for people; horizon: [control steps].
+    """The cases of one kind. name, words: of the kind, short and in full; horizon: [control steps].
 
-    left_out: cases that are none, as no place was found for the perturbation, nothing was changed by it, or the task
-    was solved before its moment.
+    left_out: episodes that give no case, as the perturbation found no place or changed nothing, or the task was solved
+    before its moment.
     """
 
     group: Group
@@ -91,23 +94,23 @@ class Row:
 
     @property
     def failed_seeds(self) -> tuple[int, ...]:
-        """Of the cases that were not solved."""
+        """Seeds of the cases that were not solved."""
         return tuple(case.seed for case in self.cases if case.steps is None)
 
     @property
     def without_label(self) -> int:
-        """Of the cases that were not solved: those that ended where the expert has no sound label."""
+        """Number of unsolved cases that ended where the expert has no valid label."""
         return sum(case.steps is None and not case.labelled for case in self.cases)
 
     @property
     def mean_steps(self) -> float | None:
-        """Until solved, over the cases that were [control steps]."""
+        """Mean over the solved cases, until they were [control steps]."""
         steps = [case.steps for case in self.cases if case.steps is not None]
         return float(np.mean(steps)) if steps else None
 
     @property
     def gaps(self) -> Gaps | None:
-        """Of the cost-to-go; None where no case knows its own."""
+        """Gaps of the cost-to-go; None where no case has one."""
         gaps = [gap for case in self.cases if (gap := case.gap(self.horizon)) is not None]
         if not gaps:
             return None
@@ -121,7 +124,7 @@ class Row:
         return 1 - (1 - CONFIDENCE) ** (1 / len(self.cases)) if self.cases else None
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON values."""
+        """Return plain JSON values."""
         success, gaps = self.success, self.gaps
         return {
             "group": self.group,
@@ -148,7 +151,7 @@ def pooled(rows: tuple[Row, ...], words: str) -> Row:
 
 @dataclass(frozen=True)
 class Settings:
-    """What was run. cases: asked for, a kind; horizon: [control steps]; tolerance: to the goal [m]."""
+    """Settings of the runs. cases: of each kind; horizon: [control steps]; tolerance: to the goal [m]."""
 
     cases: int
     seed: int
@@ -160,9 +163,9 @@ class Settings:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Of the expert on one robot and task. policy: whose visited states it went on from, None for nobody's.
+    """Recoverability of the expert on one robot and task, one row a kind.
 
-    rows: one a kind.
+    policy: from whose visited states the expert went on, too; None for none.
     """
 
     robot: str
@@ -178,12 +181,12 @@ class Certificate:
 
     @property
     def states(self) -> Row:
-        """Every state that was changed."""
+        """All changed states."""
         return pooled(self.of("state"), "all changed states")
 
     @property
     def actions(self) -> Row:
-        """Every wrong action: its `gaps.largest` is the empirical u of Ross et al. (2011)."""
+        """All wrong actions: their `gaps.largest` is the empirical u of Ross et al. (2011)."""
         return pooled(self.of("action"), "all wrong actions")
 
     def to_json(self) -> dict[str, Any]:
@@ -213,3 +216,76 @@ class Certificate:
         text = json.dumps(self.to_json(), allow_nan=False, ensure_ascii=False)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, (text + "\n").encode())
+
+
+def summary_lines(certificate: Certificate) -> list[str]:
+    """Return the table of recoveries, the table of wrong actions, and sentences on both, as plain lines."""
+    settings = certificate.settings
+    horizon = f"{settings.horizon} steps ({_seconds(settings.horizon, settings.control_hz)})"
+    return [
+        f"expert on {certificate.robot} {certificate.task}: {settings.cases} cases a kind, --seed={settings.seed}",
+        "",
+        *_recoveries(certificate, horizon),
+        "",
+        *_wrong_actions(certificate),
+        "",
+        *_sentences(certificate),
+    ]
+
+
+def _recoveries(certificate: Certificate, horizon: str) -> list[str]:
+    rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
+    rows += certificate.of("learner")
+    head = ("the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out")
+    cells: list[tuple[str, ...]] = []
+    for row in rows:
+        steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
+        cells.append((row.words, str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out)))
+    return Table(head, tuple(cells)).aligned_lines()
+
+
+def _wrong_actions(certificate: Certificate) -> list[str]:
+    hz = certificate.settings.control_hz
+    head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
+    return Table(
+        head, tuple(_costs(row, hz) for row in [*certificate.of("action"), certificate.actions])
+    ).aligned_lines()
+
+
+def _costs(row: Row, hz: int) -> tuple[str, ...]:
+    gaps = row.gaps
+    if gaps is None:
+        return (row.words, *[_NONE] * 5, "0")
+    steps = (f"{gaps.mean:.1f}", *map(str, (gaps.p95, gaps.p99, gaps.largest)))
+    costs = (f"{text} ({_seconds(float(text), hz)})" for text in steps)
+    return (row.words, *costs, str(gaps.unrecovered), str(len(row.cases)))
+
+
+def _sentences(certificate: Certificate) -> list[str]:
+    lines = [_mu(certificate.actions, certificate.settings.control_hz)] if certificate.actions.cases else []
+    for row in certificate.of("learner"):
+        count = row.left_out + len(row.cases)
+        lines.append(f"the policy had solved {row.left_out} of {count} before the expert's turn")
+    return lines + [_failures(row) for row in certificate.rows if row.failed_seeds]
+
+
+def _mu(actions: Row, hz: int) -> str:
+    assert actions.gaps is not None
+    assert actions.above_largest is not None
+    mu = f"mu (the u of Ross et al. 2011) is at least {actions.gaps.largest} steps"
+    mu += f" ({_seconds(actions.gaps.largest, hz)})"
+    if actions.gaps.unrecovered:
+        return f"{mu}, the whole horizon, as {actions.gaps.unrecovered} of {len(actions.cases)} were never solved"
+    return f"{mu}; with {CONFIDENCE:.0%} confidence, at most {actions.above_largest:.1%} of such actions cost more"
+
+
+def _failures(row: Row) -> str:
+    seeds = ", ".join(map(str, row.failed_seeds[:MAX_SEEDS])) + (", ..." if len(row.failed_seeds) > MAX_SEEDS else "")
+    line = f"not solved, {row.words}: seeds {seeds}"
+    if not row.without_label:
+        return line
+    return f"{line} ({row.without_label} of {len(row.failed_seeds)} ended where the expert has no valid label)"
+
+
+def _seconds(steps: float, hz: int) -> str:
+    return f"{steps / hz:.3g} s"

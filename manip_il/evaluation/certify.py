@@ -1,7 +1,7 @@
-"""Measure the expert's recoverability: rollouts that are perturbed once, beside the same ones undisturbed.
+"""Measure the expert's recoverability: rollouts perturbed once, beside the same ones undisturbed.
 
-Expert and simulator are deterministic. So the undisturbed run of a seed tells the cost-to-go of every state on it, and
-the same run with one wrong action tells what that action costs.
+Expert and simulator are deterministic, so the undisturbed run of a seed gives the cost-to-go of every state on it, and
+the same run with one wrong action gives the cost of that action.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def certify(
     *,
     trust: bool = False,
 ) -> Certificate:
-    """Certify the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
+    """Measure the expert on `env` with `cases` episodes of each kind, on the seeds of the stream `certificate`.
 
     A perturbation happens at a step drawn evenly from those that the undisturbed run takes until the task is solved;
     the expert then has a whole horizon. policy: the expert goes on from states that this one visits, too; trust: see
@@ -79,14 +79,14 @@ def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> in
 
 
 class _Run:
-    """The rows of one certificate; `starts` comes first, as the others lean on its runs."""
+    """The rows of one certificate; `starts` comes first, as the others need its runs."""
 
     def __init__(self, engine: Engine, env: EnvConfig, seeds: Sequence[int], on_episode: Progress | None):
         self._engine, self._env, self._seeds, self._seen = engine, env, seeds, on_episode
         self._undisturbed: dict[int, Undisturbed] = {}
 
     def starts(self) -> Row:
-        """From where episodes begin."""
+        """Episodes as they begin."""
         cases: list[Case] = []
         for episode in self._episodes(RolloutJob(self._env, "expert", hold=0), self._seeds):
             case = self._case(episode, 0)
@@ -108,26 +108,26 @@ class _Run:
         return self._row("start", "noise", f"{NOISE:.0%} noise on every action", cases)
 
     def perturbed(self, kind: str) -> Row:
-        """After a perturbation."""
+        """Episodes perturbed once."""
         moments = {seed: draw_moment(seed, kind, run.steps) for seed, run in self._undisturbed.items()}
         longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
         job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
             moment, run = moments[episode.seed], self._undisturbed[episode.seed]
-            if happened(episode, run, moment):
+            if has_changed(episode, run, moment):
                 cases.append(self._case(episode, moment, run.steps - moment))
         known = kinds_for(get_task(self._env.task))[kind]
         return self._row("action" if known.wrong else "state", kind, known.words, cases)
 
     def taken_over(self, policy: Path, trust: bool) -> Row:
-        """From states that a learner visits: at a drawn step of a horizon the expert takes over."""
+        """States that a learner visits: at a drawn step of a horizon the expert takes over."""
         once = QueryRule("one")
         job = RolloutJob(self._env, "policy", policy=policy, hold=0, label="takeover", query=once, trust=trust)
         cases: list[Case] = []
         for episode in self._episodes(job, self._seeds):
             taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)
-            if taken.size:  # else the learner had solved it before
+            if taken.size:  # else the learner solved it before
                 cases.append(self._case(episode, int(taken[0])))
         return self._row("learner", "learner", "states that the policy visited", cases)
 
@@ -153,7 +153,7 @@ def draw_moment(seed: int, kind: str, steps: int) -> int:
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
 
 
-def happened(episode: Episode, run: Undisturbed, moment: int) -> bool:
-    """Return whether the state or the action of that moment is another than in the undisturbed run."""
+def has_changed(episode: Episode, run: Undisturbed, moment: int) -> bool:
+    """Return whether the state or the action at `moment` differs from the undisturbed run's."""
     state, action = episode.columns[schema.SIM_STATE][moment], episode.columns[schema.EXECUTED_ACTION][moment]
     return not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment]))

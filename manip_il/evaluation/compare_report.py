@@ -1,128 +1,181 @@
-"""`report.html` of a comparison: which is better, and in which episodes the two differ."""
+"""The tables of a comparison, and its `report.html`: which is better, and in which episodes the two differ."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from html import escape
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
 
-from manip_il.errors import ManipError
-from manip_il.evaluation import curve_sections, sections
-from manip_il.evaluation.charts import seeds_bar
-from manip_il.evaluation.comparison import Arm, Comparison
-from manip_il.evaluation.comparison_table import comparison_table
-from manip_il.evaluation.condition_chart import paired_conditions
-from manip_il.evaluation.episode_facts import has_object
-from manip_il.evaluation.failure_map import failure_map, map_legend, thinning_note
-from manip_il.evaluation.html_table import cells_table
-from manip_il.evaluation.paired_map import paired_marks
-from manip_il.evaluation.phase_chart import phase_chart, phase_rows
-from manip_il.evaluation.report import render_page
-from manip_il.evaluation.report_data import Film, Paths, Strip
-from manip_il.evaluation.statistics import format_p
-from manip_il.evaluation.study_report import arm_curve, arm_numbers
-from manip_il.evaluation.tables import Cells
+from manip_il.evaluation.comparison import Comparison, Member
+from manip_il.evaluation.curves import CurveCharts
+from manip_il.evaluation.eval_report import AXES_NOTE
+from manip_il.evaluation.failures import PhaseRow, phase_rows
+from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.maps import FailureMap, Outcome, paired_maps
+from manip_il.evaluation.report import Bar, Report
+from manip_il.evaluation.report_data import format_seconds
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.significance import format_p, format_p_cell, holm, sign_flip_exact
+from manip_il.evaluation.study_report import arm_series
+from manip_il.evaluation.tables import NO_CONDITION, Table
 
 KINDS = ("arm arm-1 left", "arm arm-0 right")  # left, right
 
 
-@dataclass(frozen=True)
-class CompareReport:
-    """A comparison's whole story. Empty parts are left out of the page.
+def comparison_table(comparison: Comparison) -> Table:
+    """Return two rows a training seed, the paired result on the second."""
+    columns = ("policy", "training seed", "round", "labels", "episodes", "wall-clock", "validation")
+    columns += (f"test [{100 * comparison.confidence:g} % interval]", "difference", "McNemar's exact p")
+    rows: list[tuple[str, ...]] = []
+    members = zip(comparison.left.members, comparison.right.members, comparison.pairs, strict=True)
+    for left, right, pair in members:
+        low, high = (100 * end for end in pair.interval)
+        difference = f"{100 * pair.difference:+.1f} points [{low:+.1f}, {high:+.1f}]"
+        rows += [(*_cells(left), "", ""), (*_cells(right), difference, format_p_cell(pair.p_value))]
+    return Table(columns, tuple(rows), KINDS * len(comparison.pairs))
 
-    command: what made it. more_facts: sentences under the verdict. films, strips, paths: of single episodes.
-    timings: what -> [s]. config: nested.
+
+def condition_table(comparison: Comparison) -> Table | None:
+    """Return both arms by condition, all training seeds together; None where there is one condition alone.
+
+    p: exact over test episodes as in `Comparison.p_value`, corrected for the number of conditions (Holm).
     """
+    parts = comparison.left.members[0].result.by_condition
+    if len(parts) < 2:
+        return None
+    left, right = _outcomes(comparison.left.members), _outcomes(comparison.right.members)
+    seeds = {name: [episode.seed for episode in part.episodes] for name, part in parts.items()}
+    margins = [[sum(right[seed]) - sum(left[seed]) for seed in own] for own in seeds.values()]
+    corrected = holm([sign_flip_exact(one) for one in margins])
+    rows: list[tuple[str, ...]] = []
+    for (name, own), p in zip(seeds.items(), corrected, strict=True):
+        rates = [_rate(outcomes, own) for outcomes in (left, right)]
+        difference = f"{100 * (rates[1] - rates[0]):+.1f} points"
+        rows.append((name or NO_CONDITION, f"{len(own):,}", *map(format_percent, rates), difference, format_p(p)))
+    return Table(("condition", "episodes", *comparison.names, "difference", "corrected p"), tuple(rows))
 
+
+def compare_report(
+    comparison: Comparison, command: str, facts: Sequence[str] = (), config: Mapping[str, Any] | None = None
+) -> CompareReport:
+    """Return the report of a comparison. facts: sentences that follow the four counts of paired episodes."""
+    first = comparison.left.members[0].result
+    left, right = (arm.members[0].result.fingerprint for arm in comparison.arms)
+    return CompareReport(
+        title=f"{' against '.join(comparison.names)}: {first.robot} {first.task}",
+        verdict=comparison.verdict,
+        facts=(_paired_fact(comparison), *facts),
+        command=command,
+        config=config or {},
+        fingerprint=left if left == right else dict(zip(comparison.names, (left, right), strict=True)),
+        comparison=comparison,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareReport(Report):
+    """The report of a comparison, made by `compare_report`."""
+
+    template: ClassVar[str] = "compare.html.j2"
+    kinds: ClassVar[tuple[str, str]] = KINDS
     comparison: Comparison
-    command: str
-    more_facts: tuple[str, ...] = ()
-    config: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    films: tuple[Film, ...] = ()
-    strips: tuple[Strip, ...] = ()
-    paths: tuple[Paths, ...] = ()
-    pictures_note: str = ""
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
-
-    def __post_init__(self) -> None:
-        if not self.command.strip():
-            raise ManipError(f"report on {' and '.join(self.comparison.names)}: command is empty")
 
     @property
-    def title(self) -> str:
-        """What it is about."""
-        first = self.comparison.left.members[0].result
-        return f"{' against '.join(self.comparison.names)}: {first.robot} {first.task}"
+    def _first(self) -> EvalResult:
+        return self.comparison.left.members[0].result
 
     @property
-    def verdict(self) -> str:
-        """The first sentence."""
-        return self.comparison.verdict
+    def _several(self) -> bool:
+        return len(self.comparison.pairs) > 1
 
     @property
-    def facts(self) -> Sequence[str]:
-        """Further sentences under it."""
-        return [_paired_fact(self.comparison), *self.more_facts]
+    def bars(self) -> list[Bar]:
+        """Success of both arms."""
+        arms = zip(self.comparison.arms, KINDS, strict=True)
+        return [Bar.of(arm.name, kind, *(member.result.success for member in arm.members)) for arm, kind in arms]
 
     @property
-    def fingerprint(self) -> Mapping[str, Any]:
-        """Of both sides, where they differ; else the one that they share."""
-        left, right = (arm.members[0].result.fingerprint for arm in (self.comparison.left, self.comparison.right))
-        return left if left == right else dict(zip(self.comparison.names, (left, right), strict=True))
+    def note(self) -> str:
+        """Number of episodes, the disturbance, meaning of dots."""
+        note = f"Both ran the same {self._first.success.n:,} test episodes."
+        if self._first.settings.disturbance != "none":
+            note += f" Disturbed: {self._first.settings.disturbance}."
+        return note + (" Dots: each training seed; the bar is their mean." if self._several else "")
 
+    @property
+    def table(self) -> Table:
+        """The table without p, which stands beside the counts that it follows from."""
+        table = comparison_table(self.comparison)
+        return replace(table, columns=table.columns[:-1], rows=tuple(row[:-1] for row in table.rows))
 
-def compare_page(report: CompareReport) -> str:
-    """Return the page as one string of HTML."""
-    comparison = report.comparison
-    return render_page(
-        report.title,
-        [
-            sections.header(report),
-            _results(comparison),
-            _conditions(comparison),
-            _where(comparison),
-            _curves(comparison),
-            sections.pictures(report),
-            sections.making(report),
-        ],
-    )
+    @property
+    def paired_table(self) -> Table:
+        """Counts of paired episodes by who succeeded."""
+        a, b = self.comparison.names
+        rows = [
+            (
+                f"training seed {left.training_seed}" if self._several else "test episodes",
+                *(f"{count:,}" for count in (pair.n, pair.both, pair.only_left, pair.only_right, pair.neither)),
+                format_p_cell(pair.p_value),
+            )
+            for left, pair in zip(self.comparison.left.members, self.comparison.pairs, strict=True)
+        ]
+        columns = ("", "episodes", "both solved", f"only {a}", f"only {b}", "neither", "McNemar's exact p")
+        return Table(columns, tuple(rows))
 
+    @cached_property
+    def condition_table(self) -> Table | None:
+        """Both arms by condition."""
+        return condition_table(self.comparison)
 
-def _arms(comparison: Comparison) -> tuple[Arm, Arm]:
-    return comparison.left, comparison.right
+    @cached_property
+    def maps(self) -> list[FailureMap]:
+        """Starts and goals of both arms; empty where episodes lack them."""
+        return paired_maps(self.comparison)
 
+    @property
+    def map_names(self) -> dict[Outcome, str]:
+        """Outcomes in words."""
+        more = " (in more training seeds than the other)" if self._several else ""
+        return {
+            "failed": f"only this one failed{more}",
+            "shared": "failed, and so did the other",
+            "solved": f"solved: {self.maps[0].moving}'s start (circle) and goal (square)",
+        }
 
-def _results(comparison: Comparison) -> str:
-    arms = _arms(comparison)
-    drawn = [
-        (arm.name, seeds_bar(arm.name, kind, [m.result.success for m in arm.members]), arm.test_rate)
-        for arm, kind in zip(arms, KINDS, strict=True)
-    ]
-    kinds = {member.name: kind for arm, kind in zip(arms, KINDS, strict=True) for member in arm.members}
-    first = arms[0].members[0].result
-    table = comparison_table(comparison)  # its last column, p, stands with the episodes that it is worked out from
-    note = [f"Both ran the same {first.success.n:,} test episodes."]
-    if first.settings.disturbance != "none":
-        note.append(f"Disturbed: {first.settings.disturbance}.")
-    if len(comparison.pairs) > 1:
-        note.append("Dots: each training seed; the bar is their mean.")
-    return sections.section(
-        "Results",
-        sections.bars(drawn),
-        f'<p class="note">{sections.prose(" ".join(note))}</p>',
-        cells_table(Cells(table.columns[:-1], tuple(row[:-1] for row in table.rows)), kinds),
-        "<h3>Episode by episode</h3>",
-        cells_table(_paired_table(comparison)),
-    )
+    @property
+    def map_note(self) -> str:
+        """Axes of the maps."""
+        return f"Both maps show the same starts and goals. {AXES_NOTE}. {self.maps[0].thinning_note}"
+
+    @cached_property
+    def phases(self) -> tuple[PhaseRow, ...]:
+        """Failed episodes of both arms by phase; empty where none failed or no phase is known."""
+        episodes = [[e for member in arm.members for e in member.result.episodes] for arm in self.comparison.arms]
+        if not any(e.phase_at_end and not e.success for arm in episodes for e in arm):
+            return ()
+        return phase_rows(episodes, self._first.task)
+
+    @property
+    def phases_note(self) -> str:
+        """Order of phases and bars."""
+        seeds = ", all training seeds together" if self._several else ""
+        return f"Failed episodes{seeds}, in the order of the task; the upper bar is {self.comparison.left.name}."
+
+    @cached_property
+    def curves(self) -> CurveCharts | None:
+        """Success against cost of the arms whose policies are all of runs; None without such an arm."""
+        arms = zip(self.comparison.arms, KINDS, strict=True)
+        series = tuple(arm_series(arm, kind) for arm, kind in arms if all(member.history for member in arm.members))
+        return CurveCharts(series) if series else None
 
 
 def _paired_fact(comparison: Comparison) -> str:
-    both, left, right, neither = (
+    both, left, right, neither, total = (
         sum(getattr(pair, count) for pair in comparison.pairs)
-        for count in ("both", "only_left", "only_right", "neither")
+        for count in ("both", "only_left", "only_right", "neither", "n")
     )
-    total = sum(pair.n for pair in comparison.pairs)
     over = f" of {len(comparison.pairs)} training seeds" if len(comparison.pairs) > 1 else ""
     a, b = comparison.names
     return (
@@ -131,88 +184,23 @@ def _paired_fact(comparison: Comparison) -> str:
     )
 
 
-def _paired_table(comparison: Comparison) -> Cells:
-    a, b = comparison.names
-    several = len(comparison.pairs) > 1
-    rows = [
-        (
-            f"training seed {left.training_seed}" if several else "test episodes",
-            *(f"{count:,}" for count in (pair.n, pair.both, pair.only_left, pair.only_right, pair.neither)),
-            format_p(pair.p_value).removeprefix("p ").removeprefix("= "),
-        )
-        for left, pair in zip(comparison.left.members, comparison.pairs, strict=True)
-    ]
-    columns = ("", "episodes", "both solved", f"only {a}", f"only {b}", "neither", "McNemar's exact p")
-    return Cells(columns, tuple(rows))
+def _cells(member: Member) -> tuple[str, ...]:
+    seed, chosen = "" if member.training_seed is None else str(member.training_seed), member.chosen
+    if chosen is None:
+        return (member.name, seed, "", "", "", "", "", str(member.result.success))
+    costs = (str(chosen.round), f"{chosen.labels:,}", f"{chosen.episodes:,}", format_seconds(chosen.seconds))
+    return (member.name, seed, *costs, format_percent(chosen.validation.rate), str(member.result.success))
 
 
-def _conditions(comparison: Comparison) -> str:
-    cells = paired_conditions(comparison)
-    if cells is None:
-        return ""
-    note = "p: exact over the paired episodes of a condition, corrected for the number of conditions (Holm)."
-    return sections.section(
-        "By condition", cells_table(cells, names=comparison.names), f'<p class="note">{sections.prose(note)}</p>'
-    )
+def _outcomes(members: Sequence[Member]) -> dict[int, list[bool]]:
+    """Test seed -> success of each training seed."""
+    outcomes: dict[int, list[bool]] = {}
+    for member in members:
+        for episode in member.result.episodes:
+            outcomes.setdefault(episode.seed, []).append(episode.success)
+    return outcomes
 
 
-def _where(comparison: Comparison) -> str:
-    parts = [_maps(comparison), _phases(comparison)]
-    return sections.section("Where they fail", *parts) if any(parts) else ""
-
-
-def _maps(comparison: Comparison) -> str:
-    both = paired_marks(comparison)
-    marks = [*both[0], *both[1]]
-    if not all(both):
-        return ""
-    thing = "object" if has_object(comparison.left.members[0].result) else "hand"
-    maps = "".join(
-        f'<figure class="{kind}"><figcaption><b>{escape(name)}</b></figcaption>'
-        f"{failure_map(one, name, stacked=True)}</figure>"
-        for name, kind, one in zip(comparison.names, KINDS, both, strict=True)
-    )
-    more = " (in more training seeds than the other)" if len(comparison.pairs) > 1 else ""
-    legend = map_legend(
-        marks,
-        {
-            "failed": f"only this one failed{more}",
-            "shared": "failed, and so did the other",
-            "solved": f"solved: {thing}'s start (circle) and goal (square)",
-        },
-        thing,
-    )
-    note = ["Both maps show the same starts and goals. x leads away from the robot, y to its left."]
-    note += filter(None, [thinning_note(both[0])])
-    return f'<div class="pair">{maps}</div>{legend}<p class="note">{sections.prose(" ".join(note))}</p>'
-
-
-def _phases(comparison: Comparison) -> str:
-    episodes = [[e for member in arm.members for e in member.result.episodes] for arm in _arms(comparison)]
-    if not any(e.phase_at_end and not e.success for arm in episodes for e in arm):
-        return ""
-    rows = phase_rows(episodes, comparison.left.members[0].result.task)
-    keys = "".join(
-        f'<li><i class="key {kind}"></i>{escape(name)}</li>' for kind, name in zip(KINDS, comparison.names, strict=True)
-    )
-    seeds = ", all training seeds together" if len(comparison.pairs) > 1 else ""
-    words = f"Failed episodes{seeds}, in the order of the task; the upper bar is {comparison.left.name}."
-    return (
-        f'<h3>The phase that they ended in</h3><ul class="legend">{keys}</ul>'
-        f'{phase_chart(rows, KINDS, comparison.names)}<p class="note">{sections.prose(words)}</p>'
-    )
-
-
-def _curves(comparison: Comparison) -> str:
-    arms = [
-        (arm, kind)
-        for arm, kind in zip(_arms(comparison), KINDS, strict=True)
-        if all(member.history for member in arm.members)
-    ]
-    if not arms:
-        return ""
-    return sections.section(
-        "Success against cost",
-        curve_sections.arm_curves([(arm_curve(arm), kind) for arm, kind in arms]),
-        sections.details("The curves in numbers", sections.pairs(arm_numbers([arm for arm, _ in arms]))),
-    )
+def _rate(outcomes: Mapping[int, Sequence[bool]], seeds: Sequence[int]) -> float:
+    flat = [success for seed in seeds for success in outcomes[seed]]
+    return sum(flat) / len(flat)

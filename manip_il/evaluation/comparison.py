@@ -1,31 +1,28 @@
-"""Two arms, each of one or several training seeds, on the same test episodes: which is better, and how sure that is."""
+"""Two arms of one or several training seeds on the same test episodes: which one is better."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.over_seeds import mean_interval, sign_flip_exact
+from manip_il.evaluation.intervals import mean_interval
 from manip_il.evaluation.results import EvalResult, compare_results
-from manip_il.evaluation.rounds import History, Round
-from manip_il.evaluation.statistics import PairedComparison, format_p
+from manip_il.evaluation.rounds import History, Round, Rule, rule_facts
+from manip_il.evaluation.significance import PairedComparison, format_p, sign_flip_exact
 
 FILE_NAME = "compare.json"
 
 
 @dataclass(frozen=True)
-class Measured:
-    """One policy with its test.
+class Member:
+    """One policy of an arm, with its test.
 
-    training_seed: None where nothing says it. file: the evaluation's. policy: its folder, None where only an
-    evaluation is there. chosen, history: the round that it is and all rounds of its run, where it is a run's.
+    training_seed: None where not known. file: the evaluation's. policy: its folder, None where there is only an
+    evaluation. chosen, history: the round that it is and all rounds of its run, where it is of a run.
     """
 
     name: str
@@ -37,7 +34,7 @@ class Measured:
     history: History = ()
 
     def to_json(self) -> dict[str, Any]:
-        """For `compare.json` and `study.json`."""
+        """Return plain JSON values."""
         return {
             "name": self.name,
             "policy": None if self.policy is None else str(self.policy),
@@ -51,10 +48,10 @@ class Measured:
 
 @dataclass(frozen=True)
 class Arm:
-    """What is compared: one policy, or one a training seed."""
+    """One side of a comparison: one policy, or one a training seed."""
 
     name: str
-    members: tuple[Measured, ...]
+    members: tuple[Member, ...]
 
     def __post_init__(self) -> None:
         seeds = self.training_seeds
@@ -63,7 +60,7 @@ class Arm:
 
     @property
     def training_seeds(self) -> list[int | None]:
-        """In the order of the members."""
+        """Training seeds, in the order of the members."""
         return [member.training_seed for member in self.members]
 
     @property
@@ -93,31 +90,36 @@ class Comparison:
                 f"training seeds differ: {self.left.name} has {_listed(self.left)}, {self.right.name} "
                 f"{_listed(self.right)}; runs are paired by seed, so both sides need the same ones"
             )
-        # Every policy meets the same starts: also those of different training seeds.
+        # Also policies of different training seeds must have run the same episodes.
         first, *others = [*self.left.members, *self.right.members]
         for other in others:
             require_same_episodes(first.name, first.result, other.name, other.result)
         _ = self.pairs
 
     @property
+    def arms(self) -> tuple[Arm, Arm]:
+        """Left and right."""
+        return self.left, self.right
+
+    @property
     def names(self) -> tuple[str, str]:
-        """Of both arms."""
+        """Names of both arms."""
         return self.left.name, self.right.name
 
     @cached_property
     def pairs(self) -> tuple[PairedComparison, ...]:
-        """One a training seed."""
+        """The paired comparison of each training seed."""
         members = zip(self.left.members, self.right.members, strict=True)
         return tuple(compare_results(a.result, b.result, self.names) for a, b in members)
 
     @property
     def difference(self) -> float:
-        """Mean over training seeds, in [-1, 1]."""
+        """Mean difference over training seeds, in [-1, 1]."""
         return fmean(pair.difference for pair in self.pairs)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Of `difference`: Newcombe's for one training seed, Student's over training seeds for more."""
+        """(low, high) of `difference`: Newcombe's for one training seed, Student's over training seeds for more."""
         if len(self.pairs) == 1:
             return self.pairs[0].interval
         return mean_interval([pair.difference for pair in self.pairs], self.confidence)
@@ -126,7 +128,7 @@ class Comparison:
     def p_value(self) -> float:
         """Two-sided and exact over test episodes, all training seeds together; with one it is McNemar's.
 
-        It is about these trained policies: what other training seeds would give, only `interval` speaks of.
+        It holds for these trained policies; `interval` is about other training seeds, too.
         """
         margins: dict[int, int] = {}
         for left, right in zip(self.left.members, self.right.members, strict=True):
@@ -137,19 +139,18 @@ class Comparison:
 
     @property
     def confidence(self) -> float:
-        """Of all intervals, and one minus the level of the tests."""
+        """Confidence of all intervals, and one minus the level of the tests."""
         return self.pairs[0].confidence
 
     @property
-    def shown(self) -> bool:
-        """Whether one arm is shown to be better: by the exact test, and with several seeds by the t interval too."""
-        tested = self.p_value < 1 - self.confidence
+    def significant(self) -> bool:
+        """Whether one arm is better by the exact test, and with several seeds by the t interval, too."""
         low, high = self.interval
-        return tested and (len(self.pairs) == 1 or low > 0 or high < 0)
+        return self.p_value < 1 - self.confidence and (len(self.pairs) == 1 or low > 0 or high < 0)
 
     @property
     def verdict(self) -> str:
-        """One sentence in words, with the numbers that carry it."""
+        """One sentence with the difference, its interval and p."""
         n, left, right = len(self.pairs), *self.names
         swapped = self.difference < 0
         better, worse = (left, right) if swapped else (right, left)
@@ -158,7 +159,7 @@ class Comparison:
             tested += f" on each of {n} training seeds"
         over = f" on average over {n} training seeds (ahead in {self.ahead(better)} of {n})" if n > 1 else ""
         points = self._points(-1 if swapped else 1)
-        if self.shown:
+        if self.significant:
             return f"{better} is better than {worse} by {points}{over}, {tested}."
         if self.p_value < 1 - self.confidence:
             return (
@@ -170,7 +171,7 @@ class Comparison:
         return f"No difference shown between {right} and {left}: {self._points(1, '+')}{over}, {tested}."
 
     def ahead(self, name: str) -> int:
-        """In how many training seeds the arm of this name has the higher success."""
+        """Return the number of training seeds in which the arm of this name has the higher success."""
         sign = 1 if name == self.right.name else -1
         return sum(sign * pair.difference > 0 for pair in self.pairs)
 
@@ -180,11 +181,11 @@ class Comparison:
 
     @property
     def numbers(self) -> str:
-        """`+4.2 points [+1.1, +7.3], p = 0.002`: right minus left, for a table."""
+        """`+4.2 points [+1.1, +7.3], p = 0.002`: right minus left."""
         return f"{self._points(1, '+')}, {format_p(self.p_value)}"
 
     def to_json(self) -> dict[str, Any]:
-        """For `compare.json` and `study.json`; differences are right minus left."""
+        """Return plain JSON values; differences are right minus left."""
         several = len(self.pairs) > 1
         return {
             "left": self.left.name,
@@ -224,10 +225,21 @@ def require_same_episodes(left_name: str, left: EvalResult, right_name: str, rig
         )
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write `content` whole or not at all, creating the folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+def comparison_facts(comparison: Comparison, rule: Rule, limit: float | None) -> list[str]:
+    """Return sentences on the rule by which rounds were chosen, and on the numbers over training seeds."""
+    members = (*comparison.left.members, *comparison.right.members)
+    rounds = [member.chosen for member in members if member.chosen is not None]
+    return [*(rule_facts(rule, limit, rounds) if rounds else []), *seeds_facts(len(comparison.pairs))]
+
+
+def seeds_facts(count: int) -> list[str]:
+    """Return a sentence on the interval and the test over `count` training seeds; none for a single one."""
+    if count == 1:
+        return []
+    return [
+        f"The interval is Student's over {count} training seeds; with so few it is wide. "
+        "p is exact over test episodes, which flip together for all training seeds, and holds for these policies alone."
+    ]
 
 
 def _pair_json(pair: PairedComparison) -> dict[str, Any]:

@@ -1,154 +1,179 @@
-"""`report.html` of one evaluation: how good, where it fails, how that looks, and what made it."""
+"""`report.html` of one evaluation: success, where it fails, films, and what made it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
-from manip_il.errors import ManipError
-from manip_il.evaluation import curve_sections, sections
-from manip_il.evaluation.condition_chart import condition_rows, condition_words, success_bars
-from manip_il.evaluation.drawn_table import drawn_table
-from manip_il.evaluation.episode_facts import by_condition, has_object
-from manip_il.evaluation.eval_words import eval_facts, eval_verdict
-from manip_il.evaluation.factors import Factor, find_factors
-from manip_il.evaluation.failure_map import failure_map, map_legend, map_marks, thinning_note
-from manip_il.evaluation.phase_chart import phase_chart, phase_rows
-from manip_il.evaluation.report import render_page
-from manip_il.evaluation.report_data import Film, Kind, LearningCurve, Paths, Strip
+from manip_il.evaluation.factors import Factor, factor_table, find_factors
+from manip_il.evaluation.failures import PhaseRow, evaluation_facts, evaluation_verdict, phase_rows
+from manip_il.evaluation.maps import FailureMap, Outcome, failure_map
+from manip_il.evaluation.report import Bar, Report
+from manip_il.evaluation.report_data import Film, LearningCurve, Paths
 from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.tables import NO_CONDITION, Table, evaluation_table
+
+AXES_NOTE = "x leads away from the robot, y to its left"
 
 
-@dataclass(frozen=True)
-class EvalReport:
-    """One evaluation's whole story. Empty parts are left out of the page.
+def eval_report(
+    result: EvalResult,
+    command: str,
+    config: Mapping[str, Any] | None = None,
+    films: tuple[Film, ...] = (),
+    paths: tuple[Paths, ...] = (),
+    pictures_note: str = "",
+    curve: LearningCurve | None = None,
+) -> EvalReport:
+    """Return the report of an evaluation. curve: of the run that the policy is of."""
+    factors = find_factors(result)
+    return EvalReport(
+        title=f"Evaluation of {result.policy}: {result.robot} {result.task}",
+        verdict=evaluation_verdict(result),
+        facts=evaluation_facts(result, factors),
+        command=command,
+        config=config or {},
+        fingerprint=result.fingerprint,
+        films=films,
+        paths=paths,
+        pictures_note=pictures_note,
+        result=result,
+        factors=factors,
+        curve=curve,
+    )
 
-    command: what made it. films, strips, paths: of single episodes, with their outcome where it is known.
-    pictures_note: one line about them, such as why there are none. curve: of the run that the policy is of. timings:
-    what -> [s]. config: nested. kind: decides the colour. episodes: what the episodes are called in the first sentence.
-    more_facts: further sentences under it.
-    """
 
+@dataclass(frozen=True, kw_only=True)
+class EvalReport(Report):
+    """The report of one evaluation, made by `eval_report`."""
+
+    template: ClassVar[str] = "eval.html.j2"
     result: EvalResult
-    command: str
-    config: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    films: tuple[Film, ...] = ()
-    strips: tuple[Strip, ...] = ()
-    paths: tuple[Paths, ...] = ()
-    pictures_note: str = ""
-    curve: LearningCurve | None = None
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
-    kind: Kind = "dagger"
-    episodes: str = "unseen episodes"
-    more_facts: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for what in ("command", "episodes"):
-            if not getattr(self, what).strip():
-                raise ManipError(f"report on {self.result.policy!r}: {what} is empty")
+    factors: tuple[Factor, ...]
 
     @property
-    def title(self) -> str:
-        """What it is about."""
-        return f"Evaluation of {self.result.policy}: {self.result.robot} {self.result.task}"
-
-    @property
-    def verdict(self) -> str:
-        """The first sentence."""
-        return eval_verdict(self.result, self.episodes)
+    def table(self) -> Table:
+        """All episodes, then each condition, in numbers."""
+        table = evaluation_table(self.result)
+        if len(table.rows) == 1:
+            return replace(table, kinds=("dagger",))
+        (_, *total), *rows = table.rows
+        rows = (("all conditions", *total), *((row[0].strip(), *row[1:]) for row in rows))
+        return Table(("condition", *table.columns[1:]), rows, ("baseline", *["dagger"] * (len(rows) - 1)))
 
     @cached_property
-    def factors(self) -> tuple[Factor, ...]:
-        """What failures may go with."""
-        return find_factors(self.result)
+    def bars(self) -> list[Bar]:
+        """The same success."""
+        parts = self.result.by_condition
+        if len(parts) == 1:
+            return [Bar.of(self.result.policy, "dagger", self.result.success)]
+        bars = [Bar.of(name or NO_CONDITION, "dagger", part.success) for name, part in parts.items()]
+        return [Bar.of("all conditions", "baseline", self.result.success), *bars]
 
     @property
-    def facts(self) -> Sequence[str]:
-        """Further sentences under the first."""
-        return [*eval_facts(self.result, self.factors), *self.more_facts]
+    def note(self) -> str:
+        """Number of episodes, meaning of success, method of the intervals."""
+        settings, parts = self.result.settings, self.result.by_condition
+        sizes = sorted({part.success.n for part in parts.values()})
+        each = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
+        apart = f", {each} in each condition" if len(parts) > 1 else ""
+        ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
+        intervals = "Intervals are Wilson's score intervals."
+        if self.result.until_width is not None:
+            intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
+        return (
+            f"{self.result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. "
+            f"Success means being within {100 * settings.tolerance:g} cm of the goal for {settings.success_steps} "
+            f"control steps in a row{ends}. {intervals}"
+        )
 
     @property
-    def fingerprint(self) -> Mapping[str, Any]:
-        """Of the evaluation."""
-        return self.result.fingerprint
+    def ranges(self) -> dict[str, str]:
+        """Condition -> the numbers it draws and their ranges; empty where none draws any."""
+        conditions = self.result.settings.conditions
+        if not any(condition.ranges for condition in conditions):
+            return {}
+        return {
+            condition.name: ", ".join(f"{name} {_range(*ends)}" for name, ends in condition.ranges.items()) or "nothing"
+            for condition in conditions
+        }
+
+    @property
+    def failed(self) -> int:
+        """Number of failed episodes."""
+        return self.result.success.n - self.result.success.successes
+
+    @cached_property
+    def map(self) -> FailureMap | None:
+        """Starts and goals; None where no episode has them."""
+        return failure_map(self.result)
+
+    @property
+    def map_names(self) -> dict[Outcome, str]:
+        """Outcomes in words."""
+        assert self.map is not None
+        solved = f"solved: {self.map.moving}'s start (circle) and goal (square)"
+        return {"solved": solved, "failed": "failed: from start to goal"}
+
+    @property
+    def map_note(self) -> str:
+        """Number of episodes in the map, and its axes."""
+        assert self.map is not None
+        solved = len(self.map.marks) - self.map.failed
+        return (
+            f"{self.failed:,} failed and {solved:,} solved episodes by where the {self.map.moving} started and was to "
+            f"go. {AXES_NOTE}; z is the height above the table. {self.map.thinning_note}"
+        )
+
+    @cached_property
+    def phases(self) -> tuple[PhaseRow, ...]:
+        """Failed episodes by phase; empty where none failed or no phase is known."""
+        return phase_rows([self.result.episodes], self.result.task) if any(self.result.failures) else ()
+
+    @property
+    def phases_note(self) -> str:
+        """Meaning of the phases."""
+        count = "The one failed episode" if self.failed == 1 else f"The {self.failed:,} failed episodes"
+        return f"{count} by the phase of the task that the expert assigned to the last state, in task order."
+
+    @cached_property
+    def significant(self) -> Table:
+        """Factors that failures are associated with."""
+        return factor_table([factor for factor in self.factors if factor.significant])
+
+    @cached_property
+    def insignificant(self) -> Table:
+        """The other factors."""
+        return factor_table([factor for factor in self.factors if not factor.significant])
+
+    @property
+    def insignificant_heading(self) -> str:
+        """Heading of the folded table."""
+        if not self.significant.rows:
+            return "All that varied"
+        return f"{len(self.insignificant.rows)} more that varied, without a difference beyond chance"
+
+    @property
+    def no_factor(self) -> str:
+        """Sentence in place of a table without rows."""
+        if len(self.factors) == 1:
+            return f"Failures are not associated with {self.factors[0].name} beyond chance."
+        return f"Failures are associated with none of the {len(self.factors)} numbers that varied, beyond chance."
+
+    @property
+    def factors_note(self) -> str:
+        """Meaning of the table's numbers."""
+        confidence = f"{100 * self.result.confidence:g} %"
+        count = f"{len(self.factors)} that varied" if len(self.factors) > 1 else "one that varied"
+        return (
+            f"Success with its {confidence} interval (Wilson) in thirds of the episodes by start, goal and what was "
+            "drawn; under it, the values of that third; equal values stay together. p: Fisher's exact test of all "
+            f"three, corrected (Holm) for the {count}. An association with a number does not show that it causes the "
+            "failures."
+        )
 
 
-def eval_page(report: EvalReport) -> str:
-    """Return the page as one string of HTML."""
-    curve = report.curve
-    return render_page(
-        report.title,
-        [
-            sections.header(report),
-            _results(report),
-            curve_sections.curve(curve) if curve and curve.points else "",
-            _where(report),
-            drawn_table(report.factors),
-            sections.pictures(report),
-            sections.making(report),
-        ],
-    )
-
-
-def _results(report: EvalReport) -> str:
-    result = report.result
-    rows = condition_rows(result, report.kind)
-    conditions = condition_words(result)
-    return sections.section(
-        "Results",
-        sections.policy_table(rows, "Condition" if len(rows) > 1 else "Policy"),
-        success_bars(rows),
-        f'<p class="note">{sections.prose(_how_measured(result))}</p>',
-        sections.details("What the conditions draw", sections.pairs(conditions)) if conditions else "",
-    )
-
-
-def _how_measured(result: EvalResult) -> str:
-    settings = result.settings
-    sizes = sorted({len(episodes) for episodes in by_condition(result).values()})
-    each = f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"
-    apart = f", {each} in each condition" if len(by_condition(result)) > 1 else ""
-    ends = "" if settings.hold is None else f"; an episode ends {settings.hold} steps after it"
-    intervals = "Intervals are Wilson's score intervals."
-    if result.until_width is not None:
-        intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
-    return (
-        f"{result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. "
-        "Success means being within "
-        f"{100 * settings.tolerance:g} cm of the goal for {settings.success_steps} control steps in a row{ends}. "
-        + intervals
-    )
-
-
-def _where(report: EvalReport) -> str:
-    result = report.result
-    failed = result.success.n - result.success.successes
-    if not failed:
-        nothing = f"No failure in {result.success.n:,} episodes."
-        return sections.section("Where it fails", f'<p class="lead">{nothing}</p>', _map(result, failed))
-    parts = [_map(result, failed)]
-    if any(result.failures):
-        rows = phase_rows([result.episodes], result.task)
-        parts += ["<h3>The phase that they ended in</h3>", phase_chart(rows, ["cloning"], [result.policy])]
-        count = "The one failed episode" if failed == 1 else f"The {failed:,} failed episodes"
-        words = f"{count} by the phase of the task that the expert assigned to the last state, in task order."
-        parts.append(f'<p class="note">{sections.prose(words)}</p>')
-    return sections.section("Where it fails", *parts) if any(parts) else ""
-
-
-def _map(result: EvalResult, failed: int) -> str:
-    marks = map_marks(result)
-    if not marks:
-        return ""
-    thing = "object" if has_object(result) else "hand"
-    solved = len(marks) - sum(mark.outcome == "failed" for mark in marks)
-    note = [f"{failed:,} failed and {solved:,} solved episodes by where the {thing} started and was to go."]
-    note += ["x leads away from the robot, y to its left; z is the height above the table.", thinning_note(marks)]
-    words = {"solved": f"solved: {thing}'s start (circle) and goal (square)", "failed": "failed: from start to goal"}
-    return (
-        failure_map(marks, result.policy)
-        + map_legend(marks, words, thing)  # pyright: ignore[reportArgumentType]
-        + f'<p class="note">{sections.prose(" ".join(filter(None, note)))}</p>'
-    )
+def _range(low: float, high: float) -> str:
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Literal
 
 import av
 import numpy as np
@@ -27,12 +28,12 @@ from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.look import FILM, CameraConfig
 
-AFTER_SUCCESS = 1.0  # what a film shows once the task is solved [s]
+AFTER_SUCCESS = 1.0  # filmed after the task is solved [s]
 Frames = Sequence[NDArray[np.uint8]]
 
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
-    """Return the episode of one seed, with its states: the same that an evaluation of `job` saw."""
+    """Return the episode of one seed, the same as in an evaluation of `job`, with its states."""
     return next(iter(run_job(replace(job, label="last"), [seed])))
 
 
@@ -50,13 +51,13 @@ def film(
 
     Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
     """
-    states = episode.columns[schema.SIM_STATE][: shown_steps(episode, env_config.control_hz) : every]
+    states = episode.columns[schema.SIM_STATE][: filmed_steps(episode, env_config.control_hz) : every]
     seen = render_states(env_config, CameraConfig((camera,), *size, FILM), states, drawn)
     return list(seen[schema.IMAGES + camera])
 
 
-def shown_steps(episode: Episode, fps: int) -> int:
-    """Return how many control steps a picture of the episode spans: to `AFTER_SUCCESS` once solved, else all."""
+def filmed_steps(episode: Episode, fps: int) -> int:
+    """Return how many control steps are filmed: until `AFTER_SUCCESS` after success, else all."""
     solved = episode.columns[schema.SUCCESS].ravel()
     if not solved.any():
         return len(episode)
@@ -64,14 +65,14 @@ def shown_steps(episode: Episode, fps: int) -> int:
 
 
 def make_film(policy: str, frames: Frames, fps: int, caption: str = "", success: bool | None = None) -> Film:
-    """Return pictures (height, width, 3) as a film; its poster is the last one, with the goal reached or missed."""
-    return Film(policy, encode_mp4(frames, fps), caption, success, encode_jpeg(frames[-1]))
+    """Return pictures (height, width, 3) as a film; its poster is the last one."""
+    return Film(policy, encode_mp4(frames, fps), caption, success, encode_picture(frames[-1], "jpeg"))
 
 
 def encode_mp4(frames: Frames, fps: int) -> bytes:
     """Return an MP4 that browsers play from its first bytes on: H.264, 4:2:0, index in front.
 
-    Raises `ManipError` for no frames, or for a height or width that is odd, which 4:2:0 has not.
+    frames: uint8 (height, width, 3). Raises `ManipError` for no frames, or an odd height or width, which 4:2:0 forbids.
     """
     if len(frames) == 0:
         raise ManipError("no frames to make a film of")
@@ -90,28 +91,21 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
 
 
 def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
-    """`count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
+    """Return `count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    return tuple((index / fps, encode_png(frames[index])) for index in chosen.tolist())
+    return tuple((index / fps, encode_picture(frames[index], "png")) for index in chosen.tolist())
 
 
-def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture as PNG."""
+def encode_picture(picture: NDArray[np.uint8], kind: Literal["png", "jpeg"]) -> bytes:
+    """Return one picture (height, width, 3) as a file; JPEG has a fifth of the size of PNG."""
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="png", optimize=True)
-    return buffer.getvalue()
-
-
-def encode_jpeg(picture: NDArray[np.uint8]) -> bytes:
-    """Return one picture as JPEG, a fifth of the size of PNG."""
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="jpeg", quality=85, optimize=True)
+    Image.fromarray(picture).save(buffer, format=kind, optimize=True, **({"quality": 85} if kind == "jpeg" else {}))
     return buffer.getvalue()
 
 
 def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "") -> Paths:
-    """Return where hand, object (the hand again where the task has none) and goal were; needs no OpenGL."""
-    rows = episode.columns[schema.ENVIRONMENT_STATE][: shown_steps(episode, spec.fps)].astype(np.float64)
+    """Return positions of hand, object (the hand again where the task has none) and goal; needs no OpenGL."""
+    rows = episode.columns[schema.ENVIRONMENT_STATE][: filmed_steps(episode, spec.fps)].astype(np.float64)
     names = list(spec.environment_state_names)
 
     def positions(thing: str) -> NDArray[np.float64]:

@@ -1,16 +1,16 @@
-"""What a report shows: frozen types that know nothing of HTML or of a terminal."""
+"""Results, curves and pictures that a report shows, independent of HTML and of the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from manip_il.errors import ManipError
+from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.statistics import Proportion
 from manip_il.mdp import F64, require_finite
 
 Kind = Literal["expert", "dagger", "cloning", "baseline"]
@@ -22,7 +22,7 @@ JPEG_MAGIC = b"\xff\xd8\xff"
 
 @dataclass(frozen=True)
 class PolicyRow:
-    """One policy's line in the table. `labels`: expert labels it learnt from, None where it learnt from none.
+    """One policy's line in the table. labels: expert labels that it learnt from, None for the expert itself.
 
     success: at some time; success_at_end: at the last frame; steps_to_success: mean [control steps];
     disturbed: success under the disturbance, where measured. kind: decides the colour.
@@ -61,7 +61,7 @@ class PolicyRow:
 class CurvePoint:
     """Validation success of one policy that learnt from `labels` expert labels; `name` such as `round 3`.
 
-    episodes, seconds: what it had cost beside labels, where that is known; seconds of collecting and fitting.
+    episodes, seconds: its other costs, where known; seconds of collecting and fitting.
     """
 
     labels: int
@@ -77,51 +77,22 @@ class CurvePoint:
                 raise ManipError(f"a learning curve's point has {amount} {cost}; expected 0 or more")
 
     def amount(self, cost: Cost) -> float | None:
-        """Labels, episodes or seconds; None where not known."""
+        """Return labels, episodes or seconds; None where not known."""
         return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[cost]
 
 
 @dataclass(frozen=True)
 class LearningCurve:
-    """Validation success over what it cost: a run's rounds in order, cloning at labels of its own.
-
-    name: what made the rounds. target: a success that is drawn as a level, in [0, 1]. log_x: None chooses a
-    logarithmic axis where labels span a factor of 20 or more.
-    """
+    """Validation success of a run's rounds in order, and of cloning at labels of its own. name: of the algorithm."""
 
     dagger: tuple[CurvePoint, ...]
     cloning: tuple[CurvePoint, ...] = ()
-    expert: Proportion | None = None
-    log_x: bool | None = None
-    target: float | None = None
     name: str = "DAgger"
-
-    @property
-    def points(self) -> tuple[CurvePoint, ...]:
-        """All points of both."""
-        return (*self.dagger, *self.cloning)
-
-
-@dataclass(frozen=True)
-class ArmCurve:
-    """One arm of a study: a run's points a training seed, each in the order of rounds."""
-
-    name: str
-    runs: tuple[tuple[CurvePoint, ...], ...]
-
-    def __post_init__(self) -> None:
-        if not self.runs or not all(self.runs):
-            raise ManipError(f"learning curve of {self.name!r} has a training seed without a round, or none at all")
-
-    @property
-    def points(self) -> tuple[CurvePoint, ...]:
-        """All points of all training seeds."""
-        return tuple(point for run in self.runs for point in run)
 
 
 @dataclass(frozen=True)
 class Strip:
-    """One episode of one policy as pictures: (time [s], PNG bytes) in order. success: None where nothing says."""
+    """One episode of one policy as pictures: (time [s], PNG bytes) in order. success: None where not known."""
 
     policy: str
     frames: tuple[tuple[float, bytes], ...]
@@ -140,7 +111,7 @@ class Strip:
 class Film:
     """One episode, or several in a row, of one policy as an MP4 (H.264).
 
-    success: None where nothing says. poster: a JPEG that stands in its place until it plays.
+    success: None where not known. poster: a JPEG shown until it plays.
     """
 
     policy: str
@@ -158,10 +129,10 @@ class Film:
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Where hand and object went in one episode: the picture that needs no renderer.
+    """Positions of hand and object in one episode: a picture that needs no renderer.
 
     hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m]; dt: between rows [s]. success: None where
-    nothing says.
+    not known.
     """
 
     policy: str
@@ -181,39 +152,6 @@ class Paths:
             require_finite(f"paths of {self.policy}, {name}", np.asarray(getattr(self, name)))
 
 
-@dataclass(frozen=True)
-class Report:
-    """One run's whole story. Empty parts are left out of the page.
-
-    verdict: the first sentence, in plain words with its numbers. command: what made this run.
-    facts: further sentences under the verdict, such as paired comparisons. rows: the table.
-    disturbance: what the disturbed column means, in words. pictures_note: one line that says why
-    there are paths and no pictures. timings: what -> [s]. config, fingerprint: nested mappings.
-    """
-
-    title: str
-    verdict: str
-    command: str
-    rows: tuple[PolicyRow, ...]
-    facts: tuple[str, ...] = ()
-    curve: LearningCurve | None = None
-    films: tuple[Film, ...] = ()
-    strips: tuple[Strip, ...] = ()
-    paths: tuple[Paths, ...] = ()
-    pictures_note: str = ""
-    disturbance: str = ""
-    config: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    timings: Mapping[str, float] = field(default_factory=dict[str, float])
-
-    def __post_init__(self) -> None:
-        if not self.rows:
-            raise ManipError(f"report {self.title!r} has no policy to show")
-        for what in ("title", "verdict", "command"):
-            if not getattr(self, what).strip():
-                raise ManipError(f"report {self.title!r}: {what} is empty")
-
-
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Return a nested mapping as `policy.hidden -> 256`: the names that the command line takes."""
     flat: dict[str, str] = {}
@@ -227,7 +165,7 @@ def flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 def format_seconds(seconds: float) -> str:
-    """`4.2 s`, `3 min 20 s`, `1 h 05 min`."""
+    """Return a duration as `4.2 s`, `3 min 20 s` or `1 h 05 min`."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -237,13 +175,8 @@ def format_seconds(seconds: float) -> str:
 
 
 def format_amount(cost: Cost, amount: float) -> str:
-    """`8,012 labels`, `150 episodes`, `3 min 20 s`."""
+    """Return `8,012 labels`, `150 episodes` or `3 min 20 s`."""
     return format_seconds(amount) if cost == "seconds" else f"{amount:,.0f} {cost}"
-
-
-def format_percent(rate: float) -> str:
-    """`98.7 %`."""
-    return f"{100 * rate:.1f} %"
 
 
 def _plain(value: object) -> str:

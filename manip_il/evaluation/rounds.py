@@ -1,4 +1,4 @@
-"""The rounds of a DAgger run as `metrics.jsonl` tells them, and which of them a comparison takes."""
+"""The rounds of a DAgger run, read from `metrics.jsonl`, and the choice of one for a comparison."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from typing import Any, Literal
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.report_data import COSTS, Cost, CurvePoint, format_amount
-from manip_il.evaluation.statistics import Proportion
 
 END = "end"
-_MOST = 10**12  # labels, episodes: beyond it a number is a slip
+ENOUGH = 0.95  # share of an amount that a run must have reached to be compared at it: rounds are not that fine
+UNEQUAL = 1.05  # factor from which on the costs of chosen rounds are said to differ
+_MOST = 10**12  # labels, episodes
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round, and what the run had cost when it ended.
+    """One round, and the costs of the run up to its end.
 
-    labels, queries, episodes: so far. seconds: so far, of collecting and fitting; validating is counted apart, as it
-    measures the run and is no part of it.
+    seconds: of collecting and fitting; validating is counted apart, as it is no part of the method.
     """
 
     round: int
@@ -29,20 +30,15 @@ class Round:
     queries: int
     episodes: int
     seconds: float
-    validating: float  # so far [s]
+    validating: float  # [s]
     validation: Proportion
 
     def amount(self, axis: Cost) -> float:
-        """What the run had used of labels, episodes or seconds."""
+        """Return the labels, episodes or seconds that the run had used."""
         return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[axis]
 
-    @property
-    def words(self) -> str:
-        """`round 3: 8,012 labels, 150 episodes, 2 min 05 s`."""
-        return f"round {self.round}: {', '.join(format_amount(axis, self.amount(axis)) for axis in COSTS)}"
-
     def to_json(self) -> dict[str, Any]:
-        """For `compare.json` and `study.json`."""
+        """Return plain JSON values."""
         return {
             "round": self.round,
             "labels": self.labels,
@@ -59,10 +55,7 @@ History = tuple[Round, ...]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """Return a run's rounds in order from the lines of its `metrics.jsonl`.
-
-    `ManipError` where they are none of a run.
-    """
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are not a run's."""
     if not records:
         raise ManipError(f"{name} has no finished round yet; continue with manip-il dagger --resume=true")
     rounds: list[Round] = []
@@ -99,24 +92,21 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
 
 
 def _number(record: Mapping[str, Any]) -> int:
-    """Of the round that a line is about; -1 where it says none."""
+    """Number of a line's round; -1 where it has none."""
     number = record.get("round")
     return number if isinstance(number, int) else -1
 
 
 def curve_points(rounds: History) -> tuple[CurvePoint, ...]:
-    """Return a run's learning curve, with all that it had cost."""
+    """Return a run's learning curve, with all costs."""
     return tuple(
         CurvePoint(one.labels, one.validation, f"round {one.round}", one.episodes, one.seconds) for one in rounds
     )
 
 
-ENOUGH = 0.95  # of an amount that runs are compared at: rounds do not end on the dot
-
-
 @dataclass(frozen=True)
 class Rule:
-    """Which round of a run is compared; the same for every run, and fixed before any test episode is seen.
+    """The rule that chooses the round of each run, fixed before any test episode.
 
     checkpoint: the last round, or the one with the highest validation success (of equals the later). axis: rounds
     count up to an equal amount of this; `end`: all do. amount: that amount; None: the largest that every run reached.
@@ -128,7 +118,7 @@ class Rule:
 
     @classmethod
     def parse(cls, checkpoint: Literal["best", "last"], at: str) -> Rule:
-        """From `--at=`: `end`, `labels`, `episodes`, `seconds`, or such a name with an amount, `labels:5000`."""
+        """Parse `--at=`: `end`, `labels`, `episodes`, `seconds`, or such a name with an amount, `labels:5000`."""
         axis, colon, text = at.partition(":")
         known = (END, *COSTS)
         if axis not in known:
@@ -144,8 +134,8 @@ class Rule:
         return cls(checkpoint, axis, amount)
 
     @property
-    def words(self) -> str:
-        """For the report's facts."""
+    def description(self) -> str:
+        """The rule in words."""
         which = "last round" if self.checkpoint == "last" else "round that was best on validation"
         return f"Of every run the {which}, chosen before the test"
 
@@ -154,11 +144,9 @@ class Rule:
 
 
 def budget(rule: Rule, histories: Sequence[History]) -> float | None:
-    """Return how much of `rule.axis` every run may have used: given, or the largest that all reached.
+    """Return how much of `rule.axis` every run may use: as given, or the most that all reached; None for no limit.
 
-    None for no limit.
-
-    Raises `UsageError` where a run ended at less than `ENOUGH` of what is given.
+    Raises `UsageError` where a run ended before the share `ENOUGH` of what is given.
     """
     if rule.axis == END:
         return None
@@ -171,18 +159,36 @@ def budget(rule: Rule, histories: Sequence[History]) -> float | None:
     return reached if rule.amount is None else rule.amount
 
 
-def choose(rule: Rule, rounds: History, limit: float | None, name: str) -> Round:
-    """Return the round that `rule` takes of one run; `UsageError` where none ended within `limit`."""
-    within = [one for one in rounds if rule.axis == END or limit is None or one.amount(rule.axis) <= limit]
-    if not within:
-        assert rule.axis != END
+def select_round(rule: Rule, rounds: History, limit: float | None, name: str) -> Round:
+    """Return the round of one run that `rule` chooses; `UsageError` where none ended within `limit`."""
+    axis = rule.axis
+    if axis == END or limit is None:
+        within = list(rounds)
+    elif not (within := [one for one in rounds if one.amount(axis) <= limit]):
         raise UsageError(
-            f"--at={rule}: {name} has no round within {format_amount(rule.axis, limit or 0)}; "
-            f"its first took {format_amount(rule.axis, rounds[0].amount(rule.axis))}"
+            f"--at={rule}: {name} has no round within {format_amount(axis, limit)}; "
+            f"its first took {format_amount(axis, rounds[0].amount(axis))}"
         )
     if rule.checkpoint == "last":
         return within[-1]
     return max(within, key=lambda one: (one.validation.rate, one.round))
+
+
+def rule_facts(rule: Rule, limit: float | None, chosen: Sequence[Round]) -> list[str]:
+    """Return sentences on the rule, and on costs of the chosen rounds that are not the same."""
+    if rule.axis == END or limit is None:
+        return [f"{rule.description}."]
+    source = "given" if rule.amount is not None else "the most that every run reached"
+    facts = [f"{rule.description}, within {format_amount(rule.axis, limit)} ({source})."]
+    amounts = [one.amount(rule.axis) for one in chosen]
+    low, high = min(amounts), max(amounts)
+    if high > UNEQUAL * low:
+        spent = f"{format_amount(rule.axis, low).removesuffix(f' {rule.axis}')} to {format_amount(rule.axis, high)}"
+        facts.append(
+            f"The rounds taken had used {spent}: the best one may come early, and a round that would have gone over "
+            "the limit does not count."
+        )
+    return facts
 
 
 def first_reaching(rounds: History, target: float) -> Round | None:
@@ -191,10 +197,7 @@ def first_reaching(rounds: History, target: float) -> Round | None:
 
 
 def largest_dip(rounds: History) -> float:
-    """Return how far validation success fell, in any round, below the best before it.
-
-    0 where it never did, at most 1.
-    """
+    """Return how far validation success fell at most below the best before it, 0 to 1."""
     best, dip = 0.0, 0.0
     for one in rounds:
         dip, best = max(dip, best - one.validation.rate), max(best, one.validation.rate)

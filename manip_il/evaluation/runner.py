@@ -1,4 +1,4 @@
-"""Seeds to success: run one policy on stored seeds and say how often it got there."""
+"""Evaluate one policy on given seeds."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, policy_sha256, positions
 from manip_il.engine.jobs import RolloutJob, observed_cameras
 from manip_il.errors import UsageError
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.statistics import Proportion
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
+from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.results import EvalResult
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import phases
 
 _LOG = logging.getLogger(__name__)
-HOLD = 10  # control steps after success at which an evaluation's episodes end: whether it lasts, and no more
-LOOK_EVERY = 100  # episodes after which an evaluation asks whether its interval is narrow enough
-OnResult = Callable[[EpisodeResult], None]
+HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
+CHECK_EVERY = 100  # episodes after which the width of the interval is checked
 
 
 def evaluate(
@@ -30,7 +30,7 @@ def evaluate(
     job: RolloutJob,
     seeds: Sequence[int],
     name: str,
-    on_result: OnResult | None = None,
+    on_result: Callable[[EpisodeResult], None] | None = None,
     *,
     suite: str = NOMINAL.name,
     done: Mapping[int, EpisodeResult] | None = None,
@@ -38,25 +38,27 @@ def evaluate(
 ) -> EvalResult:
     """Run `job` on every seed, to the horizon unless it has a `hold`; episodes are in the order of `seeds`.
 
-    suite: what the job's conditions are called. done: results by seed that are there already. until_width: stop once
-    the interval, of high less low, is as narrow; the question is put after every `LOOK_EVERY` seeds in their order, so
-    that the answer depends on no worker. A seed that kills its worker again and again is left out, and a warning names
-    it. on_result: sees every result as its episode ends. Raises `UsageError` for a width that is not within 0 and 1.
+    suite: name of the job's conditions. done: results by seed of an earlier run. until_width: stop once the interval,
+    high less low, is as narrow; checked after every `CHECK_EVERY` seeds in their order, whatever the workers.
+    on_result: called with every result as its episode ends. A seed that repeatedly kills its worker is left out, with a
+    warning. Raises `UsageError` for a width that is not within 0 and 1.
     """
     if until_width is not None and not 0 < until_width < 1:
         raise UsageError(f"until_width is {until_width}; expected between 0 and 1, such as 0.02 for 2 points")
     results: dict[int, EpisodeResult] = {}
-    before = done or {}
+    known = done or {}
     for part in _parts(seeds, until_width):
-        results |= {seed: before[seed] for seed in part if seed in before}
-        for episode in engine.run(job, [seed for seed in part if seed not in before]):
+        results |= {seed: known[seed] for seed in part if seed in known}
+        for episode in engine.run(job, [seed for seed in part if seed not in known]):
             results[episode.seed] = episode_result(job, episode)
             if on_result is not None:
                 on_result(results[episode.seed])
-        if until_width is not None and _width(list(results.values())) <= until_width:
-            break
-    asked = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
-    if lost := [seed for seed in asked if seed not in results]:
+        if until_width is not None:
+            low, high = Proportion.of([one.success for one in results.values()], sequential=True).interval
+            if high - low <= until_width:
+                break
+    run = [seed for seed in seeds if seed <= max(results, default=-1)] if until_width else seeds
+    if lost := [seed for seed in run if seed not in results]:
         _LOG.warning("left out of the evaluation, as each repeatedly killed its worker: seeds %s", lost)
     return EvalResult(
         policy=name,
@@ -71,12 +73,12 @@ def evaluate(
 
 
 def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
-    """What an evaluation keeps of an episode."""
+    """Return the result of an episode."""
     solved = episode.columns[schema.SUCCESS].ravel()
     first = int(np.argmax(solved)) + 1 if solved.any() else None
     states = episode.columns[schema.SIM_STATE]
     start, end = (positions(job.env.robot, job.env.task, states[row]) for row in (0, -1))
-    met = draw(job.conditions or (NOMINAL,), episode.seed)
+    drawn = draw(job.conditions or (NOMINAL,), episode.seed)
     return EpisodeResult(
         seed=episode.seed,
         success=episode.success,
@@ -86,8 +88,8 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         phase_at_end=_last_phase(job, episode),
         detail={
             "steps_to_success": first,
-            "condition": met.condition,
-            "drawn": dict(met.values),
+            "condition": drawn.condition,
+            "drawn": dict(drawn.values),
             "goal": start.pop("goal", None),
             "start": start,
             "end": {name: at for name, at in end.items() if name != "goal"},
@@ -103,11 +105,6 @@ def _last_phase(job: RolloutJob, episode: Episode) -> str:
 
 
 def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence[int]]:
-    """All seeds at once, or so many as are run between two looks at the interval."""
-    size = len(seeds) if until_width is None else LOOK_EVERY
+    """All seeds at once, or as many as are run between two checks of the interval."""
+    size = len(seeds) if until_width is None else CHECK_EVERY
     return (seeds[i : i + size] for i in range(0, len(seeds), max(1, size)))
-
-
-def _width(results: Sequence[EpisodeResult]) -> float:
-    low, high = Proportion.of([result.success for result in results], sequential=True).interval
-    return high - low

@@ -1,4 +1,4 @@
-"""Several arms, each with the same training seeds: who is better than the baseline, and what success had cost."""
+"""A study: several arms with the same training seeds, compared with a baseline, and their costs."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from statistics import fmean
 from typing import Any
 
 from manip_il.errors import ManipError, UnknownName
-from manip_il.evaluation.comparison import Arm, Comparison, Measured
-from manip_il.evaluation.comparison_table import over_seeds_fact, rule_facts
-from manip_il.evaluation.report_data import COSTS, Cost, format_amount, format_percent
-from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip
-from manip_il.evaluation.tables import Cells
+from manip_il.evaluation.comparison import Arm, Comparison, Member, seeds_facts
+from manip_il.evaluation.intervals import format_percent
+from manip_il.evaluation.report_data import COSTS, Cost, format_amount
+from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip, rule_facts
+from manip_il.evaluation.tables import Table
 
 FILE_NAME, TABLE_FILE = "study.json", "table.md"
 
 
 @dataclass(frozen=True)
 class Study:
-    """All arms' runs with their tests. baseline: whom the others are compared with. target: in (0, 1].
+    """All arms' runs with their tests. baseline: the arm that the others are compared with. target: in (0, 1].
 
-    rule, limit: by which a run's round was taken. Every member is of a run, and knows its history.
+    rule, limit: by which a run's round was chosen. Every member is of a run, and has its history.
     """
 
     arms: tuple[Arm, ...]
@@ -41,18 +41,18 @@ class Study:
 
     @property
     def training_seeds(self) -> list[int | None]:
-        """The same in every arm."""
+        """Training seeds, the same in every arm."""
         return self.arms[0].training_seeds
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Every other arm against the baseline."""
+        """Arm -> its comparison with the baseline, for every other arm."""
         [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
         return {arm.name: Comparison(baseline, arm) for arm in self.arms if arm is not baseline}
 
     @property
     def verdict(self) -> str:
-        """The headline: the best arm's success, and the baseline's, or the second's where the baseline is best."""
+        """The first sentence: success of the best arm, and of the baseline, or of the second where that is best."""
         ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
         best, count, seeds = ranked[0], ranked[0].members[0].result.success.n, len(self.training_seeds)
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
@@ -62,13 +62,11 @@ class Study:
 
     @property
     def facts(self) -> list[str]:
-        """What can be said in a sentence each."""
+        """Sentences after the verdict: comparisons with the baseline, how rounds were chosen, meaning of wall-clock."""
         chosen = [_chosen(member) for arm in self.arms for member in arm.members]
-        facts = [comparison.verdict for comparison in self.comparisons.values()]
-        if self.comparisons and len(self.training_seeds) > 1:
-            facts.append(over_seeds_fact(len(self.training_seeds)))
         return [
-            *facts,
+            *(comparison.verdict for comparison in self.comparisons.values()),
+            *(seeds_facts(len(self.training_seeds)) if self.comparisons else []),
             *rule_facts(self.rule, self.limit, chosen),
             "Wall-clock is what collecting and fitting took; validating is not counted.",
         ]
@@ -77,17 +75,17 @@ class Study:
         """Return the round of each training seed in which validation first reached the target."""
         return [first_reaching(member.history, self.target) for member in arm.members]
 
-    def results_table(self) -> Cells:
-        """Return an arm a row: what its policies had cost, how they did, and against the baseline."""
+    def results_table(self) -> Table:
+        """Return an arm a row: costs, success, difference from the baseline, largest dip."""
         columns = ("arm", *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
         columns += ("validation", "test", f"test, against {self.baseline}")
-        return Cells((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
+        return Table((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
 
-    def target_table(self) -> Cells:
+    def target_table(self) -> Table:
         """Return an arm a row: labels, episodes and wall-clock when validation first reached the target."""
-        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {_percent(self.target)}" for cost in COSTS]
+        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {100 * self.target:g} %" for cost in COSTS]
         rows = [(arm.name, *(self._to_target(arm, cost) for cost in COSTS), self._fewer(arm)) for arm in self.arms]
-        return Cells(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
+        return Table(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
 
     def to_json(self) -> dict[str, Any]:
         """Return the contract of `study.json`."""
@@ -126,7 +124,7 @@ class Study:
         return (arm.name, *costs, validation, test, comparison.numbers if comparison else "", f"{100 * dip:.1f}")
 
     def _to_target(self, arm: Arm, cost: Cost) -> str:
-        """The mean where all training seeds got there, else each: what it took, or more than it had in all."""
+        """Mean cost where all training seeds reached the target, else each: its cost, or more than its whole cost."""
         reached = self.reached(arm)
         if all(reached):
             return _plain(cost, fmean(one.amount(cost) for one in reached if one))
@@ -137,7 +135,7 @@ class Study:
         )
 
     def _fewer(self, arm: Arm) -> str:
-        """Labels of the baseline over this arm's, to the target; a lower bound where the baseline did not get there."""
+        """Labels of the baseline over this arm's, to the target; a lower bound where the baseline missed it."""
         if arm.name == self.baseline:
             return ""
         ours = [one.labels for one in self.reached(arm) if one]
@@ -157,25 +155,21 @@ def table_markdown(study: Study) -> str:
     results, target = study.results_table().filled(), study.target_table().filled()
     count = study.arms[0].members[0].result.success.n
     seeds = ", ".join(map(str, study.training_seeds))
-    where = [f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."]
-    facts = "".join(f"- {fact}\n" for fact in [*where, *study.facts])
+    episodes = f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."
+    facts = "".join(f"- {fact}\n" for fact in [episodes, *study.facts])
     return f"{results.markdown()}\n{target.markdown()}\n{facts}"
 
 
-def _chosen(member: Measured) -> Round:
+def _chosen(member: Member) -> Round:
     assert member.chosen is not None
     return member.chosen
 
 
 def _plain(cost: Cost, amount: float) -> str:
-    """Without the unit that the column's head says."""
+    """The amount without the unit that the column's head has."""
     return format_amount(cost, amount).removesuffix(f" {cost}")
 
 
 def _rates(rates: Sequence[float]) -> str:
     each = f" ({', '.join(f'{100 * rate:.1f}' for rate in rates)})" if len(rates) > 1 else ""
     return f"{format_percent(fmean(rates))}{each}"
-
-
-def _percent(rate: float) -> str:
-    return f"{100 * rate:g} %"

@@ -1,114 +1,97 @@
-"""`report.html` of a study: who is better, and success over labels, episodes and wall-clock."""
+"""`report.html` of a study: which arm is better, and success over labels, episodes and wall-clock."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
 
-from manip_il.evaluation import curve_sections, sections
-from manip_il.evaluation.charts import seeds_bar
-from manip_il.evaluation.comparison import Arm, Measured
-from manip_il.evaluation.html_table import cells_table
-from manip_il.evaluation.report import render_page
-from manip_il.evaluation.report_data import ArmCurve
+from manip_il.evaluation.comparison import Arm
+from manip_il.evaluation.curves import CurveCharts, Series
+from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.rounds import curve_points
 from manip_il.evaluation.study import Study
+from manip_il.evaluation.tables import Table
 
 COLOURS = 7  # besides the baseline's; arms beyond differ by their marks
 
 
-@dataclass(frozen=True)
-class StudyReport:
-    """A study's whole story. command: what made it; config, fingerprint: nested mappings."""
+def study_report(study: Study, title: str, command: str, config: Mapping[str, Any] | None = None) -> StudyReport:
+    """Return the report of a study."""
+    timings: dict[str, float] = {}
+    for arm in study.arms:
+        for member in arm.members:
+            last, name = member.history[-1], f"{arm.name}, training seed {member.training_seed}"
+            timings |= {f"{name}, collect and fit": last.seconds, f"{name}, validate": last.validating}
+    return StudyReport(
+        title=title,
+        verdict=study.verdict,
+        facts=tuple(study.facts),
+        command=command,
+        config=config or {},
+        fingerprint=study.arms[0].members[0].result.fingerprint,
+        timings=timings,
+        study=study,
+    )
 
-    title: str
-    command: str
+
+@dataclass(frozen=True, kw_only=True)
+class StudyReport(Report):
+    """The report of a study, made by `study_report`."""
+
+    template: ClassVar[str] = "study.html.j2"
     study: Study
-    config: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    fingerprint: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
-    def verdict(self) -> str:
-        """The first sentence."""
-        return self.study.verdict
+    def kinds(self) -> dict[str, str]:
+        """Arm -> CSS class of its colour: the baseline grey, the others in order."""
+        others = [arm.name for arm in self.study.arms if arm.name != self.study.baseline]
+        return {self.study.baseline: "arm base"} | {name: f"arm arm-{i % COLOURS}" for i, name in enumerate(others)}
 
     @property
-    def facts(self) -> Sequence[str]:
-        """Further sentences under it."""
-        return self.study.facts
+    def results(self) -> Table:
+        """Costs and success of each arm."""
+        return self._coloured(self.study.results_table())
 
     @property
-    def timings(self) -> Mapping[str, float]:
-        """What every run took, measuring it included [s]."""
-        timings: dict[str, float] = {}
-        for arm in self.study.arms:
-            for member in arm.members:
-                last, name = member.history[-1], f"{arm.name}, training seed {member.training_seed}"
-                timings |= {f"{name}, collect and fit": last.seconds, f"{name}, validate": last.validating}
-        return timings
+    def to_target(self) -> Table:
+        """Costs of each arm to the target."""
+        return self._coloured(self.study.target_table())
+
+    @property
+    def bars(self) -> list[Bar]:
+        """Success of each arm."""
+        return [
+            Bar.of(arm.name, self.kinds[arm.name], *(member.result.success for member in arm.members))
+            for arm in self.study.arms
+        ]
+
+    @property
+    def note(self) -> str:
+        """Number of episodes, the disturbance, meaning of brackets and dots."""
+        first = self.study.arms[0].members[0].result
+        note = f"Every policy ran the same {first.success.n:,} test episodes, on which nothing was chosen."
+        if first.settings.disturbance != "none":
+            note += f" Disturbed: {first.settings.disturbance}."
+        if len(self.study.training_seeds) > 1:
+            note += " In brackets and as dots: each training seed; the bar is their mean."
+        return note
+
+    @cached_property
+    def curves(self) -> CurveCharts:
+        """Success against cost."""
+        series = tuple(arm_series(arm, self.kinds[arm.name]) for arm in self.study.arms)
+        return CurveCharts(series, self.study.target)
+
+    def _coloured(self, table: Table) -> Table:
+        return replace(table, kinds=tuple(self.kinds[row[0]] for row in table.rows))
 
 
-def render_study(report: StudyReport) -> str:
-    """Return the page as one string of HTML."""
-    study = report.study
-    return render_page(
-        report.title, [sections.header(report), _results(study), _curves(study), sections.making(report)]
-    )
-
-
-def _results(study: Study) -> str:
-    kinds = arm_kinds(study)
-    drawn = [
-        (arm.name, seeds_bar(arm.name, kinds[arm.name], [m.result.success for m in arm.members]), arm.test_rate)
-        for arm in study.arms
-    ]
-    first = study.arms[0].members[0].result
-    count = len(study.training_seeds)
-    note = [f"Every policy ran the same {first.success.n:,} test episodes, on which nothing was chosen."]
-    if first.settings.disturbance != "none":
-        note.append(f"Disturbed: {first.settings.disturbance}.")
-    if count > 1:
-        note.append("In brackets and as dots: each training seed; the bar is their mean.")
-    return sections.section(
-        "Results",
-        cells_table(study.results_table(), kinds),
-        sections.bars(drawn),
-        f'<p class="note">{sections.prose(" ".join(note))}</p>',
-    )
-
-
-def _curves(study: Study) -> str:
-    kinds = arm_kinds(study)
-    arms = [(arm_curve(arm), kinds[arm.name]) for arm in study.arms]
-    return sections.section(
-        "Success against cost",
-        curve_sections.arm_curves(arms, study.target),
-        cells_table(study.target_table(), kinds),
-        sections.details("The curves in numbers", sections.pairs(arm_numbers(study.arms))),
-    )
-
-
-def arm_kinds(study: Study) -> dict[str, str]:
-    """Arm -> the CSS class of its colour: the baseline grey, the others in order."""
-    others = [arm.name for arm in study.arms if arm.name != study.baseline]
-    return {study.baseline: "arm base"} | {name: f"arm arm-{i % COLOURS}" for i, name in enumerate(others)}
-
-
-def arm_curve(arm: Arm) -> ArmCurve:
-    """Return its members' runs; `ManipError` where one is of no run."""
-    return ArmCurve(arm.name, tuple(curve_points(member.history) for member in arm.members))
-
-
-def arm_numbers(arms: Sequence[Arm]) -> dict[str, str]:
-    """Return every round of every run in words, and its validation."""
-    return {
-        f"{arm.name}{_seed(member)}, {one.words}": str(one.validation)
-        for arm in arms
+def arm_series(arm: Arm, kind: str) -> Series:
+    """Return the runs of an arm's members; `ManipError` where one is of no run."""
+    runs = {
+        "" if member.training_seed is None else f"training seed {member.training_seed}": curve_points(member.history)
         for member in arm.members
-        for one in member.history
     }
-
-
-def _seed(member: Measured) -> str:
-    return "" if member.training_seed is None else f", training seed {member.training_seed}"
+    return Series(arm.name, kind, runs)

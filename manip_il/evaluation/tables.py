@@ -1,54 +1,128 @@
-"""A table as text, once: on a terminal, in Markdown, on a page."""
+"""Tables of text, for the terminal, Markdown and reports."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from manip_il.errors import ManipError
+from manip_il.evaluation.report_data import PolicyRow
+from manip_il.evaluation.results import EvalResult
 
 PLAIN_WIDTH = 240  # a file or a pipe has no width to fold lines at
+ROOMY = 112  # columns of a terminal: below it, intervals go under their rates
+STYLES = {"expert": "green", "dagger": "bold blue", "cloning": "dark_orange", "baseline": "dim"}
+WORST = "\N{BLACK DOWN-POINTING TRIANGLE} "  # begins the cell with the lowest success of a row
+NO_CONDITION = "without a condition"
+_LONG_NAME = 24  # characters of a row's name, from which on it may be broken over lines
 
 
 @dataclass(frozen=True)
-class Cells:
-    """Columns and rows of text; an empty cell is one that was not measured. The first column names the row."""
+class Table:
+    """Columns and rows of text; an empty cell was not measured. The first column names the row.
+
+    kinds: of the rows, for their colours: CSS classes of a report; empty where rows have none.
+    """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise ManipError(f"a table's row has {len(row)} cells, its head {len(self.columns)}: {row}")
 
-    def filled(self) -> Cells:
-        """Without the columns that no row fills."""
+    @property
+    def has_long_names(self) -> bool:
+        """Whether a row's name may need to be broken over lines."""
+        return any(len(row[0]) > _LONG_NAME for row in self.rows)
+
+    def filled(self) -> Table:
+        """Return the table without the columns that no row fills."""
         keep = [i for i in range(len(self.columns)) if i == 0 or any(row[i] for row in self.rows)]
-        return Cells(tuple(self.columns[i] for i in keep), tuple(tuple(row[i] for i in keep) for row in self.rows))
+        rows = tuple(tuple(row[i] for i in keep) for row in self.rows)
+        return Table(tuple(self.columns[i] for i in keep), rows, self.kinds)
 
     def markdown(self) -> str:
-        """As GitHub renders it, numbers to the right."""
+        """Return the table as GitHub renders it, numbers to the right."""
         rule = ("---", *("--:" for _ in self.columns[1:]))
         lines = [
             "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in (self.columns, *self.rows)
         ]
         return "\n".join([lines[0], "|" + "|".join(rule) + "|", *lines[1:]]) + "\n"
 
+    def aligned_lines(self) -> list[str]:
+        """Return columns as wide as their widest cell, a rule under the head; all but the first set right."""
+        cells = (self.columns, *self.rows)
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in cells]
+        return [lines[0].rstrip(), "-" * len(lines[0]), *lines[1:]]
 
-def print_table(cells: Cells, console: Console | None = None) -> None:
-    """Print to standard output, without the columns that no row fills: plain text where nobody is watching."""
+
+def print_table(table: Table, console: Console | None = None, empty: str = "") -> None:
+    """Print the filled columns: in colour on a terminal, as plain text elsewhere. empty: stands for an empty cell."""
     console = console or Console(highlight=False)
-    if not console.is_terminal:
+    terminal = console.is_terminal
+    gap = "\n" if terminal and console.width < ROOMY else " "
+    if not terminal:
         console = Console(file=console.file, width=PLAIN_WIDTH, color_system=None, highlight=False)
-    cells = cells.filled()
-    table = Table(box=box.SIMPLE_HEAD if console.is_terminal else box.ASCII2, pad_edge=False)
-    for index, name in enumerate(cells.columns):
-        table.add_column(Text(name), justify="right" if index else "left")
-    for row in cells.rows:
-        table.add_row(*map(Text, row))  # Text, as Rich would take the brackets of an interval for markup
-    console.print(table)
+    table = table.filled()
+    drawn = RichTable(box=box.SIMPLE_HEAD if terminal else box.ASCII2, pad_edge=False)
+    for index, name in enumerate(table.columns):
+        drawn.add_column(Text(name.replace(" ", gap, 1)), justify="right" if index else "left")
+    for index, row in enumerate(table.rows):
+        style = STYLES.get(table.kinds[index]) if terminal and table.kinds else None
+        # Text, as Rich would take the brackets of an interval for markup.
+        drawn.add_row(*(Text((cell or empty).replace(" [", f"{gap}[")) for cell in row), style=style)
+    console.print(drawn)
+
+
+def policy_table(rows: Sequence[PolicyRow]) -> Table:
+    """Return a row a policy: labels, success, success at the end, steps to success, success under the disturbance."""
+    success = f"success [{100 * rows[0].success.confidence:g} % interval]"
+    columns = ("policy", "expert labels", success, "success at end", "steps to success", "success, disturbed")
+    cells = tuple(
+        (
+            row.name,
+            "" if row.labels is None else f"{row.labels:,}",
+            str(row.success),
+            str(row.success_at_end or ""),
+            "" if row.steps_to_success is None else f"{row.steps_to_success:.1f}",
+            str(row.disturbed or ""),
+        )
+        for row in rows
+    )
+    return Table(columns, cells, tuple(row.kind for row in rows))
+
+
+def evaluation_table(result: EvalResult) -> Table:
+    """Return success, success at the end and control steps until success: of all episodes, then of each condition."""
+    columns = ("policy", "episodes", f"success [{100 * result.confidence:g} % interval]")
+    parts = [(result.policy, result)]
+    if len(result.by_condition) > 1:
+        parts += [(f"  {name or NO_CONDITION}", part) for name, part in result.by_condition.items()]
+    rows = tuple(
+        (
+            name,
+            f"{part.success.n:,}",
+            str(part.success),
+            str(part.success_at_end),
+            "" if part.steps_to_success is None else f"{part.steps_to_success:.1f}",
+        )
+        for name, part in parts
+    )
+    return Table((*columns, "success at end", "steps to success"), rows)
+
+
+def evaluation_lines(result: EvalResult) -> list[str]:
+    """Return a line that counts failures by phase; none where nothing failed."""
+    if not result.failures:
+        return []
+    phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
+    return [f"failures by the phase that they ended in: {phases}"]

@@ -17,13 +17,13 @@ HEIGHT = 900
 
 @dataclass
 class Opened:
-    """A page that is open. told: what its console said; asked: every address that it wanted but itself and `data:`."""
+    """A page that is open. console: its lines; requests: all addresses but its own and `data:`."""
 
     page: Page
-    told: list[str] = field(default_factory=list[str])
-    asked: list[str] = field(default_factory=list[str])
+    console: list[str] = field(default_factory=list[str])
+    requests: list[str] = field(default_factory=list[str])
 
-    def ask(self, script: str, argument: object = None) -> Any:
+    def evaluate(self, script: str, argument: object = None) -> Any:
         """The value of an expression, or of a function of `argument`, in the page."""
         return self.page.evaluate(script, argument)
 
@@ -46,9 +46,9 @@ def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "d
     context = browser.new_context(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True)
     page = context.new_page()
     seen, own = Opened(page), path.resolve().as_uri()
-    page.on("console", lambda message: seen.told.append(f"{message.type}: {message.text}"))
-    page.on("pageerror", lambda error: seen.told.append(str(error)))
-    page.on("request", lambda request: _note(seen.asked, request.url, own))
+    page.on("console", lambda message: seen.console.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: seen.console.append(str(error)))
+    page.on("request", lambda request: _note(seen.requests, request.url, own))
     page.goto(own)
     try:
         yield seen
@@ -56,6 +56,6 @@ def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "d
         context.close()
 
 
-def _note(asked: list[str], url: str, own: str) -> None:
+def _note(requests: list[str], url: str, own: str) -> None:
     if url != own and not url.startswith("data:"):
-        asked.append(url)
+        requests.append(url)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.evaluation.comparison import Arm, Comparison, Measured
+from manip_il.evaluation.comparison import Arm, Comparison, Member
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.film import make_film
 from manip_il.evaluation.report_data import Film
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
-from manip_il.evaluation.rounds import Rule, choose, history
+from manip_il.evaluation.results import EvalResult
+from manip_il.evaluation.rounds import Rule, history, select_round
 
 from .test_rounds import records
 
@@ -74,8 +75,8 @@ def _arm(name: str, fails: Fails, seeds: int, successes: tuple[float, ...]) -> A
     return Arm(
         name,
         tuple(
-            Measured(f"{name}/seed_{seed}", made_eval(name, fails=fails), Path("e.json"), seed, Path("p"),
-                     choose(Rule(), run, None, name), run)
+            Member(f"{name}/seed_{seed}", made_eval(name, fails=fails), Path("e.json"), seed, Path("p"),
+                     select_round(Rule(), run, None, name), run)
             for seed in range(seeds)
         ),
     )  # fmt: skip

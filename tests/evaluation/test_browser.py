@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from manip_il.evaluation.compare_report import CompareReport, compare_page
-from manip_il.evaluation.eval_report import EvalReport, eval_page
-from manip_il.evaluation.failure_map import map_marks
-from manip_il.evaluation.film import encode_png
-from manip_il.evaluation.paired_map import paired_marks
-from manip_il.evaluation.report import PolicyRow, Report, Strip, render_report, write_page
-from manip_il.evaluation.report_data import CurvePoint, LearningCurve
+from manip_il.evaluation.compare_report import compare_report
+from manip_il.evaluation.eval_report import eval_report
+from manip_il.evaluation.film import encode_picture
+from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.maps import map_marks, paired_marks
+from manip_il.evaluation.report import Report, RunReport
+from manip_il.evaluation.report_data import CurvePoint, LearningCurve, PolicyRow, Strip
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.statistics import Proportion
+from manip_il.evaluation.study_report import study_report
 
 from .browser import HEIGHT, Opened, chromium, opened
 from .made_evals import far_corner, made_comparison, made_eval, small_film
+from .test_study import STUDY
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +34,7 @@ WINDOWS: tuple[tuple[int, Literal["light", "dark"]], ...] = (
     (390, "dark"),
 )
 CURVE = LearningCurve(
-    tuple(CurvePoint(400 * i, Proportion(9 * i, 40), f"round {i}", 20 * i, 60.0 * i) for i in (1, 2, 3, 4)), target=0.9
+    tuple(CurvePoint(400 * i, Proportion(9 * i, 40), f"round {i}", 20 * i, 60.0 * i) for i in (1, 2, 3, 4))
 )
 RESULT = made_eval("runs/a_policy_with_a_name_that_is_rather_long/round_004/policy/pretrained_model", n=200)
 COMPARISON = made_comparison(far_corner, lambda number, _: number % 37 == 0, seeds=2)
@@ -54,45 +55,46 @@ POSTER = """async (video) => {
 
 @dataclass(frozen=True)
 class Case:
-    """A page, and what it must show. films: their outcomes in the order of the page, None where none is told."""
+    """A report, and its films in the order of the page. films: their outcomes, None where not known."""
 
-    html: str
-    verdict: str
-    films: tuple[bool | None, ...]
-    captions: tuple[str, ...]
+    report: Report
+    films: tuple[bool | None, ...] = ()
+    captions: tuple[str, ...] = ()
 
 
 def eval_case() -> Case:
     outcomes = (True, False, False, True)
     films = tuple(small_film(number, success) for number, success in enumerate(outcomes))
-    report = EvalReport(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
+    report = eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
     ordered = [film for film in films if not film.success] + [film for film in films if film.success]
-    return Case(eval_page(report), report.verdict, tuple(f.success for f in ordered), tuple(f.caption for f in ordered))
+    return Case(report, tuple(film.success for film in ordered), tuple(film.caption for film in ordered))
 
 
 def compare_case() -> Case:
-    films = (small_film(0, False), small_film(1, True))
-    report = CompareReport(COMPARISON, "manip-il compare a b", films=films)
-    return Case(compare_page(report), report.verdict, (False, True), tuple(film.caption for film in films))
+    return Case(compare_report(COMPARISON, "manip-il compare a b"))
 
 
 def quickstart_case() -> Case:
     films = tuple(small_film(number, None) for number in range(3))
-    picture = encode_png(np.full((48, 64, 3), 90, dtype=np.uint8))
-    report = Report(
-        "panda pick_place",
-        "DAgger solves 95.0 % of 200 unseen starts.",
-        "manip-il quickstart",
-        (PolicyRow.of("DAgger", RESULT, 4000), PolicyRow.of("cloning", RESULT, 4000, RESULT, "cloning")),
+    picture = encode_picture(np.full((48, 64, 3), 90, dtype=np.uint8), "png")
+    report = RunReport(
+        title="panda pick_place",
+        verdict="DAgger solves 95.0 % of 200 unseen starts.",
+        command="manip-il quickstart",
+        rows=(PolicyRow.of("DAgger", RESULT, 4000), PolicyRow.of("cloning", RESULT, 4000, RESULT, "cloning")),
         curve=CURVE,
         films=films,
         strips=(Strip("DAgger", tuple((0.1 * i, picture) for i in range(6))),),
         timings={"training": 65.0},
     )
-    return Case(render_report(report), report.verdict, (None,) * 3, tuple(film.caption for film in films))
+    return Case(report, (None,) * 3, tuple(film.caption for film in films))
 
 
-CASES = {"eval": eval_case, "compare": compare_case, "quickstart": quickstart_case}
+def study_case() -> Case:
+    return Case(study_report(STUDY, "Study", "manip-il study x.yaml"))
+
+
+CASES = {"eval": eval_case, "compare": compare_case, "quickstart": quickstart_case, "study": study_case}
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +111,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 @pytest.fixture(scope="module")
 def file(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report") / "report.html"
-    write_page(path, case.html)
+    case.report.write(path)
     return path
 
 
@@ -118,16 +120,16 @@ def test_it_opens_quietly_and_fits_the_window(
     browser: Browser, case: Case, file: Path, width: int, scheme: Literal["light", "dark"]
 ):
     with opened(browser, file, width, scheme) as seen:
-        seen.ask("document.querySelectorAll('details').forEach(one => one.open = true)")
-        wide, room = seen.ask("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        seen.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        wide, room = seen.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
         assert wide <= room == width
         assert too_wide(seen) == []
-        assert first_words(seen) == case.verdict
-        paper, ink = seen.ask(
+        assert first_words(seen) == case.report.verdict
+        paper, ink = seen.evaluate(
             "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
         )
         assert (brightness(paper) > brightness(ink)) == (scheme == "light")
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path):
@@ -144,7 +146,7 @@ def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path)
             assert caption in film.evaluate("film => film.closest('figure').innerText")
             heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
             assert success is None or heading == ("Successes" if success else "Failures")
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, case: Case, file: Path):
@@ -153,28 +155,29 @@ def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, 
             film.scroll_into_view_if_needed()  # browsers wait with those that are out of sight
             assert seen.page.wait_for_function(STARTED, arg=film, timeout=60_000)
             assert film.evaluate(POSTER) == [64, 48]
-        assert (seen.told, seen.asked) == ([], [])
+        assert (seen.console, seen.requests) == ([], [])
 
 
 def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, case: Case, tmp_path: Path):
-    slipped_in = case.html.replace("</main>", "<script>document.title = 'slipped in'</script></main>")
-    assert slipped_in != case.html
-    write_page(tmp_path / "report.html", slipped_in)
+    html = case.report.render()
+    slipped_in = html.replace("</main>", "<script>document.title = 'slipped in'</script></main>")
+    assert slipped_in != html
+    (tmp_path / "report.html").write_text(slipped_in)
     with opened(browser, tmp_path / "report.html", 1280) as seen:
         assert seen.page.title() != "slipped in"
-        assert any("Content Security Policy" in told for told in seen.told)
+        assert any("Content Security Policy" in line for line in seen.console)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path: Path, width: int):
-    write_page(tmp_path / "report.html", eval_case().html)
+    eval_case().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", width) as seen:
         for index in range(2):
             assert marks_in(seen, index) == counted(RESULT)
 
 
 def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
-    write_page(tmp_path / "report.html", compare_case().html)
+    compare_case().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", 1280) as seen:
         for arm, marks in enumerate(paired_marks(COMPARISON)):
             expected = {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
@@ -189,7 +192,7 @@ def counted(result: EvalResult) -> dict[str, int]:
 
 def marks_in(seen: Opened, index: int) -> dict[str, int]:
     """How many marks of each kind one map has, all of them inside its frame and seen."""
-    return seen.ask(
+    return seen.evaluate(
         """(index) => {
             const map = document.querySelectorAll('svg.map')[index], frame = map.getBoundingClientRect();
             const inside = (mark) => {
@@ -206,7 +209,7 @@ def marks_in(seen: Opened, index: int) -> dict[str, int]:
 
 def first_words(seen: Opened) -> str:
     """The first heading's words, which must stand in the first window without scrolling."""
-    words, bottom = seen.ask(
+    words, bottom = seen.evaluate(
         """() => {
             const first = document.querySelector('h1, h2, h3, table, svg, video');
             return [first.innerText, first.getBoundingClientRect().top];
@@ -218,7 +221,7 @@ def first_words(seen: Opened) -> str:
 
 def too_wide(seen: Opened) -> list[str]:
     """Words that stick out of the page's column."""
-    return seen.ask(
+    return seen.evaluate(
         """() => {
             const main = document.querySelector('main').getBoundingClientRect();
             const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, svg.map, .bar-line';

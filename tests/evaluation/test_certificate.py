@@ -14,10 +14,9 @@ from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled
-from manip_il.evaluation.certificate_table import align, certificate_lines
+from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled, summary_lines
 from manip_il.evaluation.certify import certify, count_episodes, draw_moment
-from manip_il.evaluation.statistics import wilson_interval
+from manip_il.evaluation.intervals import wilson_interval
 from manip_il.expert.expert import Expert
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.mdp import Episode
@@ -100,7 +99,7 @@ def test_counts_that_cannot_be_are_refused():
 
 def test_the_tables_show_the_numbers_and_who_was_not_solved():
     made = certificate(row("action", ACTIONS), row("learner", ACTIONS[:3], "learner", left_out=1))
-    lines = certificate_lines(made)
+    lines = summary_lines(made)
     [costs] = [line for line in lines if line.startswith("words of a") and "s)" in line]
     assert costs.split()[-2:] == ["1", "4"]  # never solved, cases
     assert "17.5 (0.875 s)" in costs
@@ -110,11 +109,6 @@ def test_the_tables_show_the_numbers_and_who_was_not_solved():
     assert "at least 50 steps (2.5 s), the whole horizon, as 1 of 4 were never solved" in text
     assert "the policy had solved 1 of 4 before" in text
     assert "not solved, words of a: seeds 3 (1 of 1 ended where the expert has no valid label)" in text
-
-
-def test_columns_are_aligned():
-    lines = align([["head", "a"], ["x", "1234"], ["longer", "5"]])
-    assert lines == ["head       a", "------------", "x       1234", "longer     5"]
 
 
 @pytest.mark.parametrize("kind", ["random", "opposite", "gripper"])

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.evaluation.comparison import Arm, Comparison, Measured, write_json
-from manip_il.evaluation.comparison_table import comparison_facts, comparison_table
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.compare_report import comparison_table
+from manip_il.evaluation.comparison import Arm, Comparison, Member, comparison_facts
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
+from manip_il.evaluation.results import EvalResult, write_json
 from manip_il.evaluation.rounds import Rule, history
-from manip_il.evaluation.statistics import compare_paired
-from manip_il.evaluation.tables import Cells
+from manip_il.evaluation.significance import compare_paired
 
 from .test_rounds import records
 
@@ -22,18 +22,18 @@ EASY = [True] * 80 + [False] * 20
 HARD = [True] * 50 + [False] * 50
 
 
-def measured(outcomes: list[bool], seed: int | None = None, name: str = "p", **changes) -> Measured:
+def made_member(outcomes: list[bool], seed: int | None = None, name: str = "p", **changes) -> Member:
     episodes = tuple(EpisodeResult(4_000_000 + i, good, good, 10, 0.0) for i, good in enumerate(outcomes))
     result = EvalResult(name, "panda", "reach", {"mujoco": "3.11.0"}, episodes, SETTINGS)
-    return Measured(name, replace(result, **changes), Path("e.json"), seed)
+    return Member(name, replace(result, **changes), Path("e.json"), seed)
 
 
 def arm(name: str, *outcomes: list[bool]) -> Arm:
-    return Arm(name, tuple(measured(one, seed, f"{name}/seed_{seed}") for seed, one in enumerate(outcomes)))
+    return Arm(name, tuple(made_member(one, seed, f"{name}/seed_{seed}") for seed, one in enumerate(outcomes)))
 
 
 def one(name: str, outcomes: list[bool]) -> Arm:
-    return Arm(name, (measured(outcomes, None, name),))
+    return Arm(name, (made_member(outcomes, None, name),))
 
 
 def test_one_policy_against_another_is_the_paired_comparison():
@@ -45,12 +45,8 @@ def test_one_policy_against_another_is_the_paired_comparison():
     assert comparison.verdict.endswith("p < 0.001, 100 paired episodes.")
 
 
-def test_the_verdict_names_the_better_one_on_either_side():
-    verdict = Comparison(one("A", EASY), one("B", HARD)).verdict
-    assert verdict.startswith("A is better than B by 30.0 points [20.")
-
-
-def test_a_small_difference_is_not_called_one():
+def test_the_verdict_names_the_better_one_on_either_side_and_no_small_difference():
+    assert Comparison(one("A", EASY), one("B", HARD)).verdict.startswith("A is better than B by 30.0 points [20.")
     verdict = Comparison(one("A", HARD), one("B", HARD[:-1] + [True])).verdict
     assert verdict.startswith("No difference shown between B and A: +1.0 points [")
 
@@ -58,7 +54,7 @@ def test_a_small_difference_is_not_called_one():
 def test_over_training_seeds_the_mean_difference_has_students_interval():
     better = Comparison(arm("A", HARD, HARD, HARD), arm("B", EASY, EASY[1:] + [True], EASY[:-1] + [False]))
     assert [pair.difference for pair in better.pairs] == pytest.approx([0.3, 0.31 - 0.01, 0.3])
-    assert better.shown
+    assert better.significant
     assert "on average over 3 training seeds (ahead in 3 of 3)" in better.verdict
     assert "100 paired episodes on each of 3 training seeds" in better.verdict
 
@@ -68,7 +64,7 @@ def test_these_policies_may_differ_where_training_seeds_do_not_show_it():
     low, high = comparison.interval
     assert comparison.p_value < 0.001
     assert low < 0 < high
-    assert not comparison.shown
+    assert not comparison.significant
     assert comparison.verdict.startswith("These policies of B are better than those of A (p < 0.001")
     assert "do not show that others would be: 16.0 points" in comparison.verdict
 
@@ -78,7 +74,7 @@ def test_two_equal_differences_alone_are_no_proof():
     comparison = Comparison(arm("A", HARD, HARD), arm("B", HARD[:-1] + [True], HARD[:-1] + [True]))
     assert comparison.interval == (0.01, 0.01)
     assert comparison.p_value == 1
-    assert not comparison.shown
+    assert not comparison.significant
 
 
 def test_equal_arms_are_not_called_different():
@@ -97,7 +93,7 @@ def test_random_arms_of_one_quality_are_seldom_called_different():
         left, right = (
             arm(name, *[list(map(bool, one)) for one in side]) for name, side in zip("AB", drawn, strict=True)
         )
-        wrong += Comparison(left, right).shown
+        wrong += Comparison(left, right).significant
     assert wrong <= 32  # 3 standard deviations above 5 %
 
 
@@ -107,13 +103,13 @@ def test_what_is_not_paired_is_refused():
     with pytest.raises(ManipError, match=r"test episodes differ: A has 100, B 50, of which 50 are the same"):
         Comparison(one("A", HARD), one("B", HARD[:50]))
     with pytest.raises(MismatchError, match=r"robot differs: A has panda, B has fetch"):
-        Comparison(one("A", HARD), Arm("B", (measured(HARD, robot="fetch"),)))
+        Comparison(one("A", HARD), Arm("B", (made_member(HARD, robot="fetch"),)))
     with pytest.raises(MismatchError, match="settings differs"):
-        Comparison(one("A", HARD), Arm("B", (measured(HARD, settings=EvalSettings(100, 0.05)),)))
+        Comparison(one("A", HARD), Arm("B", (made_member(HARD, settings=EvalSettings(100, 0.05)),)))
     with pytest.raises(UsageError, match="compared with itself"):
         Comparison(one("A", HARD), one("A", EASY))
     with pytest.raises(ManipError, match="each once"):
-        Arm("A", (measured(HARD, 1), measured(HARD, 1)))
+        Arm("A", (made_member(HARD, 1), made_member(HARD, 1)))
 
 
 def test_compare_json_holds_what_the_verdict_rests_on(tmp_path: Path):
@@ -131,27 +127,20 @@ def test_compare_json_holds_what_the_verdict_rests_on(tmp_path: Path):
 
 def test_the_table_says_which_round_was_taken_and_what_it_had_cost():
     run = history(records(), "x")
-    chosen = replace(measured(EASY, 0, "B/seed_0"), chosen=run[2], history=run)
+    chosen = replace(made_member(EASY, 0, "B/seed_0"), chosen=run[2], history=run)
     comparison = Comparison(arm("A", HARD), Arm("B", (chosen,)))
-    cells = comparison_table(comparison)
-    assert cells.rows[1][:7] == ("B/seed_0", "0", "2", "300", "9", "30.0 s", "80.0 %")
-    assert cells.rows[1][7] == "80.0 % [71.1, 86.7]"
-    assert cells.rows[1][8].startswith("+30.0 points [")
-    assert cells.rows[0][2:7] == ("",) * 5
+    table = comparison_table(comparison)
+    assert table.rows[1][:7] == ("B/seed_0", "0", "2", "300", "9", "30.0 s", "80.0 %")
+    assert table.rows[1][7] == "80.0 % [71.1, 86.7]"
+    assert table.rows[1][8].startswith("+30.0 points [")
+    assert table.rows[0][2:7] == ("",) * 5
     facts = comparison_facts(comparison, Rule.parse("best", "labels"), 300)
     assert any("within 300 labels (the most that every run reached)" in fact for fact in facts)
 
 
 def test_rounds_that_did_not_cost_the_same_are_said_not_to():
     run = history(records(), "x")
-    members = [replace(measured(HARD, None, name), chosen=run[i], history=run) for name, i in (("A", 1), ("B", 3))]
+    members = [replace(made_member(HARD, None, name), chosen=run[i], history=run) for name, i in (("A", 1), ("B", 3))]
     comparison = Comparison(*(Arm(member.name, (member,)) for member in members))
     assert any("200 to 400 labels" in fact for fact in comparison_facts(comparison, Rule.parse("last", "labels"), 400))
     assert not any(" to 400" in fact for fact in comparison_facts(comparison, Rule(), None))
-
-
-def test_a_table_in_markdown_escapes_what_would_break_it():
-    cells = Cells(("a", "b", "c"), (("x|y", "", "1"), ("z", "", "2")))
-    assert cells.filled().markdown() == "| a | c |\n|---|--:|\n| x\\|y | 1 |\n| z | 2 |\n"
-    with pytest.raises(ManipError, match="has 1 cells, its head 2"):
-        Cells(("a", "b"), (("x",),))

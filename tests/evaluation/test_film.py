@@ -11,7 +11,7 @@ from manip_il.data import schema
 from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
-from manip_il.evaluation.film import encode_mp4, film, make_film, paths, run_states, shown_steps, strip
+from manip_il.evaluation.film import encode_mp4, film, filmed_steps, make_film, paths, run_states, strip
 from manip_il.sim.env import EnvConfig
 
 JOB = RolloutJob(EnvConfig(), "expert", label="last")
@@ -36,7 +36,7 @@ def test_a_seed_run_again_is_the_episode_that_an_evaluation_saw(episode):
 def test_a_film_ends_a_second_after_success(episode):
     first = int(np.argmax(episode.columns[schema.SUCCESS])) + 1
     assert episode.success
-    assert shown_steps(episode, 20) == first + 20 < len(episode)
+    assert filmed_steps(episode, 20) == first + 20 < len(episode)
 
 
 def test_an_mp4_is_h264_for_browsers_with_its_index_in_front():
@@ -78,7 +78,7 @@ def test_a_strip_goes_from_the_first_to_the_last_frame():
 
 def test_paths_end_with_the_object_at_the_goal(episode):
     drawn = paths(episode, env_spec(JOB.env), "expert")
-    assert len(drawn.hand) == len(drawn.obj) == shown_steps(episode, 20)
+    assert len(drawn.hand) == len(drawn.obj) == filmed_steps(episode, 20)
     assert np.linalg.norm(drawn.obj[-1] - drawn.goal) < JOB.env.tolerance
     assert np.linalg.norm(drawn.obj[0] - drawn.goal) > JOB.env.tolerance
     assert drawn.dt == pytest.approx(0.05)
@@ -93,7 +93,7 @@ def test_paths_of_a_task_without_an_object_follow_the_hand():
 @pytest.mark.gl
 def test_a_film_shows_every_second_state_and_things_that_move(episode):
     pictures = film(episode, JOB.env, size=(60, 80), every=2)
-    assert len(pictures) == -(-shown_steps(episode, 20) // 2)
+    assert len(pictures) == -(-filmed_steps(episode, 20) // 2)
     assert all(picture.shape == (60, 80, 3) and picture.dtype == np.uint8 for picture in pictures)
     assert pictures[0].std() > 10
     assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50

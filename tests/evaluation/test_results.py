@@ -9,10 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings, compare_results
-from manip_il.evaluation.statistics import confidence_sequence, wilson_interval
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
+from manip_il.evaluation.intervals import confidence_sequence, wilson_interval
+from manip_il.evaluation.results import EvalResult, compare_results, merge_results
+from manip_il.mdp import LONGEST_EPISODE
 from manip_il.sim.conditions import Condition
+from manip_il.sim.env import EnvConfig
 
 SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
 
@@ -20,7 +23,7 @@ SETTINGS = EvalSettings(horizon=150, tolerance=0.02)
 def result(outcomes: list[bool], first_seed: int = 100, **changes: Any) -> EvalResult:
     episodes = tuple(
         EpisodeResult(
-            first_seed + i, good, good, steps=40 + i, ret=float(good), phase_at_end="AT_GOAL" if good else "CARRY"
+            first_seed + i, good, good, steps=40, ret=float(good), phase_at_end="AT_GOAL" if good else "CARRY"
         )
         for i, good in enumerate(outcomes)
     )
@@ -40,7 +43,7 @@ def test_the_keys_are_the_contracts():
         **{"horizon": 150, "tolerance": 0.02, "control_hz": 20, "success_steps": 5},
         **{"hold": None, "suite": "nominal", "conditions": [{"name": "nominal"}]},
     }
-    assert data["by_condition"] == {}  # nothing says which it met
+    assert data["by_condition"] == {}  # no episode names its own
     assert (data["interval_method"], data["until_width"]) == ("Wilson's score interval", None)
     assert data["success_rate"] == 2 / 3
     assert data["interval"] == list(wilson_interval(2, 3))
@@ -62,13 +65,15 @@ def test_json_keeps_every_bit(outcomes: list[bool], ret: float):
     assert EvalResult.from_json(json.loads(json.dumps(made.to_json()))) == made
 
 
-def test_success_is_told_by_the_condition_that_an_episode_met():
+def test_success_is_split_by_condition_in_the_order_of_the_settings():
     made = result([True, False, True, True])
     named = tuple(replace(one, detail={"condition": "ab"[i % 2]}) for i, one in enumerate(made.episodes))
     conditions = tuple(Condition(name, mass=(0.1, 0.2)) for name in "ba")
     suite = replace(made, episodes=named, settings=replace(SETTINGS, suite="mine", conditions=conditions))
-    assert {name: (one.successes, one.n) for name, one in suite.by_condition.items()} == {"b": (1, 2), "a": (2, 2)}
-    assert list(suite.by_condition) == ["b", "a"]
+    parts = suite.to_json()["by_condition"]
+    assert [(name, part["success_rate"], part["n_episodes"]) for name, part in parts.items()] == [
+        *(("b", 0.5, 2), ("a", 1.0, 2))
+    ]
     assert EvalResult.from_json(json.loads(json.dumps(suite.to_json()))) == suite
     assert "mass 0.1 to 0.2" in suite.settings.disturbance
 
@@ -98,32 +103,72 @@ def test_steps_to_success_counts_the_episodes_that_succeeded():
     assert replace(made, episodes=episodes).steps_to_success == 15.5
 
 
+ODD_VALUES = {
+    ("episodes", 0, "seed"): [-5, 2**80, 1.5, None, "5", True],
+    ("episodes", 0, "success"): [1, None, "true"],
+    ("episodes", 0, "steps"): [-1, 10**9, 0.5, None, True],
+    ("episodes", 0, "return"): ["much", None, []],
+    ("episodes", 0, "phase_at_end"): [1, "x" * 100_000],
+    ("episodes", 0, "steps_to_success"): [-1, "x", [1]],
+    ("episodes", 0, "condition"): [1, []],
+    ("episodes", 0, "drawn"): [1, [1]],
+    ("episodes", 0): [None, [], 5],
+    ("episodes",): [None, {}, 5, []],
+    ("settings", "horizon"): [10**9, 0, -1, None, "100", True],
+    ("settings", "tolerance"): [-1, 2, None, "x"],
+    ("settings", "control_hz"): [0, 10**9],
+    ("settings", "success_steps"): [0, 10**9],
+    ("settings", "hold"): [-1, 10**9, "x"],
+    ("settings", "conditions"): [{}, [1], [{}], [{"name": "../x"}], [{"name": "a", "knock": 10**400}]],
+    ("settings",): [None, [], 5],
+    ("robot",): ["../x", None, 5],
+    ("task",): ["a/b", None],
+    ("policy",): [None, 5, "x" * 100_000],
+    ("fingerprint",): [None, [], "x"],
+    ("confidence",): [0, 2, None, "x"],
+    ("until_width",): [-1, 2, "x"],
+    ("n_episodes",): [2**80, "x" * 100_000, []],
+}
+
+
+def refusal(path: Path, text: str) -> str:
+    """The error of reading `text`, one short line that names the file."""
+    path.write_text(text)
+    with pytest.raises(ManipError) as raised:
+        EvalResult.read(path)
+    message = str(raised.value)
+    assert len(message) < 1_000
+    assert "\n" not in message
+    assert str(path) in message
+    return message
+
+
+@pytest.mark.parametrize("place", ODD_VALUES, ids=lambda place: ".".join(map(str, place)))
+def test_an_odd_value_is_one_short_line(tmp_path: Path, place: tuple[str | int, ...]):
+    for value in ODD_VALUES[place]:
+        data: Any = result([True]).to_json()
+        holder = data
+        for key in place[:-1]:
+            holder = holder[key]
+        holder[place[-1]] = value
+        message = refusal(tmp_path / "eval.json", json.dumps(data))
+        assert place[0] != "episodes" or "not an eval.json" in message
+
+
 @pytest.mark.parametrize(
-    ("content", "complaint"),
+    ("text", "complaint"),
     [
         ("", "not valid JSON"),
         ('{"success_rate": 0.5, "epis', "not valid JSON"),
+        ("[" * 100_000, ""),
+        (json.dumps(result([True]).to_json()).replace("1.0", "NaN"), ""),
         ("[]", "expected an object"),
         ("{}", "is missing"),
+        ('{"a": 1}', "is missing"),
     ],
 )
-def test_a_broken_file_is_named_with_what_is_wrong(tmp_path: Path, content: str, complaint: str):
-    path = tmp_path / "eval.json"
-    path.write_text(content)
-    with pytest.raises(ManipError, match=complaint) as caught:
-        EvalResult.read(path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("seed", "1"), ("success", 1), ("steps", 1.5), ("steps", True), ("return", "much")]
-)
-def test_a_value_of_the_wrong_kind_is_refused(tmp_path: Path, key: str, value: object):
-    data = result([True]).to_json()
-    data["episodes"][0][key] = value
-    (tmp_path / "eval.json").write_text(json.dumps(data))
-    with pytest.raises(ManipError, match=r"not an eval\.json"):
-        EvalResult.read(tmp_path)
+def test_what_is_no_eval_json_is_one_short_line(tmp_path: Path, text: str, complaint: str):
+    assert complaint in refusal(tmp_path / "eval.json", text)
 
 
 def test_a_file_that_lost_episodes_is_refused(tmp_path: Path):
@@ -160,3 +205,55 @@ def test_unlike_results_are_not_compared():
         compare_results(result([True]), result([True], policy="act", task="push"))
     with pytest.raises(MismatchError, match="settings"):
         compare_results(result([True]), result([True], settings=replace(SETTINGS, suite="knocked")))
+
+
+def part(first: int, outcomes: list[bool], **changes: Any) -> EvalResult:
+    return result(outcomes, first, policy_sha256=changes.pop("policy_sha256", "ab"), **changes)
+
+
+def test_parts_in_any_order_are_the_whole():
+    outcomes = [True, False, True, True, False, True]
+    whole = part(10, outcomes)
+    parts = {"c": part(14, outcomes[4:]), "a": part(10, outcomes[:3]), "b": part(13, outcomes[3:4])}
+    merged = merge_results(parts)
+    assert merged == whole
+    assert (merged.success.successes, merged.success.n) == (4, 6)
+
+
+def test_a_policy_is_the_same_wherever_it_lay():
+    assert merge_results({"a": part(0, [True]), "b": part(1, [True], policy="/policy/x")}).success.n == 2
+    without_files = {
+        name: part(i, [True], policy=name, policy_sha256="") for i, name in enumerate(["expert", "random"])
+    }
+    with pytest.raises(MismatchError, match="policy differs"):
+        merge_results(without_files)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"policy_sha256": "cd"}, "policy_sha256"),
+        ({"robot": "fetch"}, "robot"),
+        ({"task": "lift"}, "task"),
+        ({"settings": EvalSettings(100, 0.05)}, "settings"),
+        ({"settings": EvalSettings(100, 0.02, conditions=(Condition("k", mass=(0.1, 0.2)),))}, "settings"),
+    ],
+)
+def test_what_differs_is_named_with_both_sides(changes, what):
+    with pytest.raises(MismatchError, match=f"{what} differs: a has .*, b has"):
+        merge_results({"a": part(0, [True]), "b": part(1, [True], **changes)})
+
+
+def test_parts_that_do_not_add_up_are_refused_by_name():
+    with pytest.raises(ManipError, match="seed 2 is in a and in b"):
+        merge_results({"a": part(0, [True] * 3), "b": part(2, [True])})
+    with pytest.raises(ManipError, match="b stopped by --until_width"):
+        merge_results({"a": part(0, [True]), "b": part(1, [True], until_width=0.1)})
+    with pytest.raises(ManipError, match="no evaluations"):
+        merge_results({})
+
+
+def test_no_episode_is_longer_than_the_longest():
+    assert EnvConfig(horizon=LONGEST_EPISODE).horizon == LONGEST_EPISODE
+    with pytest.raises(UsageError, match="horizon is 1000000000; expected at most 10000 control steps"):
+        EnvConfig(horizon=10**9)

@@ -8,11 +8,11 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.rounds import (
     Rule,
     budget,
-    choose,
     curve_points,
     first_reaching,
     history,
     largest_dip,
+    select_round,
 )
 
 SUCCESS = (0.5, 0.9, 0.8, 0.9, 0.7)
@@ -41,7 +41,6 @@ def test_wall_clock_adds_up_without_validating():
     assert RUN[-1].validating == 500
     assert (RUN[2].labels, RUN[2].queries, RUN[2].episodes) == (300, 305, 9)
     assert str(RUN[1].validation) == "90.0 % [59.6, 98.2]"
-    assert RUN[1].words == "round 1: 200 labels, 6 episodes, 20.0 s"
 
 
 def test_the_order_of_the_lines_does_not_matter():
@@ -65,8 +64,8 @@ def test_lines_that_are_no_runs_are_refused_by_name(lines, words):
 
 
 def test_best_is_the_later_of_equals_and_last_is_last():
-    assert choose(Rule("best"), RUN, None, "x").round == 3
-    assert choose(Rule("last"), RUN, None, "x").round == 4
+    assert select_round(Rule("best"), RUN, None, "x").round == 3
+    assert select_round(Rule("last"), RUN, None, "x").round == 4
 
 
 @pytest.mark.parametrize(
@@ -75,7 +74,7 @@ def test_best_is_the_later_of_equals_and_last_is_last():
 def test_rounds_count_up_to_the_amount(at: str, best: int, last: int):
     for checkpoint, expected in (("best", best), ("last", last)):
         rule = Rule.parse(checkpoint, at)
-        assert choose(rule, RUN, budget(rule, [RUN]), "x").round == expected
+        assert select_round(rule, RUN, budget(rule, [RUN]), "x").round == expected
 
 
 def test_without_an_amount_it_is_what_every_run_reached():
@@ -83,13 +82,13 @@ def test_without_an_amount_it_is_what_every_run_reached():
     amounts = {at: budget(Rule.parse("last", at), [RUN, shorter]) for at in ("end", "labels", "episodes", "seconds")}
     assert amounts == {"end": None, "labels": 360, "episodes": 9, "seconds": 50}
     rule = Rule.parse("last", "seconds")
-    assert [choose(rule, run, 50, "x").round for run in (RUN, shorter)] == [4, 0]
+    assert [select_round(rule, run, 50, "x").round for run in (RUN, shorter)] == [4, 0]
 
 
 def test_an_amount_that_no_round_is_within_or_not_every_run_reached_is_refused():
     rule = Rule.parse("best", "labels:99")
     with pytest.raises(UsageError, match=r"runs/x has no round within 99 labels; its first took 100 labels"):
-        choose(rule, RUN, budget(rule, [RUN]), "runs/x")
+        select_round(rule, RUN, budget(rule, [RUN]), "runs/x")
     with pytest.raises(UsageError, match="one ended at 500 labels"):
         budget(Rule.parse("best", "labels:527"), [RUN])
     assert budget(Rule.parse("best", "labels:526"), [RUN]) == 526  # rounds do not end on the dot
@@ -123,3 +122,23 @@ def test_the_curve_holds_all_that_a_round_had_cost():
     point = curve_points(RUN)[2]
     assert (point.labels, point.episodes, point.seconds, point.name) == (300, 9, 30.0, "round 2")
     assert point.success == RUN[2].validation
+
+
+ODD = (None, True, -5, 2**80, 10**9, 0.5, "x" * 100_000, [], {}, [[]] * 1_000, {"a": {"a": 1}})
+VALID = dict.fromkeys(("labels", "queries", "episodes", "validation_episodes"), 10**9) | {"validation_success": 0.5}
+
+
+@pytest.mark.parametrize("key", [key for key in records()[0] if key != "round"])
+def test_an_odd_value_is_one_short_line(key: str):
+    for value in ODD:
+        if key in VALID and value == VALID[key]:
+            continue
+        with pytest.raises(ManipError) as raised:
+            history([records()[0] | {key: value}], "run")
+        assert len(str(raised.value)) < 1_000
+
+
+@pytest.mark.parametrize("value", ODD)
+def test_a_line_of_no_round_is_one_short_line(value: object):
+    with pytest.raises(ManipError, match=r"run: metrics\.jsonl has no round 0"):
+        history([records()[0] | {"round": value}], "run")

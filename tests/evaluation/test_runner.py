@@ -149,9 +149,9 @@ def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     found = evaluate(engine, job, range(10_000), "coin", until_width=0.05)
     low, high = found.success.interval
     assert high - low <= 0.05
-    assert len(found.episodes) % runner.LOOK_EVERY == 0
+    assert len(found.episodes) % runner.CHECK_EVERY == 0
     shorter = EvalResult(
-        "coin", "fetch", "pick_place", {}, found.episodes[: -runner.LOOK_EVERY], found.settings, until_width=0.05
+        "coin", "fetch", "pick_place", {}, found.episodes[: -runner.CHECK_EVERY], found.settings, until_width=0.05
     )
     assert shorter.success.interval[1] - shorter.success.interval[0] > 0.05
     assert [episode.seed for episode in found.episodes] == list(range(len(found.episodes)))

@@ -1,4 +1,4 @@
-"""Intervals and tests agree with published tables and keep their defining properties."""
+"""Intervals agree with published tables and keep their defining properties."""
 
 import math
 import random
@@ -7,21 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import ManipError, UsageError
-from manip_il.evaluation.statistics import (
+from manip_il.errors import UsageError
+from manip_il.evaluation.intervals import (
     Proportion,
-    compare_paired,
     confidence_sequence,
-    format_p,
-    mcnemar_exact,
-    mcnemar_exact_counts,
-    paired_difference_interval,
+    mean_interval,
+    t_quantile,
     wilson_interval,
 )
 
 counts = st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
-outcomes = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=60)
 confidences = st.sampled_from([0.5, 0.8, 0.9, 0.95, 0.99])
+rates = st.lists(st.floats(-1, 1), min_size=2, max_size=8)
 
 
 @pytest.mark.parametrize(
@@ -87,84 +84,6 @@ def test_a_confidence_in_percent_is_refused():
         wilson_interval(1, 2, confidence=95)
 
 
-@pytest.mark.parametrize(
-    ("only_a", "only_b", "p"),
-    [(1, 7, 18 / 256), (0, 5, 2 / 32), (0, 6, 2 / 64), (3, 3, 1.0), (0, 0, 1.0), (10, 2, 2 * 79 / 4096)],
-)
-def test_mcnemar_is_the_exact_binomial(only_a: int, only_b: int, p: float):
-    assert mcnemar_exact_counts(only_a, only_b) == pytest.approx(p, rel=1e-12)
-
-
-@given(outcomes)
-def test_mcnemar_is_a_probability_and_symmetric(pairs: list[tuple[bool, bool]]):
-    a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    assert 0 < mcnemar_exact(a, b) <= 1
-    assert mcnemar_exact(a, b) == mcnemar_exact(b, a)
-    assert mcnemar_exact(a, a) == 1
-
-
-def test_mcnemar_survives_counts_beyond_floating_point():
-    assert 0 < mcnemar_exact_counts(1_000, 1_100) < 1  # 2 to the 2100: a float ends at 2 to the 1024
-
-
-@pytest.mark.parametrize(
-    ("table", "low", "high"),
-    [
-        # Fagerland, Lydersen, Laake (2014), Statistics in Medicine 33, 2850-2875: both worked examples
-        ((1, 1, 7, 12), -0.507, -0.026),
-        ((59, 6, 16, 80), -0.1186, -0.0046),
-        # Altman et al. (2000), Statistics with Confidence, table 6.2
-        ((14, 5, 0, 22), 0.011, 0.226),
-    ],
-)
-def test_newcombes_paired_interval_agrees_with_worked_examples(
-    table: tuple[int, int, int, int], low: float, high: float
-):
-    digits = 5e-5 if round(low, 3) != low else 5e-4
-    assert paired_difference_interval(*table) == pytest.approx((low, high), abs=digits)
-
-
-@given(outcomes, confidences)
-def test_the_paired_interval_contains_the_difference_and_changes_sign_with_the_order(
-    pairs: list[tuple[bool, bool]], confidence: float
-):
-    a, b = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-    forward, backward = compare_paired(a, b, confidence=confidence), compare_paired(b, a, confidence=confidence)
-    low, high = forward.interval
-    assert -1 <= low <= forward.difference <= high <= 1
-    assert backward.interval == pytest.approx((-high, -low), abs=1e-12)
-    assert forward.difference == pytest.approx(forward.right_rate.rate - forward.left_rate.rate)
-
-
-def test_the_verdict_names_the_better_policy_and_its_margin():
-    left, right = [True] * 60 + [False] * 40, [True] * 100
-    verdict = compare_paired(left, right, ("BC", "DAgger")).verdict
-    assert verdict.startswith("DAgger beats BC: +40.0 points")
-    assert "p < 0.001" in verdict
-    assert compare_paired(right, left, ("DAgger", "BC")).verdict.startswith("DAgger beats BC: -40.0 points")
-
-
-def test_a_small_difference_is_not_called_one():
-    verdict = compare_paired([True, False, True], [True, True, True], ("BC", "DAgger")).verdict
-    assert verdict.startswith("No difference shown between DAgger and BC")
-
-
-def test_equal_outcomes_are_called_equal():
-    assert "exactly the same episodes" in compare_paired([True, False], [True, False]).verdict
-
-
-def test_unpaired_lengths_are_refused_with_both():
-    with pytest.raises(ManipError, match=r"2 episodes of A with 1 of B"):
-        compare_paired([True, False], [True])
-    with pytest.raises(ManipError, match="no episodes"):
-        compare_paired([], [])
-
-
-def test_p_values_read_well():
-    assert format_p(0.03125) == "p = 0.031"
-    assert format_p(1e-9) == "p < 0.001"
-
-
 def test_a_confidence_sequence_holds_at_every_look_where_wilsons_does_not():
     rng = random.Random(0)
     for p in (0.6, 0.97):
@@ -211,3 +130,42 @@ def test_the_edge_of_a_confidence_sequence_is_where_the_bet_reaches_twenty():
     mixture = sum(w * x for w, x in zip(prior, likelihood, strict=True)) / sum(prior)
     for edge in confidence_sequence(successes, n):
         assert mixture / (edge**successes * (1 - edge) ** (n - successes)) == pytest.approx(20, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "degrees", "t"),
+    [  # Abramowitz & Stegun (1964), table 26.10
+        (0.95, 1, 12.706),
+        (0.95, 2, 4.303),
+        (0.95, 4, 2.776),
+        (0.99, 3, 5.841),
+        (0.99, 10, 3.169),
+        (0.90, 7, 1.895),
+        (0.95, 120, 1.980),
+    ],
+)
+def test_t_agrees_with_the_table(confidence: float, degrees: int, t: float):
+    assert t_quantile(confidence, degrees) == pytest.approx(t, abs=5e-4)
+
+
+def test_with_one_degree_of_freedom_t_is_cauchys():
+    assert t_quantile(0.8, 1) == pytest.approx(math.tan(0.8 * math.pi / 2), rel=1e-12)
+
+
+def test_the_interval_of_a_mean_worked_by_hand():
+    low, high = mean_interval([0.01, 0.02, 0.03])
+    assert (low, high) == pytest.approx(
+        (0.02 - 4.3027 * 0.01 / math.sqrt(3), 0.02 + 4.3027 * 0.01 / math.sqrt(3)), 1e-4
+    )
+
+
+@given(rates)
+def test_the_interval_contains_the_mean_and_turns_with_the_sign(values: list[float]):
+    low, high = mean_interval(values)
+    assert low <= sum(values) / len(values) + 1e-12
+    assert mean_interval([-value for value in values]) == pytest.approx((-high, -low), abs=1e-9)
+
+
+def test_one_training_seed_has_no_interval():
+    with pytest.raises(UsageError, match="1 training seed"):
+        mean_interval([0.1])

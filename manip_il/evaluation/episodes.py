@@ -1,0 +1,230 @@
+"""One episode of `eval.json`, and the settings that all its episodes share.
+
+Places, condition and drawn numbers are optional: files of older versions and of other tools may lack them, or hold
+something else under the same name, which is then ignored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from manip_il import checks
+from manip_il.mdp import LONGEST_EPISODE
+from manip_il.sim.conditions import NOMINAL, Condition
+
+if TYPE_CHECKING:
+    from manip_il.engine.jobs import RolloutJob
+    from manip_il.sim.env import EnvConfig
+
+Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
+
+_HZ, _SUCCESS_STEPS = 20, 5  # of files without them
+_MOST_CONDITIONS = 100  # of a suite
+_UNITS = {
+    "knock": "m",
+    "knock_step": "steps",
+    "joint_noise": "rad",
+    "position_noise": "m",
+    "delay": "steps",
+    "mass": "kg",
+    "size": "m",
+    "camera_shift": "m",
+    "camera_turn": "deg",
+    "light_turn": "deg",
+}
+_COMPONENTS = {"colour": ("red", "green", "blue")}  # of other vectors, the length counts
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """One episode: `success` at some time, `success_at_end` at the last frame, `ret` the sum of rewards.
+
+    steps: control steps until the episode ended. phase_at_end: the expert's name for the last state.
+    detail: further keys of the JSON object.
+    """
+
+    seed: int
+    success: bool
+    success_at_end: bool
+    steps: int
+    ret: float
+    phase_at_end: str = ""
+    detail: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def condition(self) -> str:
+        """The condition's name; empty where none is given."""
+        name = self.detail.get("condition")
+        return name if isinstance(name, str) else ""
+
+    @property
+    def start(self) -> Place | None:
+        """Start of the object, or of the hand where the task has no object [m]."""
+        return self._moving_thing("start")
+
+    @property
+    def end(self) -> Place | None:
+        """End of the same [m]."""
+        return self._moving_thing("end")
+
+    @property
+    def goal(self) -> Place | None:
+        """Goal of the same [m]."""
+        return _place(self.detail.get("goal"))
+
+    @property
+    def drawn_numbers(self) -> dict[str, float]:
+        """Every drawn number by its name and unit, `mass [kg]`: components of a colour, lengths of other vectors."""
+        drawn = self.detail.get("drawn")
+        if not isinstance(drawn, Mapping):
+            return {}
+        return {
+            name: value
+            for key, given in drawn.items()
+            for name, value in _numbers(str(key), given, _UNITS.get(str(key)))
+            if math.isfinite(value)
+        }
+
+    def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
+        places = self.detail.get(when)
+        return _place(places.get("object", places.get("hand"))) if isinstance(places, Mapping) else None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the episode as `eval.json` holds it."""
+        own = {
+            "seed": self.seed,
+            "success": self.success,
+            "success_at_end": self.success_at_end,
+            "steps": self.steps,
+            "return": self.ret,
+            "phase_at_end": self.phase_at_end,
+        }
+        return own | {key: value for key, value in self.detail.items() if key not in own}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
+        data = checks.mapping("an episode", data)
+        known = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")
+        detail = {key: value for key, value in data.items() if key not in known}
+        if detail.get("steps_to_success") is not None:
+            checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
+        if "condition" in detail:
+            checks.text("condition", detail["condition"], checks.LONGEST_NAME)
+        if "drawn" in detail:
+            checks.mapping("drawn", detail["drawn"])
+        return cls(
+            seed=checks.whole("seed", data["seed"], 0, checks.LARGEST_SEED),
+            success=checks.truth("success", data["success"]),
+            success_at_end=checks.truth("success_at_end", data.get("success_at_end", data["success"])),
+            steps=checks.whole("steps", data["steps"], 0, LONGEST_EPISODE),
+            ret=checks.number("return", data["return"]),
+            phase_at_end=checks.text("phase_at_end", data.get("phase_at_end", ""), checks.LONGEST_NAME),
+            detail=detail,
+        )
+
+
+def moving_thing(episodes: Sequence[EpisodeResult]) -> Literal["object", "hand"]:
+    """Return what is to reach the goal: the hand where episodes have starts, but none of an object."""
+    starts = [start for one in episodes if isinstance(start := one.detail.get("start"), Mapping)]
+    return "object" if not starts or any(_place(start.get("object")) is not None for start in starts) else "hand"
+
+
+@dataclass(frozen=True, slots=True)
+class EvalSettings:
+    """The settings that two evaluations must share to be compared, and that repeating an episode needs.
+
+    horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
+    of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
+    where it goes on to the horizon.
+    """
+
+    horizon: int
+    tolerance: float
+    control_hz: int = _HZ
+    success_steps: int = _SUCCESS_STEPS
+    suite: str = NOMINAL.name
+    conditions: tuple[Condition, ...] = (NOMINAL,)
+    hold: int | None = None
+
+    @classmethod
+    def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
+        """Return those of a job whose conditions are called `suite`."""
+        env, conditions = job.env, job.conditions or (NOMINAL,)
+        return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions, job.hold)
+
+    def env(self, robot: str, task: str) -> EnvConfig:
+        """Return the environment that was evaluated in."""
+        from manip_il.sim.env import EnvConfig  # here, as reading results needs no simulator
+
+        return EnvConfig(robot, task, self.control_hz, self.tolerance, self.success_steps, self.horizon)
+
+    @property
+    def disturbance(self) -> str:
+        """The conditions in words, `none` where all are nominal."""
+        return "; ".join(map(str, self.conditions)) if any(one.ranges for one in self.conditions) else "none"
+
+    def __str__(self) -> str:
+        rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
+        ends = "" if self.hold is None else f", ended {self.hold} steps after success"
+        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "horizon": self.horizon,
+            "tolerance": self.tolerance,
+            "control_hz": self.control_hz,
+            "success_steps": self.success_steps,
+            "hold": self.hold,
+            "suite": self.suite,
+            "conditions": [condition.to_json() for condition in self.conditions],
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
+        """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
+        data = checks.mapping("settings", data)
+        given = checks.array("conditions", data.get("conditions", [NOMINAL.to_json()]), _MOST_CONDITIONS)
+        named = [checks.mapping("a condition", one) for one in given]
+        ranges = [{key: value for key, value in one.items() if key != "name"} for one in named]
+        steps = data.get("success_steps", _SUCCESS_STEPS)
+        return cls(
+            horizon=checks.whole("horizon", data["horizon"], 1, LONGEST_EPISODE),
+            tolerance=checks.number("tolerance", data["tolerance"], 0, 1),
+            control_hz=checks.whole("control_hz", data.get("control_hz", _HZ), 1, 1_000),
+            success_steps=checks.whole("success_steps", steps, 1, LONGEST_EPISODE),
+            suite=checks.text("suite", data.get("suite", NOMINAL.name)),
+            conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
+            hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
+        )
+
+
+def _numbers(name: str, given: Any, unit: str | None) -> Iterator[tuple[str, float]]:
+    if isinstance(given, Mapping):  # one value a camera
+        for key, value in given.items():
+            yield from _numbers(f"{name} {key}", value, unit)
+    elif _is_number(given):
+        yield name + (f" [{unit}]" if unit else ""), float(given)
+    elif isinstance(given, Sequence) and not isinstance(given, str) and given and all(map(_is_number, given)):
+        components = _COMPONENTS.get(name, ())
+        if len(components) == len(given):
+            yield from ((f"{name}, {part}", float(value)) for part, value in zip(components, given, strict=True))
+        else:
+            yield name + (f" [{unit}]" if unit else ", length"), math.hypot(*given)
+
+
+def _place(given: Any) -> Place | None:
+    if not isinstance(given, Sequence) or isinstance(given, str) or len(given) != 3:
+        return None
+    if not all(_is_number(value) and math.isfinite(value) for value in given):
+        return None
+    x, y, z = given
+    return float(x), float(y), float(z)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,67 @@
+"""Tables show the same numbers on a terminal, in a pipe and in Markdown."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from manip_il.errors import ManipError
+from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.report_data import PolicyRow
+from manip_il.evaluation.tables import Table, evaluation_lines, evaluation_table, policy_table, print_table
+
+from .made_evals import made_eval
+
+ROWS = [
+    PolicyRow("Expert", Proportion(199, 200), kind="expert"),
+    PolicyRow("BC [mlp]", Proportion(171, 200), 1234, Proportion(160, 200), 70.5, kind="cloning"),
+]
+
+
+def printed(table: Table, terminal: bool, width: int = 140) -> str:
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=terminal, width=width, highlight=False, color_system="256")
+    print_table(table, console, empty="-")
+    return file.getvalue()
+
+
+def test_a_pipe_gets_plain_lines_one_a_policy_without_empty_columns():
+    text = printed(policy_table(ROWS), terminal=False, width=40)
+    assert "\x1b" not in text
+    line = next(line for line in text.splitlines() if "BC [mlp]" in line)
+    for number in (str(ROWS[1].success), "1,234", "70.5"):
+        assert number in line
+    assert "disturbed" not in text
+    expert = [cell.strip() for cell in text.splitlines()[3].strip("|").split("|")]
+    assert expert == ["Expert", "-", str(ROWS[0].success), "-", "-"]
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_a_terminal_gets_colour_and_whole_numbers(width: int):
+    out = printed(policy_table(ROWS), terminal=True, width=width)
+    assert "\x1b[" in out
+    assert "85.5 %" in out
+    assert "[80.0, 89.7]" in out
+
+
+def test_an_evaluation_has_a_row_for_each_condition_after_that_of_all():
+    result = made_eval()
+    table = evaluation_table(result)
+    assert [row[0] for row in table.rows] == ["runs/a/best", "  nominal", "  knocked", "  sensing"]
+    assert table.rows[0][1:4] == ("120", str(result.success), str(result.success_at_end))
+    assert table.rows[2][2] == str(result.by_condition["knocked"].success)
+    assert len(evaluation_table(made_eval(conditions=("nominal",))).rows) == 1
+    assert evaluation_lines(result)[0].startswith("failures by the phase that they ended in: descend ")
+    assert evaluation_lines(made_eval(fails=lambda *_: False)) == []
+
+
+def test_a_table_in_markdown_escapes_what_would_break_it():
+    table = Table(("a", "b", "c"), (("x|y", "", "1"), ("z", "", "2")))
+    assert table.filled().markdown() == "| a | c |\n|---|--:|\n| x\\|y | 1 |\n| z | 2 |\n"
+    with pytest.raises(ManipError, match="has 1 cells, its head 2"):
+        Table(("a", "b"), (("x",),))
+
+
+def test_columns_are_aligned():
+    lines = Table(("head", "a"), (("x", "1234"), ("longer", "5"))).aligned_lines()
+    assert lines == ["head       a", "------------", "x       1234", "longer     5"]
