@@ -14,7 +14,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
-from manip_il.errors import MismatchError, NotFiniteError, UsageError
+from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.limits import threads
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
