@@ -36,7 +36,7 @@ def clone_with_labels(
     table = read_table(folder / "dataset", LEARNING_COLUMNS)
     so_far = np.cumsum(table[LABEL_VALID])
     rows = int(np.searchsorted(so_far, labels)) + 1
-    stages.start("cloning with as many labels, fit", round_fit(config, False).total_steps)
+    stages.start("cloning with as many labels, fit", round_fit(config).total_steps)
     table = {key: column[:rows] for key, column in table.items()}
     policy = fit_table(config, table, folder / "policy", on_log=stages.log)
     stages.close()

@@ -134,9 +134,9 @@ def policy_help(words: Iterable[str]) -> str:
     kind = next((word.partition("=")[2] for word in words if word.startswith("--policy.type=")), "")
     if not kind:
         return ""
-    from manip_il.learn.lerobot_config import option_lines, policy_class
+    from manip_il.learn.lerobot_config import option_lines
 
-    rows = option_lines(policy_class(kind), "policy")
+    rows = option_lines(kind)
     width = max(len(left) for left, _ in rows) + 2
     lines = "\n".join(f"  {left:{width}}[{right}]" for left, right in rows)
     return f"\n\noptions of {kind}:\n{lines}"

@@ -33,8 +33,8 @@ class Shot:
         from manip_il.evaluation.report_data import Strip
         from manip_il.sim.conditions import NOMINAL, draw
 
-        appearance = draw(self.job.conditions or (NOMINAL,), self.episode.seed).appearance
-        frames = film(self.episode, self.job.env, every=FILM_EVERY, appearance=appearance)
+        drawn = draw(self.job.conditions or (NOMINAL,), self.episode.seed)
+        frames = film(self.episode, self.job.env, every=FILM_EVERY, drawn=drawn)
         fps = self.job.env.control_hz // FILM_EVERY or 1
         made = make_film(self.title, frames, fps, self.caption, success=self.success)
         return made, Strip(self.title, strip(frames, fps), self.caption)

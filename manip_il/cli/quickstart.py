@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import Kind, PolicyRow
+    from manip_il.evaluation.results import EvalResult
 
 POLICY_TYPES = ("mlp",)
 TIMINGS_FILE = "timings.json"
