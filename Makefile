@@ -47,11 +47,12 @@ FUZZ ?= 20000
 fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --inputs=$(FUZZ)
 
-lint: setup  ## style, types and who may import whom
+lint: setup  ## style, types, who may import whom, and the form of docstrings
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python -m tests.house
 
 format: setup  ## put the code into shape
 	$(BIN)/ruff check --fix

@@ -23,7 +23,7 @@ from manip_il.algorithms.run import DATASET, round_folder
 from manip_il.algorithms.table import run_algorithm
 from manip_il.data.lerobot_read import read_table
 from manip_il.engine.engine import Engine, default_workers
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene

@@ -26,7 +26,7 @@ from _machine import describe_machine
 from numpy.typing import NDArray
 
 import manip_il.engine.jobs as jobs
-import manip_il.expert.expert as expert
+import manip_il.expert as expert
 import manip_il.learn.train as train
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm

@@ -21,7 +21,7 @@ import qpsolvers
 from _machine import describe_machine
 
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import State
 from manip_il.robots import ik
 from manip_il.robots.robot import ROBOTS

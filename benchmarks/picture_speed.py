@@ -21,13 +21,13 @@ from contextlib import closing
 import mujoco
 from _machine import describe_machine
 
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import State
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim import render
+from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.look import CAMERAS, FILM, CameraConfig, Look
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # of one expert episode, evenly apart

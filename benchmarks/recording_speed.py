@@ -35,8 +35,8 @@ from manip_il.engine.jobs import RolloutJob
 from manip_il.recording import collect, provenance
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig
 from manip_il.sim.render import pictures
 
 HOLD = 10  # as `manip-il record`

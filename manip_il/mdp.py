@@ -6,8 +6,10 @@ over joints have length `n` = arm joints + 1: arm [rad], gripper opening [m].
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,3 +167,31 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
     row = int(np.argwhere(~np.isfinite(values))[0][0])
     where = f"frame {row}" if values.ndim > 1 else f"index {row}"
     raise NotFiniteError(f"{what}: {values[row]} at {where} is not finite")
+
+
+Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
+
+
+class Policy(Protocol):
+    """Actions from joint states (B, n), environment states (B, k) and pictures, for many episodes at once."""
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """Names of the cameras whose pictures it takes."""
+        ...
+
+    def act(self, states: F32, environment_states: F32, images: Images, episodes: Sequence[int]) -> F64:
+        """Return one absolute action a row, (B, n). episodes: whose row each is."""
+        ...
+
+    def reset(self, episodes: Sequence[int]) -> None:
+        """Forget the past of episodes that begin."""
+        ...
+
+    def sample(self, states: F32, environment_states: F32, images: Images, rngs: Sequence[np.random.Generator]) -> F64:
+        """Draw one absolute action a row, (B, n), each from its own generator; `UsageError` without a distribution."""
+        ...
+
+    def log_prob(self, states: F32, environment_states: F32, images: Images, actions: F64) -> F64:
+        """Return how likely each row's action (B, n) is [nats], (B,); `UsageError` without a distribution."""
+        ...

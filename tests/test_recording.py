@@ -17,8 +17,8 @@ from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.recording import check_journals, collect, collect_successes, record
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig
 
 from .damage import digests
 

@@ -1,19 +1,121 @@
-"""Options of one run of an algorithm, checked against each other."""
+"""Options of one run of an algorithm: who drives, what is learnt from, and all of it checked against each other."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
 
-from manip_il.algorithms.beta import BetaSchedule
-from manip_il.algorithms.sampling import Sampling
-from manip_il.engine.drivers import QueryRule
-from manip_il.errors import UsageError
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
+from manip_il.engine.drivers import QueryRule, action_gap
+from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.mdp import Actor
 from manip_il.option import option
 from manip_il.seeding import MAX_ROUNDS
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.look import CameraConfig
+from manip_il.sim.config import CameraConfig, EnvConfig
+
+SCHEDULES = {
+    "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
+    "linear": "linear:5 falls evenly from 1 in round 0 to 0 in round 5",
+    "exponential": "exponential:0.5 is 0.5 to the power of the round",
+}
+
+
+@dataclass(frozen=True)
+class BetaSchedule:
+    """`kind:parameter`, as in `constant:0`, `linear:5`, `exponential:0.5`. Round 0 is the expert's own: beta is 1.
+
+    Raises `UnknownName` for the kind, `UsageError` for a parameter out of range.
+    """
+
+    kind: str
+    parameter: float
+
+    def __post_init__(self) -> None:
+        if self.kind not in SCHEDULES:
+            raise UnknownName("beta schedule", self.kind, SCHEDULES)
+        if not (self.parameter >= 1 if self.kind == "linear" else 0 <= self.parameter <= 1):
+            expected = "at least 1 round" if self.kind == "linear" else "0 to 1"
+            raise UsageError(f"beta is '{self}'; expected {expected} after {self.kind}:")
+
+    @classmethod
+    def parse(cls, text: str) -> BetaSchedule:
+        """Read what `str` writes; `UsageError` also for a parameter that is missing or no number."""
+        kind, _, parameter = text.partition(":")
+        number = _number(parameter)
+        if kind not in SCHEDULES and _number(text) is not None:
+            raise UsageError(f"beta is {text!r}; expected constant:{text}, linear:ROUNDS or exponential:B")
+        if kind in SCHEDULES and number is None:
+            raise UsageError(f"beta is {text!r}; expected {kind}:NUMBER ({SCHEDULES[kind]})")
+        return cls(kind, number or 0.0)
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.parameter:g}"
+
+    def __call__(self, round_: int) -> float:
+        """Return the probability that the expert drives a step of this round."""
+        if round_ == 0:
+            return 1.0
+        if self.kind == "constant":
+            return self.parameter
+        if self.kind == "linear":
+            return max(0.0, 1.0 - round_ / self.parameter)
+        return self.parameter**round_
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+F64 = NDArray[np.float64]
+COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
+CORRECTION = 0.25  # of the longest step: where expert and learner differ by more, the label corrects
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Relative weight of a frame. All equal: each frame once an epoch.
+
+    demonstrations: of round 0. corrections: of later rounds, where the expert drove or differed from who did by more
+    than `CORRECTION`. rollouts: the others of later rounds.
+    """
+
+    demonstrations: float = option(1.0, "weight of a frame of round 0")
+    corrections: float = option(1.0, "weight of a later frame where the expert drove or would have acted differently")
+    rollouts: float = option(1.0, "weight of the other later frames")
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not 0 <= value < np.inf:
+                raise UsageError(f"sampling.{one.name} is {value}; expected 0 or more")
+        if self.demonstrations == 0:
+            raise UsageError("sampling.demonstrations is 0, but round 0 has nothing else to learn from")
+
+    @property
+    def is_even(self) -> bool:
+        """Whether no kind is preferred."""
+        return self.demonstrations == self.corrections == self.rollouts
+
+    def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
+        """Return the weight of every frame of a table with `COLUMNS`, (N,); None where all are equal.
+
+        scale: see `action_gap`.
+        """
+        if self.is_even:
+            return None
+        gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
+        by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
+        later = np.where(by_expert | (gap > CORRECTION), self.corrections, self.rollouts)
+        return np.where(table[ROUND].reshape(-1) == 0, self.demonstrations, later).astype(np.float64)
+
 
 _AT_LEAST_1 = (
     *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble"),

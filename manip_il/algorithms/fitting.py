@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.algorithms import sampling
-from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.config import COLUMNS, RunConfig
 from manip_il.data.lerobot_read import read_tables
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
@@ -91,4 +90,4 @@ def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
     if config.sampling.is_even:
         return None
     scale = build_scene(config.env.robot, config.env.task).actions.scale
-    return config.sampling.weights(read_tables(roots, sampling.COLUMNS), scale)
+    return config.sampling.weights(read_tables(roots, COLUMNS), scale)

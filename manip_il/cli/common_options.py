@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.errors import UsageError
 from manip_il.option import option, option_of
-from manip_il.sim.config import EnvConfig
-from manip_il.sim.look import CameraConfig, Look
+from manip_il.sim.config import CameraConfig, EnvConfig, Look
 
 if TYPE_CHECKING:
     from manip_il.learn.checkpoint import CheckpointMeta

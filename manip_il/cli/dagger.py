@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.algorithms.config import RunConfig, check_cameras, check_labels
-from manip_il.algorithms.sampling import Sampling
+from manip_il.algorithms.config import RunConfig, Sampling, check_cameras, check_labels
 from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
 from manip_il.cli.common_options import (
     EnvOptions,
@@ -129,7 +128,7 @@ class DaggerOptions(EnvOptions):
 
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
-        from manip_il.algorithms.beta import BetaSchedule
+        from manip_il.algorithms.config import BetaSchedule
         from manip_il.engine.drivers import QueryRule
 
         made = {

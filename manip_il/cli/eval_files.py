@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.common_options import trust_option
-from manip_il.cli.films import Shot, condition_caption
 from manip_il.cli.inputs import check_policy, find_policy, require_eval
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, append_jsonl, atomic_write, open_output, read_jsonl, require_new
 from manip_il.cli.progress import say, warn
+from manip_il.cli.trials import Shot, condition_caption
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import option
 

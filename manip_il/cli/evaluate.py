@@ -19,12 +19,19 @@ from manip_il.cli.common_options import (
     workers_option,
 )
 from manip_il.cli.eval_files import EpisodeJournal
-from manip_il.cli.films import Pictures, Shot, condition_caption, film_shots
 from manip_il.cli.inputs import check_policy, find_policy, observation_text
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import SUITE_HELP, require_suite, suite_conditions
+from manip_il.cli.trials import (
+    SUITE_HELP,
+    Pictures,
+    Shot,
+    condition_caption,
+    film_shots,
+    require_suite,
+    suite_conditions,
+)
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 

@@ -94,8 +94,8 @@ def check_pictures(pictures: Mapping[str, Picture]) -> None:
 
 def _draw() -> str:
     """Draw and time the default scene; return renderer and speed."""
+    from manip_il.sim.config import CameraConfig
     from manip_il.sim.env import ManipEnv
-    from manip_il.sim.look import CameraConfig
     from manip_il.sim.render import pictures
 
     world, cameras = ManipEnv(), CameraConfig(_CAMERAS)

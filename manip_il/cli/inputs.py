@@ -19,8 +19,7 @@ if TYPE_CHECKING:  # the environment and the learner take a second to import
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import CheckpointMeta
     from manip_il.mdp import Observation
-    from manip_il.sim.config import EnvConfig
-    from manip_il.sim.look import CameraConfig
+    from manip_il.sim.config import CameraConfig, EnvConfig
 
 _POLICY_FOLDERS = (".", "pretrained_model", "best/pretrained_model", "checkpoints/last/pretrained_model")
 _NEWEST_POLICY = ("checkpoints/*/pretrained_model", "round_*/policy/checkpoints/*/pretrained_model")

@@ -19,11 +19,10 @@ from manip_il.cli.common_options import (
     workers_option,
 )
 from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timings, run_rounds
-from manip_il.cli.films import Pictures, Shot, film_shots
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import Trial, suite_conditions
+from manip_il.cli.trials import Pictures, Shot, Trial, film_shots, suite_conditions
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option, option_of
 

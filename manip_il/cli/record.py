@@ -30,7 +30,7 @@ from manip_il.cli.outputs import (
 from manip_il.cli.progress import Stages, progress, say, warn
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
-from manip_il.sim.look import Look
+from manip_il.sim.config import Look
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info, read_info
+from manip_il.data.parquet_files import UNREADABLE, Shard, find_shards, floats, integers
 from manip_il.data.pictures import Pictures, VideoReader, open_picture
-from manip_il.data.shards import UNREADABLE, Shard, find_shards, floats, integers
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` of the first

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info
+from manip_il.data.parquet_files import UNREADABLE, Shard
 from manip_il.data.pictures import open_picture, open_video
-from manip_il.data.shards import UNREADABLE, Shard
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, list_first, plural
 from manip_il.doctor.scan import F64, I64

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import NUMBERS, Info, InvalidInfo, read_info, read_object
-from manip_il.data.shards import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
 from manip_il.doctor.finding import Finding, error
 from manip_il.doctor.scan import F64, I64, Scan, concatenate, scan
 

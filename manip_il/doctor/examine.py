@@ -16,7 +16,7 @@ from manip_il.data.atomic import exclusive, write_file
 from manip_il.data.build import build
 from manip_il.data.info import Feature
 from manip_il.data.lerobot_stats import RunningStats
-from manip_il.data.shards import to_array
+from manip_il.data.parquet_files import to_array
 from manip_il.doctor.cameras import check_pictures, check_videos
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural

@@ -12,7 +12,7 @@ from manip_il.data.atomic import PARTIAL
 from manip_il.data.build import RECORDING, Recording
 from manip_il.data.episodes import Header
 from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.shards import NO_FOOTER
+from manip_il.data.parquet_files import NO_FOOTER
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, count_frames, error, list_first, plural, warning
 from manip_il.errors import ManipError

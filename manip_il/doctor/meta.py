@@ -12,7 +12,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
 from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature, read_object
-from manip_il.data.shards import UNREADABLE, read_tasks
+from manip_il.data.parquet_files import UNREADABLE, read_tasks
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, list_first, plural, warning
 from manip_il.errors import ManipError

@@ -9,7 +9,7 @@ import numpy as np
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
-from manip_il.data.shards import UNREADABLE, read_tasks
+from manip_il.data.parquet_files import UNREADABLE, read_tasks
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, Remedy, error, list_first, plural, warning
 from manip_il.doctor.meta import EPISODES

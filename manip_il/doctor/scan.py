@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, Info
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, to_array
 from manip_il.data.parquet_limits import check_parquet
-from manip_il.data.shards import UNREADABLE, BadColumn, Shard, to_array
 from manip_il.doctor.finding import Finding, error, plural
 
 I64 = NDArray[np.int64]

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.mdp import Actor
-from manip_il.policy import Policy
+from manip_il.mdp import Actor, Policy
 from manip_il.robots.action_space import ActionSpace
 from manip_il.rollout import Driver, Turn
 from manip_il.seeding import rng_for

@@ -17,8 +17,8 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import META_FILE, read_meta
 from manip_il.learn.pretrained import read_interface
 from manip_il.mdp import STATE_EXTRAS, State
+from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import EnvConfig, environment_state_names
-from manip_il.sim.look import CAMERAS, CameraConfig, Look
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
 from manip_il.tasks.table import get_task

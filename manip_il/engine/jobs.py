@@ -15,13 +15,13 @@ from manip_il.engine import drivers
 from manip_il.engine.drivers import LabelMode, QueryRule, drawn_step
 from manip_il.engine.environments import env_spec, policy_cameras
 from manip_il.errors import MismatchError, UsageError
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.learn.pretrained import check_interface
 from manip_il.mdp import Actor, Episode, State, Transition
 from manip_il.rollout import Driver, Rules, rollout
 from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig
 from manip_il.sim.scene import build_scene
 
 if TYPE_CHECKING:  # torch only where a learner drives

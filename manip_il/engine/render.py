@@ -35,8 +35,8 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]

@@ -7,8 +7,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
-from manip_il.evaluation.factors import Factor, factor_table, find_factors
-from manip_il.evaluation.failures import PhaseRow, evaluation_facts, evaluation_verdict, phase_rows
+from manip_il.evaluation.failures import (
+    Factor,
+    PhaseRow,
+    evaluation_facts,
+    evaluation_verdict,
+    factor_table,
+    find_factors,
+    phase_rows,
+)
 from manip_il.evaluation.maps import FailureMap, Outcome, failure_map
 from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.report_data import Film, LearningCurve, Paths

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from manip_il.evaluation.episodes import EpisodeResult
-from manip_il.evaluation.factors import Factor, hardest_condition
-from manip_il.evaluation.intervals import format_percent
+import numpy as np
+
+from manip_il.evaluation.episodes import EpisodeResult, moving_thing
+from manip_il.evaluation.intervals import Proportion, format_percent
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.significance import format_p
+from manip_il.evaluation.significance import fisher_exact, format_p, format_p_cell, holm
+from manip_il.evaluation.tables import NO_CONDITION, WORST, Table
+from manip_il.mdp import F64
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import NO_PHASE
 
@@ -117,3 +121,160 @@ def _end_fact(result: EvalResult) -> str:
 
 def _spaced(phase: str) -> str:
     return phase.replace("_", " ")
+
+
+MIN_EPISODES = 9  # that are split into thirds
+SAME_PLACE = 0.005  # coordinates that differ by less are one: what settled on the table rests there [m]
+THIRDS = ("lowest third", "middle third", "highest third")
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Episodes with a factor's value from `low` to `high`."""
+
+    low: float
+    high: float
+    success: Proportion
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A number that varied between episodes, with success in its bins, ascending, at most three.
+
+    p_value: of this factor alone. corrected: the same, corrected for the number of factors (Holm).
+    """
+
+    name: str
+    bins: tuple[Bin, ...]
+    p_value: float
+    corrected: float = 1.0
+
+    @property
+    def significant(self) -> bool:
+        """Whether success differs between the bins by more than chance."""
+        return self.corrected < 1 - self.bins[0].success.confidence
+
+    @property
+    def worst(self) -> int:
+        """The bin with the lowest success."""
+        return min(range(len(self.bins)), key=lambda index: self.bins[index].success.rate)
+
+    @property
+    def bin_names(self) -> tuple[str, ...]:
+        """Names of the bins: a number that takes two values alone has two."""
+        return THIRDS if len(self.bins) == len(THIRDS) else ("lowest", "highest")
+
+
+@dataclass(frozen=True)
+class HardestCondition:
+    """The condition with the lowest success. p_value: against all others, corrected for the choice (Holm)."""
+
+    name: str
+    success: Proportion
+    p_value: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is harder by more than chance."""
+        return self.p_value < 1 - self.success.confidence
+
+
+def find_factors(result: EvalResult) -> tuple[Factor, ...]:
+    """Return every coordinate and drawn number that varied, the smallest p first.
+
+    Places are taken over all episodes, drawn numbers within the condition that drew them, as they are constant
+    elsewhere. Empty where all episodes succeeded, or none did.
+    """
+    if result.success.successes in (0, result.success.n):
+        return ()
+    columns = {name: column for name, column in _coordinates(result.episodes).items() if _span(column) > SAME_PLACE}
+    conditions = result.by_condition
+    for condition, part in conditions.items():
+        prefix = f"{condition}: " if condition and len(conditions) > 1 else ""
+        for episode in part.episodes:
+            for name, value in episode.drawn_numbers.items():
+                columns.setdefault(prefix + name, []).append((value, episode.success))
+    made = [_factor(name, column, result.confidence) for name, column in columns.items()]
+    factors = [factor for factor in made if factor is not None]
+    corrected = holm([factor.p_value for factor in factors])
+    factors = [replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True)]
+    return tuple(sorted(factors, key=lambda factor: factor.p_value))
+
+
+def hardest_condition(result: EvalResult) -> HardestCondition | None:
+    """Return the condition with the lowest success; None where there is one condition alone."""
+    parts = {name or NO_CONDITION: part.success for name, part in result.by_condition.items()}
+    if len(parts) < 2:
+        return None
+    total = result.success
+    p_values = [
+        fisher_exact((part.successes, total.successes - part.successes), (part.n, total.n - part.n))
+        for part in parts.values()
+    ]
+    corrected = dict(zip(parts, holm(p_values), strict=True))
+    worst = min(parts, key=lambda name: parts[name].rate)
+    return HardestCondition(worst, parts[worst], corrected[worst])
+
+
+def factor_table(factors: Sequence[Factor]) -> Table:
+    """Return success in the thirds of each factor, the lowest of a significant factor marked, and the corrected p."""
+    rows: list[tuple[str, ...]] = []
+    for factor in factors:
+        cells = [_bin_cell(one, factor.significant and index == factor.worst) for index, one in enumerate(factor.bins)]
+        if len(cells) == 2:  # of two values there is no middle
+            cells.insert(1, "")
+        rows.append((factor.name, *cells, format_p_cell(factor.corrected)))
+    return Table(("number", *THIRDS, "corrected p"), tuple(rows))
+
+
+def _bin_cell(one: Bin, marked: bool) -> str:
+    low, high = one.success.interval
+    values = f"{one.low:.3g}" if one.low == one.high else f"{one.low:.3g} to {one.high:.3g}"
+    rate = f"{format_percent(one.success.rate)} [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{WORST if marked else ''}{rate}\n{values}"
+
+
+def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[float, bool]]]:
+    thing = moving_thing(episodes)
+    columns: dict[str, list[tuple[float, bool]]] = {}
+    for episode in episodes:
+        start, goal = episode.start, episode.goal
+        # An object starts on the table: its height there is its size, which is a drawn number of its own.
+        axes = "xy" if thing == "object" else "xyz"
+        values = {f"start of the {thing}, {a} [m]": v for a, v in zip(axes, start or (), strict=False)}
+        values |= {f"goal, {axis} [m]": value for axis, value in zip("xyz", goal or (), strict=False)}
+        if start is not None and goal is not None:
+            values["distance from start to goal [m]"] = math.dist(start, goal)
+        for name, value in values.items():
+            columns.setdefault(name, []).append((value, episode.success))
+    return columns
+
+
+def _factor(name: str, column: Sequence[tuple[float, bool]], confidence: float) -> Factor | None:
+    """None for what hardly varies, or for too few episodes."""
+    values = np.array([value for value, _ in column])
+    if len(column) < MIN_EPISODES or _span(column) <= 1e-6 * float(np.abs(values).max()):
+        return None
+    bins = [
+        Bin(low, high, Proportion.of([success for value, success in column if low <= value <= high], confidence))
+        for low, high in _thirds(values)
+    ]
+    if len(bins) == 1:  # nearly all values are one
+        return None
+    return Factor(name, tuple(bins), fisher_exact([b.success.successes for b in bins], [b.success.n for b in bins]))
+
+
+def _span(column: Sequence[tuple[float, bool]]) -> float:
+    values = [value for value, _ in column]
+    return max(values) - min(values)
+
+
+def _thirds(values: F64) -> list[tuple[float, float]]:
+    """Smallest and largest value of each third; equal values stay together, so thirds of whole numbers differ."""
+    distinct, counts = np.unique(values, return_counts=True)
+    below = np.cumsum(counts) - counts / 2  # rank of each value's middle
+    third = np.minimum(2, (3 * below / len(values)).astype(int))
+    if len(distinct) <= 3:
+        third = np.arange(len(distinct))
+    bins = [distinct[third == index] for index in range(3)]
+    return [(float(values[0]), float(values[-1])) for values in bins if len(values)]

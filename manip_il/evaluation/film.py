@@ -25,8 +25,8 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Film, Paths
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.sim.config import FILM, CameraConfig
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import FILM, CameraConfig
 
 AFTER_SUCCESS = 1.0  # filmed after the task is solved [s]
 Frames = Sequence[NDArray[np.uint8]]

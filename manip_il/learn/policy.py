@@ -20,7 +20,7 @@ from manip_il.learn.limits import Budget, threads
 from manip_il.learn.losses import DISTRIBUTIONS
 from manip_il.learn.network import MLPNetwork, Shape
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
-from manip_il.policy import F32, F64, Images
+from manip_il.mdp import F32, F64, Images
 
 Batch = dict[str, torch.Tensor]
 LIKELIHOODS = ("mixture", "categorical")  # losses whose spread depends on the state

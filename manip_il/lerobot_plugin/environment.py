@@ -22,9 +22,9 @@ from manip_il.errors import UnknownName
 from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import environment_state_names
-from manip_il.sim.look import CameraConfig
 from manip_il.sim.register import ENV_IDS, register_envs
 from manip_il.sim.scene import build_scene
 

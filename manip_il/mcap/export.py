@@ -22,7 +22,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
 from manip_il.data.lerobot_read import dataset_info, read_frames, read_table
-from manip_il.data.shards import UNREADABLE, find_shards, read_tasks
+from manip_il.data.parquet_files import UNREADABLE, find_shards, read_tasks
 from manip_il.errors import ManipError
 from manip_il.mcap import foxglove
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
-from manip_il.sim.look import CAMERAS
+from manip_il.sim.config import CAMERAS
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]

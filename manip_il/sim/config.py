@@ -1,10 +1,10 @@
-"""What makes an environment: robot, task, control rate and success, without the simulator."""
+"""Settings of an environment and of its pictures, without the simulator."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from manip_il.errors import UsageError
+from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 
 DT_SIM = 0.002  # [s]
@@ -37,3 +37,63 @@ class EnvConfig:
     def physics_steps(self) -> int:
         """MuJoCo steps in one control step."""
         return round(1 / (DT_SIM * self.control_hz))
+
+
+CAMERAS = ("front", "wrist")
+MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
+_BRIGHTNESS = (0.1, 2.0)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Light of a scene; part of a dataset's fingerprint, and what re-rendering may vary.
+
+    shadows: of the main lamp; two to six times the price of a picture. brightness: factor on every lamp.
+    light_turn: of the lamps about the vertical through the world's origin, -180 to 180 [deg].
+    Raises `UsageError` for a value out of range.
+    """
+
+    shadows: bool = option(False, "cast shadows; rendering then takes two to six times as long")
+    brightness: float = option(1.0, "factor on every lamp, 0.1 to 2")
+    light_turn: float = option(0.0, "turn the lamps about the vertical, -180 to 180 [deg]")
+
+    def __post_init__(self) -> None:
+        low, high = _BRIGHTNESS
+        if not low <= self.brightness <= high:
+            raise UsageError(f"brightness is {self.brightness}; expected a factor from {low} to {high}")
+        if not -180 <= self.light_turn <= 180:
+            raise UsageError(f"light_turn is {self.light_turn}; expected -180 to 180 degrees")
+
+
+FILM = Look(shadows=True)  # for people: a shadow says how high a thing is
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """Cameras that see every step, and the height, width [pixels] and look of their pictures.
+
+    Raises `UnknownName` for a camera, `UsageError` for none, for one named twice, and for a height or width that
+    is odd (which video's 4:2:0 has not) or out of range.
+    """
+
+    names: tuple[str, ...]
+    height: int = option(128, "of a picture [pixels]")
+    width: int = option(128, "of a picture [pixels]")
+    look: Look = field(default_factory=Look)
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if name not in CAMERAS:
+                raise UnknownName("camera", name, CAMERAS)
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise UsageError(f"cameras are {', '.join(self.names) or 'none'}; expected at least one, each once")
+        if any(side % 2 or not MIN_SIDE <= side <= MAX_SIDE for side in self.size):
+            raise UsageError(
+                f"pictures of height {self.height} and width {self.width}; "
+                f"expected even numbers from {MIN_SIDE} to {MAX_SIDE}"
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.height, self.width

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
-from manip_il.sim.config import EnvConfig
+from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.events import Events
-from manip_il.sim.look import CameraConfig, Look
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn

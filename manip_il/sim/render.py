@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from manip_il.errors import RenderError
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.gl import PACKAGES
-from manip_il.sim.look import CAMERAS, CameraConfig, Look
 from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.view import ViewModel
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
-from manip_il.sim.look import CAMERAS, Look
+from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.scene import build_scene, camera_id
 
 F64 = NDArray[np.float64]

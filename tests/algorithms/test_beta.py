@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.algorithms.beta import BetaSchedule
+from manip_il.algorithms.config import BetaSchedule
 from manip_il.errors import UnknownName, UsageError
 
 

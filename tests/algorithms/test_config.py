@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.algorithms.beta import BetaSchedule
-from manip_il.algorithms.config import RunConfig, check_cameras, check_labels
+from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels
 from manip_il.algorithms.table import check_method
 from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.sim.look import CameraConfig
+from manip_il.sim.config import CameraConfig
 
 CNN = FitConfig({"type": "cnn"})
 ACT = FitConfig({"type": "act", "chunk_size": 8, "n_action_steps": 4})

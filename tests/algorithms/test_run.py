@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.algorithms import run as run_module
-from manip_il.algorithms.beta import BetaSchedule
-from manip_il.algorithms.config import RunConfig
+from manip_il.algorithms.config import BetaSchedule, RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.run import Watch, round_folder
 from manip_il.algorithms.table import run_algorithm
@@ -23,8 +22,8 @@ from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Actor, Episode
 from manip_il.seeding import stream_seeds
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig
 
 from ..learn.tiny_policies import ACT
 from .trees import files, is_data

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.algorithms.sampling import Sampling
+from manip_il.algorithms.config import Sampling
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor
 

@@ -12,8 +12,8 @@ from manip_il.cli.main import main
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig, Look
 
 from ..learn.tiny_policies import edit_config, write_checkpoint
 from .made_runs import make_policy

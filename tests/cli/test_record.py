@@ -16,8 +16,8 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.sim import render
+from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig, Look
 
 from .made_runs import files
 

@@ -20,8 +20,8 @@ from manip_il.data import schema as s
 from manip_il.data.frame_source import find_frames
 from manip_il.data.lerobot_read import check_dataset, dataset_info, read_episodes, read_table, read_tables
 from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.parquet_files import open_shard
 from manip_il.data.parquet_limits import LARGEST_FOOTER, check_parquet
-from manip_il.data.shards import open_shard
 from manip_il.errors import ManipError
 from manip_il.mcap.export import export_dataset, open_source
 from manip_il.mdp import Episode

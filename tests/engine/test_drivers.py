@@ -8,7 +8,7 @@ import pytest
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
 from manip_il.errors import ManipError
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import Actor, Episode, Label, Observation, State
 from manip_il.rollout import Rules, Turn, rollout
 from manip_il.seeding import stream_seeds

@@ -14,7 +14,7 @@ from manip_il.engine.drivers import QueryRule
 from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig

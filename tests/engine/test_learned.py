@@ -21,8 +21,8 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.seeding import stream_seeds
+from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.look import CameraConfig, Look
 
 from ..learn.tiny_policies import edit_config, write_checkpoint
 

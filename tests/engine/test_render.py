@@ -17,8 +17,8 @@ from manip_il.engine.render import open_source, render_dataset, render_episodes,
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
+from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig, Look
 
 ENV = EnvConfig("panda", "pick_place")
 CAMERAS = CameraConfig(("front", "wrist"), 64, 96)

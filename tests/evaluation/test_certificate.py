@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled, summary_lines
 from manip_il.evaluation.certify import certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from manip_il.evaluation.episodes import EpisodeResult
-from manip_il.evaluation.factors import find_factors
+from manip_il.evaluation.failures import find_factors
 
 from .made_evals import made_eval, without_detail
 

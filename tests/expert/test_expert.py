@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from manip_il.errors import MismatchError
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import Label, State
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
@@ -80,7 +80,7 @@ def test_labels_do_not_depend_on_clock_or_count(visited_states):
 IN_ANOTHER_PROCESS = """
 import sys
 import numpy as np
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 for pair in sys.argv[2:]:

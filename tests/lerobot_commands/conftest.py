@@ -17,8 +17,8 @@ from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import episode_result
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig
 
 from ..warm import Warm
 

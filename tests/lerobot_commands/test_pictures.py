@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from manip_il.data.schema import EXECUTED_ACTION
+from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.look import CameraConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]
 SIDE, STEPS, COUNT = 32, 10, 4

@@ -41,7 +41,7 @@ def test_an_arm_from_a_yaml_is_a_scene_and_has_the_files_name(tmp_path: Path):
 
 @pytest.mark.usefixtures("everywhere")
 def test_an_arm_from_a_yaml_is_driven_to_the_goal(tmp_path: Path):
-    from manip_il.expert.expert import Expert
+    from manip_il.expert import Expert
 
     env = ManipEnv(str(write(tmp_path)), "reach", horizon=60)
     expert = Expert(env.scene)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.sim.env import ManipEnv
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import phases

@@ -9,7 +9,7 @@ import pytest
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.conditions import NOMINAL, Condition, draw
-from manip_il.sim.look import CAMERAS
+from manip_il.sim.config import CAMERAS
 
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 OBJECT = Condition("object", mass=(0.05, 0.3), size=(0.04, 0.06), colour=(0.1, 0.9))

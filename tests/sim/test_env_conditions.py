@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import EnvConfig, ManipEnv, environment_state_names
 from manip_il.sim.scene import build_scene

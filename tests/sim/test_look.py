@@ -10,8 +10,8 @@ import pytest
 
 from manip_il.data.fingerprint import canonical_json
 from manip_il.errors import UnknownName, UsageError
+from manip_il.sim.config import FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.look import FILM, CameraConfig, Look
 
 
 @pytest.mark.parametrize(

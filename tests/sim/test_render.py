@@ -14,9 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from manip_il.errors import RenderError, UnknownName
 from manip_il.robots.robot import ROBOTS
 from manip_il.sim import render
+from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend, require_known_backend
-from manip_il.sim.look import CAMERAS, CameraConfig, Look
 
 SEED = 5_000_000
 

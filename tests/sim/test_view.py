@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from manip_il.sim import render, view
+from manip_il.sim.config import CAMERAS, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.look import CAMERAS, Look
 from manip_il.sim.scene import build_scene
 from manip_il.sim.view import ViewModel, cluster
 

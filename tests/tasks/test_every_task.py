@@ -16,7 +16,7 @@ from manip_il.engine import environments
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName
-from manip_il.expert.expert import Expert
+from manip_il.expert import Expert
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
