@@ -142,7 +142,7 @@ class RunConfig:
 
     env: EnvConfig = field(default_factory=EnvConfig)
     method: str = "dagger"
-    demonstrations: int = option(50, "successful expert episodes of round 0")
+    demonstrations: int = option(50, "successful expert episodes to begin with (round 0)")
     rounds: int = option(5, "DAgger rounds after round 0")
     episodes_per_round: int = option(50, "rollouts per round; with --method=cloning, successful ones")
     label_budget: int | None = option(None, "expert labels of all rounds together at which the run ends")

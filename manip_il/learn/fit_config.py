@@ -50,7 +50,7 @@ class FitConfig:
 
     policy: Mapping[str, Any] = option(dict, "type (mlp), or path of a policy to start from; ...")
     observation: str | None = option(
-        None, "what the policy observes besides its joints; by default images if it is cnn, else state"
+        None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
     steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
     batch_size: int | None = option(
