@@ -26,7 +26,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il.child_processes import bound_to_this_process, initialize_worker
-from manip_il.data.atomic import PARTIAL, WriteError, new_folder
+from manip_il.data.atomic import PARTIAL, WriteError, new_folder, opened, try_lock
 from manip_il.data.frame_source import FrameSource, Part, find_frames
 from manip_il.errors import ManipError, UsageError
 
@@ -129,18 +129,11 @@ def _build(
 def _exclusive(folder: Path) -> Generator[None]:
     """Hold the right to add and remove entries; wait for a process that holds it."""
     folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with opened(folder / _LOCK, os.O_RDWR | os.O_CREAT) as handle:
+        if not try_lock(handle):  # without locks the entry that is finished last stays
             _LOG.warning("another process decodes pictures into %s: waiting for it", folder)
             fcntl.flock(handle, fcntl.LOCK_EX)
-        except OSError:
-            pass  # a network file system may know no locks; then the entry that is finished last stays
         yield
-    finally:
-        os.close(handle)
 
 
 def _make_room(folder: Path, needed: int, max_bytes: int) -> bool:
@@ -179,15 +172,13 @@ def _remove(path: Path) -> bool:
 @contextlib.contextmanager
 def _unused(path: Path) -> Generator[bool]:
     """Lock a file or folder; gives False where another process has it locked, or where there are no locks."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        yield False
-    else:
-        yield True
-    finally:
-        os.close(handle)
+    with opened(path) as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True
 
 
 def _write_frames(
@@ -235,9 +226,8 @@ def _written(write: Callable[[Part], int], parts: Sequence[Part], workers: int) 
 
 def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int:
     """Decode a part into its place; return how many frames it holds."""
-    handle = os.open(path, os.O_WRONLY)
     frames = 0
-    try:
+    with opened(path, os.O_WRONLY) as handle:
         for row, pictures in source.read(part):
             content = memoryview(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).cast("B")
             place = offset + row * (source.nbytes // source.frames)
@@ -245,8 +235,6 @@ def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int
                 written = os.pwrite(handle, content, place)
                 content, place = content[written:], place + written
             frames += len(pictures)
-    finally:
-        os.close(handle)
     return frames
 
 
