@@ -117,7 +117,11 @@ def _build(
     folder: Path, source: FrameSource, workers: int | None, on_frames: Callable[[int], None] | None
 ) -> Frames | None:
     with new_folder(folder / source.fingerprint, replace=True) as new:
-        _write_frames(source, new / FRAMES, workers, on_frames)
+        write = partial(_write_part, source, new / FRAMES, _reserve(source, new / FRAMES))
+        with contextlib.closing(_written(write, source, workers)) as counts:
+            for count in counts:
+                if on_frames is not None:
+                    on_frames(count)
         about = {"dataset": str(source.root.resolve()), "camera": source.key, "shape": source.shape}
         (new / ABOUT).write_text(json.dumps(about, indent=4) + "\n", encoding="utf-8")
         if find_frames(source.root, source.key).fingerprint != source.fingerprint:
@@ -181,23 +185,11 @@ def _unused(path: Path) -> Generator[bool]:
             yield True
 
 
-def _write_frames(
-    source: FrameSource, path: Path, workers: int | None, on_frames: Callable[[int], None] | None
-) -> None:
-    """Write a camera's pictures to `path`; `OSError` before any is decoded where the disk has no room for all."""
-    write = partial(_write_part, source, path, _reserve(source, path))
-    workers = workers or (1 if source.nbytes < _SMALL else len(os.sched_getaffinity(0)))
-    with contextlib.closing(_written(write, source.parts, workers)) as counts:
-        for count in counts:
-            if on_frames is not None:
-                on_frames(count)
-
-
 def _reserve(source: FrameSource, path: Path) -> int:
     """Create the file at its full size; return where the pictures start in it.
 
     Writing to a mapped file would end the process where the disk is full; so the room is taken now, and filled by
-    plain writes.
+    plain writes. Raises `OSError` where the disk has no room for all.
     """
     header = {"descr": npy.dtype_to_descr(np.dtype(np.uint8)), "fortran_order": False, "shape": source.shape}
     with path.open("wb") as stream:
@@ -207,15 +199,16 @@ def _reserve(source: FrameSource, path: Path) -> int:
         return stream.tell()
 
 
-def _written(write: Callable[[Part], int], parts: Sequence[Part], workers: int) -> Generator[int]:
+def _written(write: Callable[[Part], int], source: FrameSource, workers: int | None) -> Generator[int]:
     """Frames of every part, once it is written."""
+    workers = workers or (1 if source.nbytes < _SMALL else len(os.sched_getaffinity(0)))
     if workers == 1:
-        yield from map(write, parts)
+        yield from map(write, source.parts)
         return
-    pool = ProcessPoolExecutor(min(workers, len(parts)), get_context("spawn"), initializer=initialize_worker)
+    pool = ProcessPoolExecutor(min(workers, len(source.parts)), get_context("spawn"), initializer=initialize_worker)
     try:
         with _interrupts_held(), bound_to_this_process():  # starts the processes
-            futures = [pool.submit(write, part) for part in parts]
+            futures = [pool.submit(write, part) for part in source.parts]
         for future in as_completed(futures):
             yield future.result()
     except BrokenExecutor as error:

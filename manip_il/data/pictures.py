@@ -95,7 +95,10 @@ class VideoReader:
         Raises `ManipError` for a file that cannot be read or does not hold each of them.
         """
         try:
-            pictures = _decode(self._opened(path), first, count, fps)
+            if self._container is None or self._path != path:
+                self.close()
+                self._container, self._path = open_video(path), path
+            pictures = _decode(self._container, first, count, fps)
         except _UNREADABLE as error:
             raise _unreadable(path, error) from error
         if len(pictures) != count:
@@ -107,12 +110,6 @@ class VideoReader:
         if self._container is not None:
             self._container.close()
             self._path = self._container = None
-
-    def _opened(self, path: Path) -> InputContainer:
-        if self._container is None or self._path != path:
-            self.close()
-            self._container, self._path = open_video(path), path
-        return self._container
 
 
 def count_packets(path: Path) -> int:
