@@ -50,11 +50,6 @@ def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     return {**features(spec), **own}
 
 
-def table_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """Return the features of the columns in the data files: all but the pictures."""
-    return {key: feature for key, feature in all_features(spec).items() if key not in spec.image_keys}
-
-
 def info_json(
     spec: RobotTaskSpec, episodes: int, frames: int, file_sizes: tuple[float, float], videos: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
@@ -89,7 +84,9 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
-    for key, feature in table_features(spec).items():
+    for key, feature in all_features(spec).items():
+        if key in spec.image_keys:
+            continue  # in files of their own
         value = {"dtype": feature["dtype"], "_type": "Value"}
         dtype = pa.type_for_alias(feature["dtype"])
         size: int = feature["shape"][0]
