@@ -106,7 +106,7 @@ def exclusive(folder: Path) -> Generator[None]:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
             with writing(path):
                 raise
-        with opened(folder, os.O_RDONLY | os.O_DIRECTORY) as itself:
+        with descriptor(folder, os.O_RDONLY | os.O_DIRECTORY) as itself:
             if not try_lock(itself):
                 raise FolderBusyError(folder, "unknown") from None
             yield
@@ -122,7 +122,7 @@ def exclusive(folder: Path) -> Generator[None]:
 
 
 @contextlib.contextmanager
-def opened(path: Path, flags: int = os.O_RDONLY) -> Generator[int]:
+def descriptor(path: Path, flags: int = os.O_RDONLY) -> Generator[int]:
     """Give the descriptor of a file or folder, and close it on leaving."""
     handle = os.open(path, flags, 0o666)
     try:
@@ -180,7 +180,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 def sync(path: Path) -> None:
     """Have the disk hold a file's content, or a folder's list of names."""
-    with opened(path) as handle:
+    with descriptor(path) as handle:
         os.fsync(handle)
 
 
@@ -208,7 +208,7 @@ def _refuse_full(root: Path) -> None:
 
 def _remove_leftovers(root: Path) -> None:
     for partial in root.parent.glob(f".{root.name}.*{PARTIAL}"):
-        with contextlib.suppress(OSError), opened(partial, os.O_RDONLY | os.O_DIRECTORY) as lock:
+        with contextlib.suppress(OSError), descriptor(partial, os.O_RDONLY | os.O_DIRECTORY) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its writer lives
             shutil.rmtree(partial, ignore_errors=True)
 

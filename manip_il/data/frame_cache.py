@@ -26,7 +26,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il.child_processes import bound_to_this_process, initialize_worker
-from manip_il.data.atomic import PARTIAL, WriteError, new_folder, opened, try_lock
+from manip_il.data.atomic import PARTIAL, WriteError, descriptor, new_folder, try_lock
 from manip_il.data.frame_source import FrameSource, Part, find_frames
 from manip_il.errors import ManipError, UsageError
 
@@ -133,7 +133,7 @@ def _build(
 def _exclusive(folder: Path) -> Generator[None]:
     """Hold the right to add and remove entries; wait for a process that holds it."""
     folder.mkdir(parents=True, exist_ok=True)
-    with opened(folder / _LOCK, os.O_RDWR | os.O_CREAT) as handle:
+    with descriptor(folder / _LOCK, os.O_RDWR | os.O_CREAT) as handle:
         if not try_lock(handle):  # without locks the entry that is finished last stays
             _LOG.warning("another process decodes pictures into %s: waiting for it", folder)
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -176,7 +176,7 @@ def _remove(path: Path) -> bool:
 @contextlib.contextmanager
 def _unused(path: Path) -> Generator[bool]:
     """Lock a file or folder; gives False where another process has it locked, or where there are no locks."""
-    with opened(path) as handle:
+    with descriptor(path) as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -220,7 +220,7 @@ def _written(write: Callable[[Part], int], source: FrameSource, workers: int | N
 def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int:
     """Decode a part into its place; return how many frames it holds."""
     frames = 0
-    with opened(path, os.O_WRONLY) as handle:
+    with descriptor(path, os.O_WRONLY) as handle:
         for row, pictures in source.read(part):
             content = memoryview(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).cast("B")
             place = offset + row * (source.nbytes // source.frames)

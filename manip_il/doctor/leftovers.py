@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from manip_il.data.atomic import PARTIAL, opened, try_lock
+from manip_il.data.atomic import PARTIAL, descriptor, try_lock
 from manip_il.data.build import RECORDING, Recording
 from manip_il.data.episodes import Header
 from manip_il.data.journal import list_episodes, read_header
@@ -138,7 +138,7 @@ def _check_beside(root: Path) -> Iterator[Finding]:
 
 def _is_held(path: Path) -> bool:
     """Return whether a living process has locked the file or folder."""
-    with contextlib.suppress(OSError), opened(path) as handle:
+    with contextlib.suppress(OSError), descriptor(path) as handle:
         return not try_lock(handle, fcntl.LOCK_SH)
     return False
 

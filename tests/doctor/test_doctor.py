@@ -17,7 +17,7 @@ from av.video.stream import VideoStream
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.atomic import opened, try_lock
+from manip_il.data.atomic import descriptor, try_lock
 from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
@@ -352,7 +352,7 @@ def test_a_video_that_is_wrong(filmed: Path, change: Change, texts: list[str]) -
 def test_a_writer_that_lives_is_no_leftover(alone: Path) -> None:
     partial = alone.with_name(".lift.abc.partial")
     partial.mkdir()
-    with opened(partial) as handle:
+    with descriptor(partial) as handle:
         assert try_lock(handle)
         assert lines(alone) == []
     assert said(alone, "../.lift.abc.partial", kind="warning")
