@@ -73,7 +73,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
         partial.chmod(0o777 & ~umask())
         with writing(root):
             yield partial
-            _sync_tree(partial)
+            for path in (*partial.rglob("*"), partial):
+                sync(path)
         if replace and root.exists():
             _exchange(partial, root)
             shutil.rmtree(partial, ignore_errors=True)
@@ -105,7 +106,9 @@ def exclusive(folder: Path) -> Generator[None]:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
             with writing(path):
                 raise
-        with _holding_itself(folder):
+        with descriptor(folder, os.O_RDONLY | os.O_DIRECTORY) as itself:
+            if not try_lock(itself):
+                raise FolderBusyError(folder, "unknown") from None
             yield
         return
     try:
@@ -119,32 +122,36 @@ def exclusive(folder: Path) -> Generator[None]:
 
 
 @contextlib.contextmanager
-def _holding_itself(folder: Path) -> Generator[None]:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def descriptor(path: Path, flags: int = os.O_RDONLY) -> Generator[int]:
+    """Give the descriptor of a file or folder, and close it on leaving."""
+    handle = os.open(path, flags, 0o666)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(handle)
-        raise FolderBusyError(folder, "unknown") from error
-    except OSError:
-        pass  # a network file system may know no locks
-    try:
-        yield
+        yield handle
     finally:
         os.close(handle)
+
+
+def try_lock(handle: int, kind: int = fcntl.LOCK_EX) -> bool:
+    """Lock an open file or folder until it is closed; return False where another process holds it.
+
+    True also on a network file system that knows no locks.
+    """
+    try:
+        fcntl.flock(handle, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def _lock(folder: Path, path: Path) -> int:
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        if not try_lock(handle):
             holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
             os.close(handle)
-            raise FolderBusyError(folder, holder or "unknown") from error
-        except OSError:
-            return handle  # a network file system may know no locks
+            raise FolderBusyError(folder, holder or "unknown")
         if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
             return handle
         os.close(handle)  # its last holder removed it meanwhile: take the new one
@@ -156,32 +163,25 @@ def write_file(path: Path, data: bytes) -> None:
     Raises `WriteError` where the disk is full or read-only.
     """
     with writing(path):
-        _write_file(path, data)
-
-
-def _write_file(path: Path, data: bytes) -> None:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
-    partial = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            os.fchmod(stream.fileno(), 0o666 & ~umask())
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-    sync(path.parent)  # else a power cut may take the new name back
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.parent)
+        partial = Path(name)
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                os.fchmod(stream.fileno(), 0o666 & ~umask())
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+        sync(path.parent)  # else a power cut may take the new name back
 
 
 def sync(path: Path) -> None:
     """Have the disk hold a file's content, or a folder's list of names."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
+    with descriptor(path) as handle:
         os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _rename(partial: Path, root: Path) -> None:
@@ -201,12 +201,6 @@ def _exchange(left: Path, right: Path) -> None:
         raise OSError(number, os.strerror(number), str(right))
 
 
-def _sync_tree(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        sync(path)
-    sync(folder)
-
-
 def _refuse_full(root: Path) -> None:
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise FolderExistsError(root)
@@ -214,13 +208,9 @@ def _refuse_full(root: Path) -> None:
 
 def _remove_leftovers(root: Path) -> None:
     for partial in root.parent.glob(f".{root.name}.*{PARTIAL}"):
-        with contextlib.suppress(OSError):
-            lock = os.open(partial, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its writer lives
-                shutil.rmtree(partial, ignore_errors=True)
-            finally:
-                os.close(lock)
+        with contextlib.suppress(OSError), descriptor(partial, os.O_RDONLY | os.O_DIRECTORY) as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its writer lives
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def umask() -> int:

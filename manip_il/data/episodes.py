@@ -79,7 +79,9 @@ def to_episode(
     for camera in frames[0].observation.images:
         columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
     if labelled:
-        columns[schema.ACTION] = np.stack([_label(frame) for frame in frames]).astype(np.float32)
+        columns[schema.ACTION] = np.stack(
+            [frame.label.action if frame.label else frame.executed_action for frame in frames]
+        ).astype(np.float32)
         columns[schema.LABEL_VALID] = _column([bool(frame.label and frame.label.valid) for frame in frames], np.int64)
     decides = frames[:path]
     return Episode(
@@ -217,10 +219,6 @@ def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Epis
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
     return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final)
-
-
-def _label(frame: Transition) -> NDArray[np.float64]:
-    return frame.executed_action if frame.label is None else frame.label.action
 
 
 def _column(values: list[Any], dtype: type) -> NDArray[Any]:

@@ -26,7 +26,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il.child_processes import bound_to_this_process, initialize_worker
-from manip_il.data.atomic import PARTIAL, WriteError, new_folder
+from manip_il.data.atomic import PARTIAL, WriteError, descriptor, new_folder, try_lock
 from manip_il.data.frame_source import FrameSource, Part, find_frames
 from manip_il.errors import ManipError, UsageError
 
@@ -117,7 +117,11 @@ def _build(
     folder: Path, source: FrameSource, workers: int | None, on_frames: Callable[[int], None] | None
 ) -> Frames | None:
     with new_folder(folder / source.fingerprint, replace=True) as new:
-        _write_frames(source, new / FRAMES, workers, on_frames)
+        write = partial(_write_part, source, new / FRAMES, _reserve(source, new / FRAMES))
+        with contextlib.closing(_written(write, source, workers)) as counts:
+            for count in counts:
+                if on_frames is not None:
+                    on_frames(count)
         about = {"dataset": str(source.root.resolve()), "camera": source.key, "shape": source.shape}
         (new / ABOUT).write_text(json.dumps(about, indent=4) + "\n", encoding="utf-8")
         if find_frames(source.root, source.key).fingerprint != source.fingerprint:
@@ -129,18 +133,11 @@ def _build(
 def _exclusive(folder: Path) -> Generator[None]:
     """Hold the right to add and remove entries; wait for a process that holds it."""
     folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with descriptor(folder / _LOCK, os.O_RDWR | os.O_CREAT) as handle:
+        if not try_lock(handle):  # without locks the entry that is finished last stays
             _LOG.warning("another process decodes pictures into %s: waiting for it", folder)
             fcntl.flock(handle, fcntl.LOCK_EX)
-        except OSError:
-            pass  # a network file system may know no locks; then the entry that is finished last stays
         yield
-    finally:
-        os.close(handle)
 
 
 def _make_room(folder: Path, needed: int, max_bytes: int) -> bool:
@@ -179,34 +176,20 @@ def _remove(path: Path) -> bool:
 @contextlib.contextmanager
 def _unused(path: Path) -> Generator[bool]:
     """Lock a file or folder; gives False where another process has it locked, or where there are no locks."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        yield False
-    else:
-        yield True
-    finally:
-        os.close(handle)
-
-
-def _write_frames(
-    source: FrameSource, path: Path, workers: int | None, on_frames: Callable[[int], None] | None
-) -> None:
-    """Write a camera's pictures to `path`; `OSError` before any is decoded where the disk has no room for all."""
-    write = partial(_write_part, source, path, _reserve(source, path))
-    workers = workers or (1 if source.nbytes < _SMALL else len(os.sched_getaffinity(0)))
-    with contextlib.closing(_written(write, source.parts, workers)) as counts:
-        for count in counts:
-            if on_frames is not None:
-                on_frames(count)
+    with descriptor(path) as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True
 
 
 def _reserve(source: FrameSource, path: Path) -> int:
     """Create the file at its full size; return where the pictures start in it.
 
     Writing to a mapped file would end the process where the disk is full; so the room is taken now, and filled by
-    plain writes.
+    plain writes. Raises `OSError` where the disk has no room for all.
     """
     header = {"descr": npy.dtype_to_descr(np.dtype(np.uint8)), "fortran_order": False, "shape": source.shape}
     with path.open("wb") as stream:
@@ -216,15 +199,16 @@ def _reserve(source: FrameSource, path: Path) -> int:
         return stream.tell()
 
 
-def _written(write: Callable[[Part], int], parts: Sequence[Part], workers: int) -> Generator[int]:
+def _written(write: Callable[[Part], int], source: FrameSource, workers: int | None) -> Generator[int]:
     """Frames of every part, once it is written."""
+    workers = workers or (1 if source.nbytes < _SMALL else len(os.sched_getaffinity(0)))
     if workers == 1:
-        yield from map(write, parts)
+        yield from map(write, source.parts)
         return
-    pool = ProcessPoolExecutor(min(workers, len(parts)), get_context("spawn"), initializer=initialize_worker)
+    pool = ProcessPoolExecutor(min(workers, len(source.parts)), get_context("spawn"), initializer=initialize_worker)
     try:
         with _interrupts_held(), bound_to_this_process():  # starts the processes
-            futures = [pool.submit(write, part) for part in parts]
+            futures = [pool.submit(write, part) for part in source.parts]
         for future in as_completed(futures):
             yield future.result()
     except BrokenExecutor as error:
@@ -235,9 +219,8 @@ def _written(write: Callable[[Part], int], parts: Sequence[Part], workers: int) 
 
 def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int:
     """Decode a part into its place; return how many frames it holds."""
-    handle = os.open(path, os.O_WRONLY)
     frames = 0
-    try:
+    with descriptor(path, os.O_WRONLY) as handle:
         for row, pictures in source.read(part):
             content = memoryview(np.ascontiguousarray(pictures.transpose(0, 3, 1, 2))).cast("B")
             place = offset + row * (source.nbytes // source.frames)
@@ -245,8 +228,6 @@ def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int
                 written = os.pwrite(handle, content, place)
                 content, place = content[written:], place + written
             frames += len(pictures)
-    finally:
-        os.close(handle)
     return frames
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -41,11 +42,8 @@ class VideoPart:
 
     def read(self, root: Path, key: str, fps: int) -> Iterator[Rows]:
         """Decode them, all at once. Raises `ManipError` where one is not there."""
-        reader = VideoReader()
-        try:
+        with closing(VideoReader()) as reader:
             yield self.row, reader.read(root / self.path, self.first, self.count, fps)
-        finally:
-            reader.close()
 
 
 @dataclass(frozen=True)

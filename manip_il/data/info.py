@@ -131,7 +131,7 @@ def read_object(path: Path) -> dict[str, Any]:
 def info_problems(raw: dict[str, Any]) -> Iterator[str]:
     """Yield what is wrong with the file's content, one line each: values of wrong types, paths out of the dataset."""
     fps: Any = raw.get("fps")
-    if not _is_number(fps) or not 1 <= fps < 1e6:
+    if type(fps) not in (int, float) or not 1 <= fps < 1e6:
         yield f"fps is {checks.shorten(fps)}; expected a number of at least 1"
     for key in ("total_episodes", "total_frames"):
         if not _is_count(raw.get(key)):
@@ -186,10 +186,6 @@ def _feature(key: str, value: dict[str, Any]) -> Feature:
     details = value.get("info") or value.get("video_info") or {}
     details = cast(dict[str, Any], details) if isinstance(details, dict) else {}
     return Feature(key, value["dtype"], tuple(value["shape"]), value.get("names"), details)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _is_count(value: Any) -> bool:

@@ -33,13 +33,7 @@ EPISODE_INDEX = "episode_index"
 INDEX = "index"
 TASK_INDEX = "task_index"
 
-_INDEX_DTYPES = {
-    TIMESTAMP: "float32",
-    FRAME_INDEX: "int64",
-    EPISODE_INDEX: "int64",
-    INDEX: "int64",
-    TASK_INDEX: "int64",
-}
+_INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
     "chunk_index": pa.int64(),
@@ -54,11 +48,6 @@ def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     """Return our features and LeRobot's own five, in the order of the columns."""
     own = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}
     return {**features(spec), **own}
-
-
-def table_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """Return the features of the columns in the data files: all but the pictures."""
-    return {key: feature for key, feature in all_features(spec).items() if key not in spec.image_keys}
 
 
 def info_json(
@@ -95,9 +84,11 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
-    for key, feature in table_features(spec).items():
+    for key, feature in all_features(spec).items():
+        if key in spec.image_keys:
+            continue  # in files of their own
         value = {"dtype": feature["dtype"], "_type": "Value"}
-        dtype = _arrow_type(feature["dtype"])
+        dtype = pa.type_for_alias(feature["dtype"])
         size: int = feature["shape"][0]
         if feature["shape"] != (1,):
             dtype = pa.list_(dtype, size)
@@ -110,26 +101,14 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
 
 def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
     """Return Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
-    whole = ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
-    return pa.schema(
-        [
-            pa.field(EPISODE_INDEX, pa.int64()),
-            pa.field("tasks", pa.list_(pa.string())),
-            *(pa.field(name, pa.int64()) for name in whole),
-            *(
-                pa.field(f"videos/{key}/{name}", dtype)
-                for key in spec.image_keys
-                for name, dtype in VIDEO_COLUMNS.items()
-            ),
-            *(
-                pa.field(f"stats/{key}/{name}", _stat_type(name, key in spec.image_keys))
-                for key in all_features(spec)
-                for name in STAT_NAMES
-            ),
-            pa.field("meta/episodes/chunk_index", pa.int64()),
-            pa.field("meta/episodes/file_index", pa.int64()),
-        ]
-    )
+    columns = {EPISODE_INDEX: pa.int64(), "tasks": pa.list_(pa.string())}
+    for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
+        columns[name] = pa.int64()
+    for key in spec.image_keys:
+        columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
+    for key in all_features(spec):
+        columns |= {f"stats/{key}/{name}": _stat_type(name, key in spec.image_keys) for name in STAT_NAMES}
+    return pa.schema(columns | dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()))
 
 
 def tasks_table(instruction: str) -> pa.Table:
@@ -153,10 +132,6 @@ def write_json(path: Path, data: Any) -> None:
     """Write `data` laid out as LeRobot does."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
-
-
-def _arrow_type(dtype: str) -> pa.DataType:
-    return {"float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}[dtype]
 
 
 def _stat_type(name: str, is_picture: bool) -> pa.DataType:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import sys
 
@@ -15,23 +16,16 @@ NO_FFMPEG = (
 
 def shorten_ffmpeg_warning() -> None:
     """Replace LeRobot's warning of missing FFmpeg libraries by one line; a second call changes nothing."""
-    logger = logging.getLogger(_LOGGER)
-    if not any(isinstance(one, _OneLine) for one in logger.filters):
-        logger.addFilter(_OneLine())
+    logging.getLogger(_LOGGER).addFilter(_passes)
 
 
-class _OneLine(logging.Filter):
-    """Prints one line for the first warning, and drops the others."""
+def _passes(record: logging.LogRecord) -> bool:
+    if _MARK not in record.getMessage():
+        return True
+    _print_once()
+    return False
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._printed = False
 
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Let every other record pass."""
-        if _MARK not in record.getMessage():
-            return True
-        if not self._printed:
-            print(NO_FFMPEG, file=sys.stderr, flush=True)  # as every other warning of ours, whatever handlers there are
-        self._printed = True
-        return False
+@functools.cache
+def _print_once() -> None:
+    print(NO_FFMPEG, file=sys.stderr, flush=True)  # as every other warning of ours, whatever handlers there are

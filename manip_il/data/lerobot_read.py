@@ -16,14 +16,13 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import find_clips, to_part
-from manip_il.data.info import LARGEST_META, info_problems
+from manip_il.data.info import LARGEST_META, PICTURES, info_problems
 from manip_il.data.parquet_files import check_files, read_column, read_file
 from manip_il.data.pictures import VideoReader
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 UNKNOWN_TASK = "unknown"
-_PICTURES = ("video", "image")
 _INDEX = {"dtype": "int64", "shape": (1,)}
 
 
@@ -52,7 +51,7 @@ def read_table(
     that is not there, `UsageError` for an episode that is not there.
     """
     info = _read_info(root)
-    table_features = {key: value for key, value in info["features"].items() if value["dtype"] not in _PICTURES}
+    table_features = {key: value for key, value in info["features"].items() if value["dtype"] not in PICTURES}
     names = list(table_features) if columns is None else list(columns)
     for name in names:
         if name not in table_features:
@@ -181,7 +180,7 @@ def dataset_info(root: Path) -> DatasetInfo:
 
 def camera_keys(root: Path) -> list[str]:
     """Return names of the columns that are pictures."""
-    return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in _PICTURES]
+    return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in PICTURES]
 
 
 def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:

@@ -107,7 +107,7 @@ def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
         stats["max"].append(int(levels[-1]))
         stats["mean"].append(first / total)
         stats["std"].append(math.sqrt(total * second - first**2) / total)
-        for name, rank in _ranks(total).items():
+        for name, rank in quantile_places(total).items():
             stats[name].append(int(np.searchsorted(channel.cumsum(), rank + 1)))
     shaped: dict[str, list[Any]] = {name: [[[value / 255]] for value in values] for name, values in stats.items()}
     shaped["count"] = [frames]
@@ -117,11 +117,11 @@ def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
 def _row_stats(rows: F64) -> dict[str, F64]:
     """Of every row of (D, T), which are sorted in part afterwards."""
     moments = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
-    ranks = _ranks(rows.shape[1])
+    ranks = quantile_places(rows.shape[1])
     rows.partition(sorted(set(ranks.values())), axis=1)
     return {**moments, **{name: rows[:, rank].copy() for name, rank in ranks.items()}}
 
 
-def _ranks(count: int) -> dict[str, int]:
-    """Where in a sorted row of `count` values each quantile stands."""
+def quantile_places(count: int) -> dict[str, int]:
+    """Return where in a sorted row of `count` values each quantile stands, from 0."""
     return {name: max(int(np.ceil(share * count)), 1) - 1 for name, share in QUANTILES.items()}

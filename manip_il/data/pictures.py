@@ -32,7 +32,7 @@ _OPTIONS = {
     "max_pixels": str(2 * MOST_PIXELS),  # should pictures grow on the way; codecs round them up to whole blocks
 }
 _BOX = 8  # its size and name [bytes]
-_MOST_BOXES = 100_000  # outermost ones
+MOST_BOXES = 100_000  # outermost ones
 _COUNTS = re.compile(rb"(stsz|stz2|elst)(?s:.){4}")  # frames by their sizes, edits: version and flags, ..., count
 _ELSEWHERE = re.compile(rb"moof|mvex|cmov")  # fragments and a packed index: what follows is counted nowhere here
 
@@ -95,7 +95,10 @@ class VideoReader:
         Raises `ManipError` for a file that cannot be read or does not hold each of them.
         """
         try:
-            pictures = _decode(self._opened(path), first, count, fps)
+            if self._container is None or self._path != path:
+                self.close()
+                self._container, self._path = open_video(path), path
+            pictures = _decode(self._container, first, count, fps)
         except _UNREADABLE as error:
             raise _unreadable(path, error) from error
         if len(pictures) != count:
@@ -107,12 +110,6 @@ class VideoReader:
         if self._container is not None:
             self._container.close()
             self._path = self._container = None
-
-    def _opened(self, path: Path) -> InputContainer:
-        if self._container is None or self._path != path:
-            self.close()
-            self._container, self._path = open_video(path), path
-        return self._container
 
 
 def count_packets(path: Path) -> int:
@@ -130,7 +127,9 @@ def _check_index(path: Path) -> None:
         return  # FFmpeg refuses it
     frames, edits = 0, 1
     with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        for start, stop in _outside_media(data):
+        for name, size, start, stop in find_boxes(data):
+            if name == b"mdat" and size >= _BOX:
+                continue  # coded frames
             if found := _ELSEWHERE.search(data, start, stop):
                 raise ValueError(
                     f"it has a box {found[0].decode()}, which videos of datasets do not have; write it as plain MP4"
@@ -144,20 +143,22 @@ def _check_index(path: Path) -> None:
         raise ValueError(f"it declares {frames:,} frames and {edits:,} edits; expected at most {MOST_INDEXED:,} frames")
 
 
-def _outside_media(data: mmap.mmap) -> Iterator[tuple[int, int]]:
-    """Start and stop [bytes] of everything but coded frames."""
+def find_boxes(data: mmap.mmap) -> Iterator[tuple[bytes, int, int, int]]:
+    """Yield an MP4 file's outermost boxes: name, declared size, start and stop in the file [bytes].
+
+    One of no valid size lasts to the end. Raises `ValueError` for too many.
+    """
     at = 0
-    for _ in range(_MOST_BOXES):
+    for _ in range(MOST_BOXES):
         if at + _BOX > len(data):
             return
         size, name = int.from_bytes(data[at : at + 4]), data[at + 4 : at + _BOX]
         if size == 1:  # it follows as 64 bits
             size = int.from_bytes(data[at + _BOX : at + 2 * _BOX])
         stop = min(at + size, len(data)) if size >= _BOX else len(data)
-        if name != b"mdat" or size < _BOX:
-            yield at, stop
+        yield name, size, at, stop
         at = stop
-    raise ValueError(f"it has more than {_MOST_BOXES:,} boxes")
+    raise ValueError(f"it has more than {MOST_BOXES:,} boxes")
 
 
 def _decode(container: InputContainer, first: int, count: int, fps: int) -> list[NDArray[np.uint8]]:

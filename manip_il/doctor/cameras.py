@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import mmap
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info
 from manip_il.data.parquet_files import UNREADABLE, Shard
-from manip_il.data.pictures import open_picture, open_video
+from manip_il.data.pictures import MOST_BOXES, find_boxes, open_picture, open_video
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, list_first, plural
 from manip_il.doctor.scan import F64, I64
@@ -103,24 +105,11 @@ def _explain(path: Path, problem: Exception, decoded: int) -> str:
         return f"cannot be decoded beyond {plural(decoded, 'frame')}: {reason}"
     if path.stat().st_size == 0:
         return "is empty"
-    if b"moov" not in _box_names(path):
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        names = {name for name, *_ in itertools.islice(find_boxes(data), MOST_BOXES)}
+    if b"moov" not in names:
         return "has no moov box: its encoder died before it closed the file, or the file was cut"
     return f"cannot be decoded: {reason}"
-
-
-def _box_names(path: Path) -> set[bytes]:
-    """Return the names of an MP4 file's outermost boxes, as far as they can be followed."""
-    names: set[bytes] = set()
-    with path.open("rb") as stream:
-        while len(head := stream.read(16)) >= 8:
-            size = int.from_bytes(head[:4])
-            names.add(head[4:8])
-            if size == 1:  # the size follows as 64 bits
-                size = int.from_bytes(head[8:16])
-            if size < 8:
-                break
-            stream.seek(size - len(head), 1)
-    return names
 
 
 def _check_film(name: str, film: Film, feature: Feature, info: Info, episodes: int, frames: int) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -209,9 +210,6 @@ def _move(source: Path, target: Path) -> None:
 
 def _free_name(root: Path) -> Path:
     """Return the first of `<root>.before-repair`, `<root>.before-repair-2`, ... that is not there."""
-    first = root.with_name(f"{root.name}.before-repair")
-    number, path = 1, first
-    while path.exists():
-        number += 1
-        path = first.with_name(f"{first.name}-{number}")
-    return path
+    name = f"{root.name}.before-repair"
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(path for path in map(root.with_name, names) if not path.exists())

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from manip_il.data.atomic import PARTIAL
+from manip_il.data.atomic import PARTIAL, descriptor, try_lock
 from manip_il.data.build import RECORDING, Recording
 from manip_il.data.episodes import Header
 from manip_il.data.journal import list_episodes, read_header
@@ -138,18 +138,8 @@ def _check_beside(root: Path) -> Iterator[Finding]:
 
 def _is_held(path: Path) -> bool:
     """Return whether a living process has locked the file or folder."""
-    try:
-        handle = os.open(path, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False  # a network file system may know no locks
-    finally:
-        os.close(handle)
+    with contextlib.suppress(OSError), descriptor(path) as handle:
+        return not try_lock(handle, fcntl.LOCK_SH)
     return False
 
 

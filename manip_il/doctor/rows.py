@@ -9,6 +9,7 @@ import numpy as np
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
+from manip_il.data.lerobot_stats import quantile_places
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, Remedy, error, list_first, plural, warning
@@ -190,7 +191,7 @@ def _check_ranks(dataset: Dataset) -> Iterator[Finding]:
     for key, moments in dataset.scan.moments.items():
         if not len(moments.quantiles) or moments.bad_rows:
             continue
-        ranks = np.array([max(int(np.ceil(share * moments.rows)), 1) for share in layout.QUANTILES.values()])[:, None]
+        ranks = np.array([[place + 1] for place in quantile_places(moments.rows).values()])
         if ((moments.below >= ranks) | (moments.up_to < ranks)).any():
             wrong.append(key)
     if wrong:

@@ -96,9 +96,8 @@ class Runs:
         return len(self.episode)
 
 
-def _no_runs() -> Runs:
-    none = np.zeros(0, dtype=np.int64)
-    return Runs(none, none, none, [], none)
+_NONE = np.zeros(0, dtype=np.int64)
+_NO_RUNS = Runs(_NONE, _NONE, _NONE, [], _NONE)
 
 
 @dataclass
@@ -106,7 +105,7 @@ class Scan:
     """Result of reading all data files. moments: of every column of numbers that could be read in every file."""
 
     findings: list[Finding] = field(default_factory=list[Finding])
-    runs: Runs = field(default_factory=_no_runs)
+    runs: Runs = _NO_RUNS
     moments: dict[str, Moments] = field(default_factory=dict[str, Moments])
     tasks: set[int] = field(default_factory=set[int])
     readable: set[str] = field(default_factory=set[str])  # names of the files that were read to their end
@@ -192,7 +191,7 @@ def _find_runs(shard: Shard, info: Info, columns: Mapping[str, NDArray[Any]], re
     for key, (wanted, tolerance) in expected.items():
         if key in columns:
             result.findings += _compare(shard, key, columns[key], wanted, tolerance, episode)
-    seeds = columns[s.SEED][starts].astype(np.int64) if s.SEED in columns else np.zeros(0, dtype=np.int64)
+    seeds = columns[s.SEED][starts].astype(np.int64) if s.SEED in columns else _NONE
     return Runs(episode[starts], index[starts], lengths, [shard.name] * len(starts), seeds)
 
 

@@ -92,11 +92,8 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
     for start, stop in itertools.pairwise([*starts, len(index)]):
         episode = int(index[start])
         rows: dict[str, Any] = {key: values[start:stop] for key, values in table.items()}
-        for key in source.cameras:
-            if key in stored:
-                rows[key] = itertools.islice(stored[key], stop - start)
-            else:
-                rows[key] = read_frames(source.root, key, episode)
+        rows |= {key: itertools.islice(pictures, stop - start) for key, pictures in stored.items()}
+        rows |= {key: read_frames(source.root, key, episode) for key in source.cameras if key not in stored}
         path = folder / f"episode_{episode:06d}.mcap"
         _write(path, source, episode, [tasks[int(task)] for task in task_index[start:stop]], rows)
         yield path

@@ -152,9 +152,8 @@ def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, A
 
     Raises `MismatchError` where a column's width or a picture's size is not that of the first file.
     """
-    pictures: dict[str, Iterator[NDArray[np.uint8]]] = {}
-    for key, camera in mapping.cameras.items():
-        pictures[key] = read_pictures(episode.path, camera.topic, episode.picks[key].left)
+    cameras, picks = mapping.cameras, episode.picks
+    pictures = {key: read_pictures(episode.path, one.topic, picks[key].left) for key, one in cameras.items()}
     columns: dict[str, Column] = {}
     for key, column in episode.columns.items():
         if not isinstance(column, list):

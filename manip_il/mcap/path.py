@@ -115,21 +115,18 @@ def _take(node: Any, step: Step) -> Sequence[Any]:
 
 
 def _field(node: Any, name: str) -> Any:
-    if isinstance(node, Message):
-        known = node.DESCRIPTOR.fields_by_name
-        if name in known:
-            if known[name].has_presence and not node.HasField(name):
-                raise LookupError("not set in this message")
-            return getattr(node, name)
-    elif isinstance(node, dict):
-        known = node
-        if name in known:
-            return known[name]
-    elif _is_list(node):
+    if _is_list(node):
         raise LookupError(f"no field {name!r} in a list; choose its elements by [0], [:] or [name=...]")
-    else:
+    if not isinstance(node, Message | dict):
         raise LookupError(f"no field {name!r} in a plain value")
-    raise LookupError(f"no field {name!r}{nearest(name, known)}; known: {', '.join(known) or 'none'}")
+    known = node if isinstance(node, dict) else node.DESCRIPTOR.fields_by_name
+    if name not in known:
+        raise LookupError(f"no field {name!r}{nearest(name, known)}; known: {', '.join(known) or 'none'}")
+    if isinstance(node, dict):
+        return node[name]
+    if known[name].has_presence and not node.HasField(name):
+        raise LookupError("not set in this message")
+    return getattr(node, name)
 
 
 def _is_list(node: Any) -> bool:

@@ -36,11 +36,6 @@ BYTES = 21 * 3 * 72 * 96  # one camera's, of three episodes
 PLENTY = 10 * BYTES
 
 
-@pytest.fixture(scope="module")
-def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
-    return numbered_episodes(make_episode, two)
-
-
 @pytest.fixture
 def root(tmp_path: Path, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
     return write(filmed, tmp_path / "lift", two)

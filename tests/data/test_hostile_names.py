@@ -186,6 +186,7 @@ def lie(root: Path, **changes: Any) -> None:
         ({"data_path": "x" * 10_000}, "data_path is"),
         ({"fps": "20"}, "fps is '20'"),
         ({"fps": 0.001}, "fps is 0.001"),
+        ({"fps": 10**400}, "fps is 1000"),
         ({"robot_type": {"a": 1}}, "robot_type is"),
         ({"total_frames": "9"}, "total_frames is '9'"),
         ({"total_episodes": 2**60}, "total_episodes is"),

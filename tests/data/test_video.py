@@ -44,11 +44,6 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 
 
 @pytest.fixture(scope="module")
-def filmed(make_episode: MakeEpisode, two: s.RobotTaskSpec) -> list[Episode]:
-    return numbered_episodes(make_episode, two)
-
-
-@pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
     root = tmp_path_factory.mktemp("filmed") / "lift"
     write_dataset(filmed, root, two, **OPTIONS)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ from av.video.stream import VideoStream
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.atomic import descriptor, try_lock
 from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
@@ -353,12 +352,9 @@ def test_a_video_that_is_wrong(filmed: Path, change: Change, texts: list[str]) -
 def test_a_writer_that_lives_is_no_leftover(alone: Path) -> None:
     partial = alone.with_name(".lift.abc.partial")
     partial.mkdir()
-    handle = os.open(partial, os.O_RDONLY)
-    fcntl.flock(handle, fcntl.LOCK_EX)
-    try:
+    with descriptor(partial) as handle:
+        assert try_lock(handle)
         assert lines(alone) == []
-    finally:
-        os.close(handle)
     assert said(alone, "../.lift.abc.partial", kind="warning")
 
 
