@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
-EPISODES_FILE = "episodes.jsonl"
 FILMS = "films"
 FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust")
 
@@ -115,7 +114,13 @@ class EvalOptions:
         engine = Engine(self.workers, self.engine)
         job = self._job(engine, len(seeds))
         with contextlib.ExitStack() as held:
-            self._prepare(held)
+            try:  # before the first episode
+                held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
+            except OSError as error:
+                raise ManipError(
+                    f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
+                    'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
+                ) from error
             journal = EpisodeJournal.open(self.output_dir, job, self.suite)
             with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
                 result = self._evaluate(job, seeds, engine, journal, stages)
@@ -170,16 +175,6 @@ class EvalOptions:
 
         weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
         check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)
-
-    def _prepare(self, held: contextlib.ExitStack) -> None:
-        """Make the folder, before the first episode, and hold it for as long as `held` is open."""
-        try:
-            held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
-        except OSError as error:
-            raise ManipError(
-                f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
-                'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
-            ) from error
 
     def _evaluate(
         self, job: RolloutJob, seeds: range, engine: Engine, journal: EpisodeJournal, stages: Stages

@@ -28,6 +28,7 @@ from manip_il.cli.outputs import (
     save_options,
 )
 from manip_il.cli.progress import Stages, progress, say, warn
+from manip_il.data.atomic import exclusive
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 from manip_il.sim.config import Look
@@ -97,7 +98,6 @@ class RecordOptions(EnvOptions):
             from manip_il.data.video import VideoConfig
 
             VideoConfig(**asdict(self.dataset.rgb_encoder)).check(cameras.size, env.control_hz)
-        from manip_il.data.atomic import exclusive
         from manip_il.engine.engine import Engine
         from manip_il.engine.jobs import RolloutJob
 
@@ -178,7 +178,6 @@ class BuildOptions:
 
     def run(self) -> None:
         """Build the dataset; `ManipError` where a journal could not be read."""
-        from manip_il.data.atomic import exclusive
         from manip_il.data.build import build
 
         with exclusive(self.dataset):
@@ -221,7 +220,6 @@ class RenderOptions:
         cameras = self.image.config(self.cameras, self.look)
         if cameras is None:
             raise UsageError("--cameras names none; expected front, wrist or both")
-        from manip_il.data.atomic import exclusive
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.engine.engine import default_workers

@@ -70,7 +70,10 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
         file = replace(file, training_seeds=training_seeds)
     _check_numbers(path, file)
     arms = {name: replace(_arm(path, file, name), trust=trust) for name in file.arms}
-    envs = {name: _env(path, name, options) for name, options in arms.items()}
+    envs: dict[str, EnvConfig] = {}
+    for name, options in arms.items():
+        with _named(path, name):
+            envs[name] = options.config().env
     first = next(iter(envs))
     for name, env in envs.items():
         require_same_env(f"arm {first!r}", envs[first], f"arm {name!r}", env)
@@ -132,16 +135,10 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
         )
     layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
     for where, tree in layers:
-        for own in OWN:
-            if own in tree:
-                raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
+        if own := next((own for own in OWN if own in tree), None):
+            raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
     with _named(path, name):
         return from_layers(DaggerOptions, layers)
-
-
-def _env(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
-    with _named(path, name):
-        return options.config().env
 
 
 @contextmanager

@@ -7,18 +7,16 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from manip_il.cli.common_options import policy_help, trust_option
 from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
 from manip_il.cli.options import Open
 from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
 from manip_il.cli.progress import Stages, progress, say, set_quiet
+from manip_il.data.atomic import exclusive
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option, option_of
-
-if TYPE_CHECKING:
-    pass
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
@@ -78,7 +76,6 @@ class TrainOptions:
 
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
-        from manip_il.data.atomic import exclusive
         from manip_il.data.lerobot_read import read_fingerprint, read_spec
         from manip_il.learn.lerobot_config import LeRobotFit
 

@@ -17,11 +17,14 @@ from manip_il.option import option
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.report_data import Film, Paths, Strip
     from manip_il.evaluation.results import EvalResult
+    from manip_il.mdp import Episode
     from manip_il.sim.conditions import Condition
     from manip_il.sim.config import EnvConfig
 
 FOLDER = "evaluations"
+FILM_EVERY = 2  # control steps a frame of film
 SUITES = {
     "nominal": ("nominal",),
     "disturbed": ("knocked", "sensing"),
@@ -29,6 +32,7 @@ SUITES = {
     "all": ("nominal", "knocked", "sensing", "object", "view"),
 }
 CONDITIONS = SUITES["all"]
+_YAML = (".yaml", ".yml")
 SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
 
 
@@ -107,8 +111,7 @@ class Trial:
         from manip_il.evaluation.results import EvalSettings
 
         settings = EvalSettings.of(self.job(Path()), self.suite)
-        wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
-        for what, value in wanted.items():
+        for what, value in {"robot": self.env.robot, "task": self.env.task, "settings": settings}.items():
             if getattr(result, what) != value:
                 raise MismatchError(what, name, getattr(result, what), "this comparison", value)
         theirs = {episode.seed for episode in result.episodes}
@@ -140,7 +143,7 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
     from manip_il.tasks.table import get_task
 
     has_object = bool(get_task(task).grasped)
-    asked = [_read(name) for name in SUITES.get(suite, (suite,))]
+    asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
     if not left:
         blind = "" if sees else " and a policy without cameras"
@@ -150,27 +153,20 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
 
 def require_suite(suite: str) -> None:
     """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
-    if _is_file(suite):
+    if suite.endswith(_YAML):
         if not Path(suite).is_file():
             raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
     elif suite not in (*SUITES, *CONDITIONS):
         raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
 
 
-def _is_file(suite: str) -> bool:
-    return suite.endswith((".yaml", ".yml"))
-
-
-def _read(name: str) -> Condition:
-    require_suite(name)
-    return read_condition(Path(name) if _is_file(name) else _suites_folder() / f"{name}.yaml")
-
-
-def read_condition(path: Path) -> Condition:
-    """Return a YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
+def read_condition(name: str) -> Condition:
+    """Return a condition by its name, or a YAML of ranges by its path; `UsageError` names what is wrong with it."""
     from manip_il.sim.conditions import Condition
     from manip_il.yaml_file import read_yaml
 
+    require_suite(name)
+    path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
     tree = read_yaml(path, "a YAML of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
@@ -184,14 +180,6 @@ def _suites_folder() -> Path:
         if (place / "suites" / "nominal.yaml").is_file():
             return place / "suites"
     raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")
-
-
-if TYPE_CHECKING:
-    from manip_il.engine.jobs import RolloutJob
-    from manip_il.evaluation.report_data import Film, Paths, Strip
-    from manip_il.mdp import Episode
-
-FILM_EVERY = 2  # control steps a frame of film
 
 
 @dataclass(frozen=True)
