@@ -128,10 +128,7 @@ def match_seeds(left: Candidate, right: Candidate) -> tuple[Candidate, Candidate
 
 
 def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
-    """Return the amount of `rule.axis` that every run may have used.
-
-    `UsageError` where a source has no rounds to choose.
-    """
+    """Return the amount of `rule.axis` that all runs may have used; `UsageError` where a source has no rounds."""
     sources = list(sources)
     for source in sources:
         if rule.axis != END and not source.history:

@@ -8,23 +8,8 @@ from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from manip_il.cli.candidates import (
-    Source,
-    common_env,
-    limit_of,
-    match_seeds,
-    read_candidate,
-    require_candidate,
-)
-from manip_il.cli.common_options import (
-    EnvGroup,
-    MaybeRobotGroup,
-    MaybeTaskGroup,
-    engine_option,
-    require_workers,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
+from manip_il.cli.candidates import Source, common_env, limit_of, match_seeds, read_candidate, require_candidate
 from manip_il.cli.dagger import FREE
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
@@ -58,13 +43,13 @@ class CompareOptions:
     at: str = option("end", AT_HELP)
     eval: TrialGroup = field(default_factory=TrialGroup)
     suite: str = option("nominal", SUITE_HELP)
-    robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
-    task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
+    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
+    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
+    env: common.EnvGroup = field(default_factory=common.EnvGroup)
     seed: int = option(0, "shifts the stream of test seeds, 0 to 1000")
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/compare"), "folder of compare.json")
     resume: bool = option(False, "continue an interrupted comparison")
     overwrite: bool = option(False, "replace an existing comparison")
@@ -78,7 +63,7 @@ class CompareOptions:
             require_candidate(side)
         if self.left.resolve() == self.right.resolve():
             raise UsageError(f"{self.left} is compared with itself; give two different ones")
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         require_suite(self.suite)
         require_output(self.output_dir, "compare", resume=self.resume, overwrite=self.overwrite)
 

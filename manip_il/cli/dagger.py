@@ -12,16 +12,7 @@ from manip_il import checks
 from manip_il.algorithms.config import BetaSchedule, RunConfig, Sampling, check_cameras, check_labels
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
-from manip_il.cli.common_options import (
-    EnvOptions,
-    ImageGroup,
-    engine_option,
-    policy_help,
-    require_workers,
-    seed_option,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import start_policy
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import (
@@ -50,7 +41,7 @@ FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ w
 
 
 @dataclass
-class DaggerOptions(EnvOptions):
+class DaggerOptions(common.EnvOptions):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
@@ -80,7 +71,7 @@ class DaggerOptions(EnvOptions):
     policy: Open = option_of(FitConfig, "policy")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
-    image: ImageGroup = field(default_factory=ImageGroup)
+    image: common.ImageGroup = field(default_factory=common.ImageGroup)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
@@ -90,17 +81,17 @@ class DaggerOptions(EnvOptions):
     scheduler: Open = option_of(FitConfig, "scheduler")
     validation_episodes: int = option_of(RunConfig, "validation_episodes")
     hold: int = option_of(RunConfig, "hold")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/dagger"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
         self._config()
 
@@ -146,7 +137,7 @@ class DaggerOptions(EnvOptions):
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
         """Return the options of the policy that `--policy.type` names."""
-        return policy_help(words)
+        return common.policy_help(words)
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:

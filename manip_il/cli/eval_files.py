@@ -7,12 +7,12 @@ from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.common_options import trust_option
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy, require_eval
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, append_jsonl, atomic_write, open_output, read_jsonl, require_new
 from manip_il.cli.progress import say, warn
-from manip_il.cli.trials import Shot, condition_caption
+from manip_il.cli.trials import Shot
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import option
 
@@ -101,7 +101,7 @@ class ReplayOptions:
     episode: int = option(MISSING, "which of its episodes, the first one is 0")
     video: Path | None = option(None, "an MP4 to write")
     policy: PolicyPathGroup = field(default_factory=PolicyPathGroup)
-    trust: bool = trust_option()
+    trust: bool = common.trust_option()
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
@@ -125,7 +125,7 @@ class ReplayOptions:
         after = episode_result(job, episode)
         say(_text(before))
         if self.video is not None:
-            film, _ = Shot(job, episode, condition_caption(job, episode), success=episode.success).film()
+            film, _ = Shot.of(job, episode).film()
             atomic_write(self.video, film.mp4)
             say(f"video: {self.video}")
         differences = _differences(before, after)

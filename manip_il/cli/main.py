@@ -238,15 +238,13 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
 
 def _row(option: Option) -> tuple[str, str]:
     left = option.label if option.positional else f"{option.label}={metavar(option.type)}"
-    return left, f"{option.help} [{_default_text(option)}]".lstrip()
-
-
-def _default_text(option: Option) -> str:
     if option.default is MISSING:
-        return "required"
-    if option.is_open or option.default is None or option.default == []:
-        return "none"
-    return word(option.default) or "empty"
+        default = "required"
+    elif option.is_open or option.default is None or option.default == []:
+        default = "none"
+    else:
+        default = word(option.default) or "empty"
+    return left, f"{option.help} [{default}]".lstrip()
 
 
 def _stdout_is_gone() -> bool:

@@ -60,8 +60,8 @@ def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     `command_line_only=True` for an option that no file may set, and that no file of options holds.
     """
     found: list[Option] = []
-    for field, field_type in typed_fields(cls):
-        name, default = prefix + field.name, default_of(field, base)
+    for field, field_type, default in fields_of(cls, base):
+        name = prefix + field.name
         if dataclasses.is_dataclass(field_type):
             found += options_of(typing.cast(type, field_type), None if default is MISSING else default, f"{name}.")
         else:
@@ -70,17 +70,13 @@ def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     return found
 
 
-def typed_fields(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
-    """Yield every field of a dataclass that its constructor takes, with its type."""
+def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:
+    """Yield every field that a dataclass's constructor takes, its type, and its value in `base`, else its default."""
     hints = typing.get_type_hints(cls)
-    return ((field, hints[field.name]) for field in dataclasses.fields(cls) if field.init)
-
-
-def default_of(field: dataclasses.Field[Any], base: Any) -> Any:
-    """Return the field's value in `base`, or its default where `base` is None."""
-    if base is not None:
-        return getattr(base, field.name)
-    return field.default_factory() if field.default_factory is not MISSING else field.default
+    for field in dataclasses.fields(cls):
+        own = field.default if field.default_factory is MISSING else field.default_factory()
+        if field.init:
+            yield field, hints[field.name], own if base is None else getattr(base, field.name)
 
 
 def value_of(options: Any, name: str) -> Any:

@@ -22,10 +22,7 @@ _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a f
 
 @contextmanager
 def open_output(options: Any, free: Iterable[str] = (), may_grow: str | None = None) -> Generator[Path]:
-    """Hold and prepare `options.output_dir`, and write `config.yaml` into it.
-
-    A run that is resumed must have the same options as before, see `check_same_options`.
-    """
+    """Hold and prepare `options.output_dir`, with `config.yaml` in it; a resumed run must have the same options."""
     folder, resume = options.output_dir, getattr(options, "resume", False)
     with exclusive(folder):
         prepare_output(folder, resume=resume, overwrite=options.overwrite)

@@ -17,18 +17,7 @@ from typing import Any
 
 from manip_il import __version__
 from manip_il.checks import shorten
-from manip_il.cli.options import (
-    Open,
-    Option,
-    choices,
-    decode,
-    default_of,
-    expected,
-    options_of,
-    to_plain,
-    typed_fields,
-    without_none,
-)
+from manip_il.cli.options import Open, Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
 from manip_il.errors import UsageError, did_you_mean, nearest
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
@@ -179,8 +168,8 @@ def _read_tree(
 def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
     """Return an instance of `cls` of the given values, else `base`'s, else the defaults."""
     arguments: dict[str, Any] = {}
-    for field, field_type in typed_fields(cls):
-        name, default = prefix + field.name, default_of(field, base)
+    for field, field_type, default in fields_of(cls, base):
+        name = prefix + field.name
         if dataclasses.is_dataclass(field_type):
             nested = None if default is MISSING else default
             arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")

@@ -99,11 +99,11 @@ class PushOptions:
         if published is None:
             _say_plan(plan, url)
             return
-        counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
-        if not published.uploaded and not published.removed:
-            say(f"{url}: {published.kept} files, all there already")
-        else:
+        if published.uploaded or published.removed:
+            counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
             say(f"{url}: {counts}; {published.removed} removed; {published.kept} unchanged")
+        else:
+            say(f"{url}: {published.kept} files, all there already")
         say(f"next: manip-il pull {url} FOLDER")
 
 

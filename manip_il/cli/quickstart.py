@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from manip_il import checks
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
-from manip_il.cli.common_options import EnvOptions, engine_option, seed_option, workers_option
+from manip_il.cli import common_options as common
 from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
@@ -54,7 +54,7 @@ class PolicyGroup:
 
 
 @dataclass
-class QuickstartOptions(EnvOptions):
+class QuickstartOptions(common.EnvOptions):
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
@@ -72,9 +72,9 @@ class QuickstartOptions(EnvOptions):
     validation_episodes: int = option_of(RunConfig, "validation_episodes", 100)
     test_episodes: int = option(200, "unseen test episodes, used for no choice")
     disturbed_episodes: int = option(100, "the first of them again, disturbed")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
     output_dir: Path = option(Path("runs/quickstart"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
@@ -264,10 +264,7 @@ def read_timings(path: Path) -> dict[str, float]:
 
 
 def quickstart_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
-    """Return the first sentence of the report.
-
-    significant: whether DAgger and cloning with as many labels are shown to differ.
-    """
+    """Return the report's first sentence; significant: whether DAgger differs from cloning with as many labels."""
     from manip_il.evaluation.intervals import format_percent
 
     _, cloned, more, dagger = rows

@@ -13,8 +13,8 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from manip_il.cli import common_options as common
 from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
-from manip_il.cli.common_options import engine_option, require_workers, trust_option, workers_option
 from manip_il.cli.compare import rule_json
 from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
 from manip_il.cli.options import to_plain
@@ -50,9 +50,9 @@ class StudyOptions:
     example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
     file: Path = option(MISSING, "YAML of the study", positional=True)
     training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/study"), "folder of the study")
     resume: bool = option(False, "continue an interrupted study")
     overwrite: bool = option(False, "replace an existing study")
@@ -60,10 +60,9 @@ class StudyOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         if not self.file.is_file():
-            raise UsageError(
-                f"{self.file} does not exist; expected the YAML of a study, such as configs/studies/*.yaml"
-            )
-        require_workers(self.workers)
+            wanted = "the YAML of a study, such as configs/studies/*.yaml"
+            raise UsageError(f"{self.file} does not exist; expected {wanted}")
+        common.require_workers(self.workers)
         require_output(self.output_dir, "study", resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:

@@ -89,10 +89,7 @@ def keep_file(folder: Path, file: StudyFile) -> None:
 
 
 def check_same_file(folder: Path, file: StudyFile) -> None:
-    """Raise `MismatchError` naming the option unless the study in `folder` was started with the same file.
-
-    There may be more training seeds than before.
-    """
+    """Raise `MismatchError` for an option that differs from the study's in `folder`; training seeds may be more."""
     path = folder / STUDY_FILE
     if not path.is_file():
         return
@@ -115,16 +112,12 @@ def _check_numbers(path: Path, file: StudyFile) -> None:
     if not 0 < file.target <= 1:
         raise UsageError(f"{path}: target is {file.target}; expected a share above 0 and up to 1, such as 0.95")
     for name in file.arms:
-        if not _is_arm_name(name):
+        is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
+        if not is_name or ".." in name or name == FOLDER:
             raise UsageError(
                 f"{path}: an arm is named {checks.shorten(name)}, which becomes a folder; expected letters, digits, "
                 f"_ . and -, at most {checks.LONGEST_NAME}{', and not ' + FOLDER if name == FOLDER else ''}"
             )
-
-
-def _is_arm_name(name: object) -> bool:
-    is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
-    return bool(is_name) and ".." not in str(name) and name != FOLDER
 
 
 def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:

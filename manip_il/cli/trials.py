@@ -45,10 +45,7 @@ class TrialGroup:
 
 @dataclass(frozen=True)
 class Trial:
-    """Environment, seeds and conditions in which policies are tested.
-
-    trust: whether models that their checkpoints name may be loaded.
-    """
+    """Environment, seeds and conditions of tests; trust: whether models that checkpoints name may be loaded."""
 
     env: EnvConfig
     seeds: range
@@ -100,9 +97,8 @@ class Trial:
             result = evaluate(engine, self.job(policy), self.seeds, name, stages.episode, suite=self.suite)
             stages.close()
             if complete and len(result.episodes) < len(self.seeds):
-                raise ManipError(
-                    f"{name} has {len(result.episodes)} of {len(self.seeds)} test episodes, because workers died"
-                )
+                have = f"{len(result.episodes)} of {len(self.seeds)}"
+                raise ManipError(f"{name} has {have} test episodes, because workers died")
             result.write(file)
         return EvalResult.read(file)
 
@@ -192,6 +188,15 @@ class Shot:
     caption: str = ""
     success: bool | None = None
 
+    @classmethod
+    def of(cls, job: RolloutJob, episode: Episode) -> Shot:
+        """Show an episode with its outcome, seed, and the condition where not nominal: `Seed 4000000, knocked`."""
+        from manip_il.sim.conditions import NOMINAL, draw
+
+        condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
+        title = f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
+        return cls(job, episode, title, success=episode.success)
+
     def film(self) -> tuple[Film, Strip]:
         """Return the episode as it looked. Raises `RenderError` where there is no OpenGL."""
         from manip_il.evaluation.film import film, make_film, strip
@@ -235,11 +240,3 @@ def film_shots(shots: Sequence[Shot], stages: Stages) -> Pictures:
     finally:
         stages.close()
     return Pictures(tuple(film for film, _ in made), tuple(strip for _, strip in made))
-
-
-def condition_caption(job: RolloutJob, episode: Episode) -> str:
-    """Return the seed, and the condition where that is not nominal: `Seed 4000000, knocked`."""
-    from manip_il.sim.conditions import NOMINAL, draw
-
-    condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
-    return f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
