@@ -128,10 +128,7 @@ def match_seeds(left: Candidate, right: Candidate) -> tuple[Candidate, Candidate
 
 
 def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
-    """Return the amount of `rule.axis` that every run may have used.
-
-    `UsageError` where a source has no rounds to choose.
-    """
+    """Return the amount of `rule.axis` that all runs may have used; `UsageError` where a source has no rounds."""
     sources = list(sources)
     for source in sources:
         if rule.axis != END and not source.history:
@@ -145,15 +142,12 @@ def common_env(sources: Sequence[Source], group: EnvGroup, robot: str | None, ta
 
     Raises `MismatchError` naming the first setting in which two differ.
     """
-    claims: list[tuple[str, EnvConfig]] = []
     run = next((source.env for source in sources if source.env is not None), None)
-    for source in sources:
-        if source.result is None:
-            claims.append((source.name, source.env or _policy_env(source, run, group, robot, task)))
-    name, env = claims[0]
-    for other, theirs in claims[1:]:
-        require_same_env(name, env, other, theirs)
-    return env
+    tested = [source for source in sources if source.result is None]
+    envs = [source.env or _policy_env(source, run, group, robot, task) for source in tested]
+    for source, env in zip(tested, envs, strict=True):
+        require_same_env(tested[0].name, envs[0], source.name, env)
+    return envs[0]
 
 
 def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) -> None:
@@ -188,10 +182,7 @@ def _read_source(path: Path) -> Source:
     records = read_jsonl(path / METRICS_FILE) if (path / METRICS_FILE).is_file() else []
     if options is not None or any("round" in record for record in records):  # `manip-il train` counts steps there
         source = Source(path, history=history(records, str(path)), finished=run_finished(path))
-        if options is None:
-            return source
-        env = options.env_config()
-        return replace(source, training_seed=options.seed, env=env)
+        return source if options is None else replace(source, training_seed=options.seed, env=options.env_config())
     if (path / FILE_NAME).is_file():
         return Source(path, result=EvalResult.read(path))
     try:

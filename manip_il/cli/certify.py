@@ -4,26 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from manip_il.cli.common_options import (
-    EnvGroup,
-    MaybeRobotGroup,
-    MaybeTaskGroup,
-    engine_option,
-    require_workers,
-    seed_option,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy
 from manip_il.cli.outputs import open_output, require_new
 from manip_il.cli.progress import progress, say
 from manip_il.errors import UsageError
 from manip_il.option import option
-
-if TYPE_CHECKING:
-    from manip_il.sim.config import EnvConfig
 
 
 @dataclass
@@ -38,15 +26,15 @@ class CertifyOptions:
     """Measure how the expert recovers from perturbed states and wrong actions; writes certificate.json."""
 
     example: ClassVar[str] = "manip-il certify --policy.path=runs/dagger --output_dir=runs/certificate"
-    robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
-    task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
+    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
+    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
     policy: VisitorGroup = field(default_factory=VisitorGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
+    env: common.EnvGroup = field(default_factory=common.EnvGroup)
     cases: int = option(500, "episodes of each kind")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/certificate"), "folder of certificate.json")
     overwrite: bool = option(False, "replace an existing certificate")
 
@@ -54,7 +42,7 @@ class CertifyOptions:
         """Refuse what paths and values show to be wrong."""
         if self.cases < 1:
             raise UsageError(f"--cases is {self.cases}; expected at least 1")
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         if self.policy.path is not None:
             find_policy(self.policy.path)
         require_new(self.output_dir, overwrite=self.overwrite)
@@ -62,7 +50,15 @@ class CertifyOptions:
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
-        env, policy = self._env_and_policy()
+        policy = meta = None
+        if self.policy.path is not None:
+            from manip_il.learn.checkpoint import read_meta
+
+            policy = find_policy(self.policy.path)
+            meta = read_meta(policy)
+        env = self.env.config(self.robot.type, self.task.type, meta)
+        if policy is not None:
+            check_policy(policy, meta, env, draw=self.engine == "local", trust=self.trust)
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.certificate import FILE_NAME, summary_lines
         from manip_il.evaluation.certify import certify, count_episodes
@@ -79,14 +75,3 @@ class CertifyOptions:
         for line in summary_lines(certificate):
             say(line)
         say(f"result: {folder / FILE_NAME}")
-
-    def _env_and_policy(self) -> tuple[EnvConfig, Path | None]:
-        if self.policy.path is None:
-            return self.env.config(self.robot.type, self.task.type), None
-        from manip_il.learn.checkpoint import read_meta
-
-        path = find_policy(self.policy.path)
-        meta = read_meta(path)
-        env = self.env.config(self.robot.type, self.task.type, meta)
-        check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
-        return env, path

@@ -121,10 +121,7 @@ class ImageGroup:
     width: int = option_of(CameraConfig, "width")
 
     def config(self, cameras: Sequence[str], look: Look | None = None) -> CameraConfig | None:
-        """Return the cameras and their pictures; None without cameras.
-
-        `UnknownName` for a camera, `UsageError` for a size.
-        """
+        """Return the cameras, None for none; `UnknownName` for a camera, `UsageError` for a size."""
         return CameraConfig(tuple(cameras), self.height, self.width, look or Look()) if cameras else None
 
 

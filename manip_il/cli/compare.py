@@ -8,34 +8,19 @@ from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from manip_il.cli.candidates import (
-    Candidate,
-    Source,
-    common_env,
-    limit_of,
-    match_seeds,
-    read_candidate,
-    require_candidate,
-)
-from manip_il.cli.common_options import (
-    EnvGroup,
-    MaybeRobotGroup,
-    MaybeTaskGroup,
-    engine_option,
-    require_workers,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
+from manip_il.cli.candidates import Source, common_env, limit_of, match_seeds, read_candidate, require_candidate
 from manip_il.cli.dagger import FREE
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, open_output, require_output
 from manip_il.cli.progress import Stages, say, warn
 from manip_il.cli.trials import SUITE_HELP, Trial, TrialGroup, require_suite
 from manip_il.errors import UsageError
-from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, require_same_episodes
-from manip_il.evaluation.results import write_json
+from manip_il.evaluation.comparison import FILE_NAME, Arm, Comparison, comparison_facts, require_same_episodes
+from manip_il.evaluation.results import compare_results, write_json
 from manip_il.evaluation.rounds import Rule
 from manip_il.option import option
+from manip_il.seeding import stream_seeds
 
 AT_HELP = (
     "which rounds of a run count: end (all), labels, episodes or seconds (up to what every run reached; seconds of "
@@ -58,13 +43,13 @@ class CompareOptions:
     at: str = option("end", AT_HELP)
     eval: TrialGroup = field(default_factory=TrialGroup)
     suite: str = option("nominal", SUITE_HELP)
-    robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
-    task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
+    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
+    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
+    env: common.EnvGroup = field(default_factory=common.EnvGroup)
     seed: int = option(0, "shifts the stream of test seeds, 0 to 1000")
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/compare"), "folder of compare.json")
     resume: bool = option(False, "continue an interrupted comparison")
     overwrite: bool = option(False, "replace an existing comparison")
@@ -78,7 +63,7 @@ class CompareOptions:
             require_candidate(side)
         if self.left.resolve() == self.right.resolve():
             raise UsageError(f"{self.left} is compared with itself; give two different ones")
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         require_suite(self.suite)
         require_output(self.output_dir, "compare", resume=self.resume, overwrite=self.overwrite)
 
@@ -86,21 +71,40 @@ class CompareOptions:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""
         rule = Rule.parse(self.checkpoint, self.at)
         left, right, lines = match_seeds(read_candidate(self.left), read_candidate(self.right))
-        sources = (*left.sources, *right.sources)
-        warn([*lines, *_unfinished(sources)])
+        both = (left, right)
+        sources = [source for side in both for source in side.sources]
+        warn(lines)
+        warn(
+            f"{source.name} is not finished: the {len(source.history)} rounds that it has count"
+            for source in sources
+            if not source.finished
+        )
         limit = limit_of(rule, sources)
         trial = self._trial(sources, rule, limit)
+        from manip_il.engine.engine import Engine
+        from manip_il.evaluation.compare_report import compare_report, comparison_table
+        from manip_il.evaluation.tables import print_table
+
         with open_output(self, FREE) as folder:
-            comparison = Comparison(*self._measure((left, right), rule, limit, trial))
+            kept = f"every finished evaluation, in {folder}"
+            with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
+                last = (rule, limit, trial, folder, engine, stages)
+                arms = [Arm(str(side.path), tuple(one.measure(*last) for one in side.sources)) for side in both]
+            comparison = Comparison(*arms)
             content = comparison.to_json() | {"rule": rule_json(rule, limit), **_test_json(comparison)}
             write_json(folder / FILE_NAME, content)
-            self._report(comparison, rule, limit)
-        self._say(comparison, rule, limit)
+            facts = comparison_facts(comparison, rule, limit)
+            report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
+            report.write(folder / REPORT_FILE)
+        print_table(comparison_table(comparison))
+        for line in (*facts, comparison.verdict):
+            say(line)
+        say(f"result: {folder / FILE_NAME}")
+        say(f"report: {folder / REPORT_FILE}")
+        say(f"next: {self._next(comparison)}")
 
     def _trial(self, sources: Sequence[Source], rule: Rule, limit: float | None) -> Trial | None:
         """Return the test to run, checked; None where all is evaluated already."""
-        from manip_il.seeding import stream_seeds
-
         results = [source for source in sources if source.result is not None]
         for other in results[1:]:
             _require_same(results[0], other)
@@ -114,37 +118,6 @@ class CompareOptions:
             trial.check_result(source.name, source.evaluation)
         trial.check_policies(policies, self.output_dir, self.engine)
         return trial
-
-    def _measure(
-        self, candidates: Sequence[Candidate], rule: Rule, limit: float | None, trial: Trial | None
-    ) -> list[Arm]:
-        from manip_il.engine.engine import Engine
-
-        kept = f"every finished evaluation, in {self.output_dir}"
-        with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            last = (rule, limit, trial, self.output_dir, engine, stages)
-            return [Arm(str(one.path), tuple(source.measure(*last) for source in one.sources)) for one in candidates]
-
-    def _report(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.compare_report import compare_report
-        from manip_il.evaluation.comparison import comparison_facts
-
-        facts = comparison_facts(comparison, rule, limit)
-        report = compare_report(comparison, command_line("compare", self), facts, to_plain(self))
-        report.write(self.output_dir / REPORT_FILE)
-
-    def _say(self, comparison: Comparison, rule: Rule, limit: float | None) -> None:
-        from manip_il.evaluation.compare_report import comparison_table
-        from manip_il.evaluation.comparison import comparison_facts
-        from manip_il.evaluation.tables import print_table
-
-        print_table(comparison_table(comparison))
-        for line in comparison_facts(comparison, rule, limit):
-            say(line)
-        say(comparison.verdict)
-        say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
-        say(f"next: {self._next(comparison)}")
 
     def _next(self, comparison: Comparison) -> str:
         policies = [member.policy for arm in (comparison.left, comparison.right) for member in arm.members]
@@ -174,17 +147,8 @@ def _test_json(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _unfinished(sources: Sequence[Source]) -> list[str]:
-    return [
-        f"{source.name} is not finished: the {len(source.history)} rounds that it has count"
-        for source in sources
-        if not source.finished
-    ]
-
-
 def _require_same(left: Source, right: Source) -> None:
     from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.evaluation.results import compare_results
 
     ours, theirs = left.evaluation, right.evaluation
     compare_results(ours, theirs, (left.name, right.name))

@@ -9,18 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.algorithms.config import RunConfig, Sampling, check_cameras, check_labels
+from manip_il.algorithms.config import BetaSchedule, RunConfig, Sampling, check_cameras, check_labels
+from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
-from manip_il.cli.common_options import (
-    EnvOptions,
-    ImageGroup,
-    engine_option,
-    policy_help,
-    require_workers,
-    seed_option,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import start_policy
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import (
@@ -34,12 +26,12 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
+from manip_il.engine.drivers import QueryRule
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import MLP_STEPS, FitConfig
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.rounds import RoundResult
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import LearningCurve
@@ -49,7 +41,7 @@ FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ w
 
 
 @dataclass
-class DaggerOptions(EnvOptions):
+class DaggerOptions(common.EnvOptions):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
     Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
@@ -79,7 +71,7 @@ class DaggerOptions(EnvOptions):
     policy: Open = option_of(FitConfig, "policy")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
-    image: ImageGroup = field(default_factory=ImageGroup)
+    image: common.ImageGroup = field(default_factory=common.ImageGroup)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
@@ -89,17 +81,17 @@ class DaggerOptions(EnvOptions):
     scheduler: Open = option_of(FitConfig, "scheduler")
     validation_episodes: int = option_of(RunConfig, "validation_episodes")
     hold: int = option_of(RunConfig, "hold")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/dagger"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
         self._config()
 
@@ -128,12 +120,10 @@ class DaggerOptions(EnvOptions):
 
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
-        from manip_il.algorithms.config import BetaSchedule
-        from manip_il.engine.drivers import QueryRule
-
+        same = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         made = {
             "env": self.env_config(),
-            "fit": self._fit(),
+            "fit": FitConfig(policy=start_policy(self.policy), **{name: getattr(self, name) for name in same}),
             "cameras": self.image.config(self.cameras),
             "beta": BetaSchedule.parse(self.beta),
             "query_rule": None if self.query is None else QueryRule.parse(self.query),
@@ -144,14 +134,10 @@ class DaggerOptions(EnvOptions):
         check_method(config)
         return config
 
-    def _fit(self) -> FitConfig:
-        own = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
-        return FitConfig(policy=start_policy(self.policy), **{name: getattr(self, name) for name in own})
-
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
         """Return the options of the policy that `--policy.type` names."""
-        return policy_help(words)
+        return common.policy_help(words)
 
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
@@ -163,29 +149,18 @@ def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) 
     results: list[RoundResult] = []
     for result in run_algorithm(config, folder, engine, stages.watch()):
         stages.close()
-        _add_metrics(folder / METRICS_FILE, result)
+        # Unless it is there from before an interruption, with the seconds of then.
+        if all(record.get("round") != result.round for record in read_jsonl(folder / METRICS_FILE)):
+            append_jsonl(folder / METRICS_FILE, result.to_json())
         results.append(result)
-        say(_line(result))
+        took = f"{sum(result.seconds.values()):.0f} s"
+        success = f"validation success {result.validation.success}"
+        say(f"round {result.round}: {result.labels:,} labels, {success}, {took}")
         stages.check()
     return results
 
 
-def _add_metrics(path: Path, result: RoundResult) -> None:
-    """Add the round's line, unless it is there from before an interruption, with the seconds of then."""
-    if all(record.get("round") != result.round for record in read_jsonl(path)):
-        append_jsonl(path, result.to_json())
-
-
-def _line(result: RoundResult) -> str:
-    seconds = sum(result.seconds.values())
-    return (
-        f"round {result.round}: {result.labels:,} labels, validation success {result.validation.success}, "
-        f"{seconds:.0f} s"
-    )
-
-
 def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult]) -> RunReport:
-    from manip_il.algorithms.rounds import best_round
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import PolicyRow
     from manip_il.evaluation.results import compare_results
@@ -219,7 +194,6 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
     Where round 0 is the best itself, it is compared with the last round. names: of the rounds.
     """
-    from manip_il.algorithms.rounds import best_round
     from manip_il.evaluation.results import compare_results
 
     best = best_round(list(results))
@@ -228,12 +202,10 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
     if other is best:
         return f"{names[best.round]}: {found}."
     comparison = compare_results(other.validation, best.validation)
+    name = names[best.round]
     if comparison.significant and comparison.difference > 0:
-        return f"{names[best.round]} is the best of {len(results)}: {found}."
-    return (
-        f"{names[best.round]} is chosen of {len(results)}, with {found}; "
-        f"no difference from {names[other.round]} is shown."
-    )
+        return f"{name} is the best of {len(results)}: {found}."
+    return f"{name} is chosen of {len(results)}, with {found}; no difference from {names[other.round]} is shown."
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:

@@ -7,12 +7,12 @@ from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from manip_il.cli.common_options import trust_option
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy, require_eval
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, append_jsonl, atomic_write, open_output, read_jsonl, require_new
 from manip_il.cli.progress import say, warn
-from manip_il.cli.trials import Shot, condition_caption
+from manip_il.cli.trials import Shot
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import option
 
@@ -62,9 +62,8 @@ class EpisodeJournal:
                 result = EpisodeResult.from_json(line)
             except (KeyError, ManipError) as error:
                 why = f"{error} is missing" if isinstance(error, KeyError) else error
-                raise ManipError(
-                    f"{self.path}: a line that is not an episode ({why}); start again with --overwrite=true"
-                ) from error
+                text = f"a line that is not an episode ({why}); start again with --overwrite=true"
+                raise ManipError(f"{self.path}: {text}") from error
             if result.seed in seeds:
                 found[result.seed] = result
         return found
@@ -102,7 +101,7 @@ class ReplayOptions:
     episode: int = option(MISSING, "which of its episodes, the first one is 0")
     video: Path | None = option(None, "an MP4 to write")
     policy: PolicyPathGroup = field(default_factory=PolicyPathGroup)
-    trust: bool = trust_option()
+    trust: bool = common.trust_option()
 
     def check(self) -> None:
         """Refuse what the paths show to be wrong."""
@@ -126,7 +125,7 @@ class ReplayOptions:
         after = episode_result(job, episode)
         say(_text(before))
         if self.video is not None:
-            film, _ = Shot(job, episode, condition_caption(job, episode), success=episode.success).film()
+            film, _ = Shot.of(job, episode).film()
             atomic_write(self.video, film.mp4)
             say(f"video: {self.video}")
         differences = _differences(before, after)
@@ -146,16 +145,15 @@ class ReplayOptions:
 
         env = result.settings.env(result.robot, result.task)
         conditions, hold = result.settings.conditions, result.settings.hold
+        job = RolloutJob(env, "expert", hold=hold, label="last", conditions=conditions)
         if result.policy in NO_FILES and not result.policy_sha256 and self.policy.path is None:
-            cameras = None
-            job = RolloutJob(env, result.policy, hold=hold, label="last", conditions=conditions)  # pyright: ignore[reportArgumentType]
+            cameras, job = None, replace(job, driver=result.policy)
         else:
             path = self._find(result)
             cameras = check_policy(path, read_meta(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn([f"{path} is not the policy of {self.file}: its files differ"])
-            job = RolloutJob(env, "policy", policy=path, hold=hold, label="last", conditions=conditions)
-            job = replace(job, trust=self.trust)
+            job = replace(job, driver="policy", policy=path, trust=self.trust)
         here = env_fingerprint(env, cameras)
         warn(compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
         return job
@@ -192,13 +190,12 @@ def _short(value: Any) -> str:
 
 def _differences(before: EpisodeResult, after: EpisodeResult) -> list[str]:
     """Return in what two runs of one episode differ; `MismatchError` where they had other conditions."""
-    if before.detail.get("drawn", {}) != dict(after.detail["drawn"]):
-        raise MismatchError(
-            "what is drawn for the episode", "then", before.detail.get("drawn"), "now", dict(after.detail["drawn"])
-        )
+    now = dict(after.detail["drawn"])
+    if before.detail.get("drawn", {}) != now:
+        raise MismatchError("what is drawn for the episode", "then", before.detail.get("drawn"), "now", now)
     pairs = {name: (getattr(before, name), getattr(after, name)) for name in ("success", "success_at_end", "steps")}
     pairs |= {"return": (before.ret, after.ret)}
-    return [f"{name} was {then}, is {now}" for name, (then, now) in pairs.items() if then != now]
+    return [f"{name} was {was}, is {value}" for name, (was, value) in pairs.items() if was != value]
 
 
 @dataclass

@@ -8,30 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from manip_il.cli.common_options import (
-    EnvGroup,
-    MaybeRobotGroup,
-    MaybeTaskGroup,
-    engine_option,
-    require_workers,
-    seed_option,
-    trust_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
 from manip_il.cli.eval_files import EpisodeJournal
 from manip_il.cli.inputs import check_policy, find_policy, observation_text
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import (
-    SUITE_HELP,
-    Pictures,
-    Shot,
-    condition_caption,
-    film_shots,
-    require_suite,
-    suite_conditions,
-)
+from manip_il.cli.trials import SUITE_HELP, Pictures, Shot, film_shots, require_suite, suite_conditions
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 
@@ -41,7 +24,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
-EPISODES_FILE = "episodes.jsonl"
 FILMS = "films"
 FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust")
 
@@ -74,16 +56,16 @@ class EvalOptions:
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
-    robot: MaybeRobotGroup = field(default_factory=MaybeRobotGroup)
-    task: MaybeTaskGroup = field(default_factory=MaybeTaskGroup)
-    env: EnvGroup = field(default_factory=EnvGroup)
+    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
+    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
+    env: common.EnvGroup = field(default_factory=common.EnvGroup)
     eval: EvalGroup = field(default_factory=EvalGroup)
     suite: str = option("nominal", SUITE_HELP)
     until_width: float | None = option(None, "stop when the interval is this narrow; 0.02 is 2 points")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/eval"), "folder of eval.json")
     resume: bool = option(False, "continue an interrupted evaluation, or add more episodes")
     overwrite: bool = option(False, "replace an existing evaluation")
@@ -99,7 +81,7 @@ class EvalOptions:
         if self.until_width is not None and not 0 < self.until_width < 1:
             raise UsageError(f"--until_width is {self.until_width}; expected between 0 and 1: 0.02 for 2 points")
         self._seeds()
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         if self.policy.path is not None:
             find_policy(self.policy.path)
         require_suite(self.suite)
@@ -115,7 +97,13 @@ class EvalOptions:
         engine = Engine(self.workers, self.engine)
         job = self._job(engine, len(seeds))
         with contextlib.ExitStack() as held:
-            self._prepare(held)
+            try:  # before the first episode
+                held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
+            except OSError as error:
+                raise ManipError(
+                    f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
+                    'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
+                ) from error
             journal = EpisodeJournal.open(self.output_dir, job, self.suite)
             with Stages(f"finished episodes, in {self.output_dir}") as stages, engine:
                 result = self._evaluate(job, seeds, engine, journal, stages)
@@ -171,16 +159,6 @@ class EvalOptions:
         weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
         check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)
 
-    def _prepare(self, held: contextlib.ExitStack) -> None:
-        """Make the folder, before the first episode, and hold it for as long as `held` is open."""
-        try:
-            held.enter_context(open_output(self, FREE, may_grow="eval.n_episodes"))
-        except OSError as error:
-            raise ManipError(
-                f"{self.output_dir} cannot be written to ({error.strerror}); choose another --output_dir, or in a "
-                'container run as the owner of the folder: docker run --user "$(id -u):$(id -g)"'
-            ) from error
-
     def _evaluate(
         self, job: RolloutJob, seeds: range, engine: Engine, journal: EpisodeJournal, stages: Stages
     ) -> EvalResult:
@@ -206,10 +184,9 @@ class EvalOptions:
         if not seeds:
             return Pictures()
         stages.start("films", len(seeds))
-        episodes = {episode.seed: episode for episode in engine.run(replace(job, label="last"), seeds)}
+        episodes = {episode.seed: episode for episode in engine.run(job, seeds)}
         filmed = [episodes[seed] for seed in seeds]
-        shots = [Shot(job, one, condition_caption(job, one), success=one.success) for one in filmed]
-        pictures = film_shots(shots, stages)
+        pictures = film_shots([Shot.of(job, one) for one in filmed], stages)
         for film, episode in zip(pictures.films, filmed, strict=False):  # no films without OpenGL
             outcome = "success" if episode.success else "failure"
             atomic_write(self.output_dir / FILMS / f"seed_{episode.seed}_{outcome}.mp4", film.mp4)

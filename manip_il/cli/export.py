@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from manip_il.cli.inputs import find_policy
 from manip_il.cli.outputs import atomic_write
@@ -35,9 +34,8 @@ class ExportOptions:
 
     def run(self) -> None:
         """Export, compare, write."""
-        output = self._output()
-        path = find_policy(self.policy)
-        self._check(path, output)
+        output = self.output or Path(f"policy{SUFFIXES[self.format]}")
+        path = self._find(output)
         from manip_il.engine.environments import policy_sha256
         from manip_il.learn.export import export_onnx, export_torchscript
 
@@ -47,20 +45,18 @@ class ExportOptions:
         if "robot" not in exported.metadata:
             warn([f"{path} was written by another tool: the file does not say robot, task, control rate and names"])
         say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
-        say("\n".join(_lines(exported.metadata)))
+        for direction, tensors in (("in", exported.metadata["inputs"]), ("out", exported.metadata["outputs"])):
+            for one in tensors:
+                say(f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})")
         say(f"exported: {output} ({len(exported.data):,} bytes)")
 
-    def _output(self) -> Path:
-        """Where the file goes; `UsageError` where it may not."""
-        output = self.output or Path(f"policy{SUFFIXES[self.format]}")
+    def _find(self, output: Path) -> Path:
+        """Return the policy; raise, before anything heavy is imported, where it cannot be exported, or not to there."""
         if output.is_dir():
             raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
         if output.exists() and not self.overwrite:
             raise UsageError(f"{output} exists already; replace it with --overwrite=true, or choose another --output")
-        return output
-
-    def _check(self, path: Path, output: Path) -> None:
-        """Raise before anything heavy is imported where this policy cannot be exported, or not on this machine."""
+        path = find_policy(self.policy)
         if output.resolve().is_relative_to(path.resolve()):
             raise UsageError(f"--output is {output}, inside the policy's own folder {path}; choose another place")
         from manip_il.learn.pretrained import read_config
@@ -70,12 +66,4 @@ class ExportOptions:
             raise ManipError(f"{path} is a policy of type {kind!r}; only {' and '.join(EXPORTABLE)} can be exported")
         if self.format == "onnx" and (missing := [name for name in ONNX_PACKAGES if find_spec(name) is None]):
             raise ManipError(f"--format=onnx needs {' and '.join(missing)}: pip install 'manip_il[export]'")
-
-
-def _lines(metadata: Mapping[str, Any]) -> list[str]:
-    """The file's inputs and outputs, a line each."""
-    tensors = [("in", one) for one in metadata["inputs"]] + [("out", one) for one in metadata["outputs"]]
-    return [
-        f"{direction:>3}: {one['name']} {one['dtype']} ({', '.join(map(str, one['shape']))})"
-        for direction, one in tensors
-    ]
+        return path

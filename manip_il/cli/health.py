@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.progress import say
 from manip_il.errors import ManipError, RenderError
+from manip_il.sim.gl import PACKAGES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,7 +54,8 @@ class HealthOptions:
 def check_backend(backend: str | None) -> None:
     """Raise `RenderError` for a MUJOCO_GL that mujoco cannot draw pictures off screen with."""
     if backend is None:
-        raise RenderError("MUJOCO_GL is not set, and neither EGL nor OSMesa is installed; " + _install())
+        install = f"on Debian: apt-get install -y {PACKAGES}"
+        raise RenderError(f"MUJOCO_GL is not set, and neither EGL nor OSMesa is installed; {install}")
     if backend.lower() not in _BACKENDS:
         raise RenderError(f"MUJOCO_GL is {backend!r}; expected egl or osmesa, or unset it")
 
@@ -140,9 +142,3 @@ def _cuda_devices() -> int:
     except OSError:
         return 0
     return count.value if driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0 else 0
-
-
-def _install() -> str:
-    from manip_il.sim.gl import PACKAGES
-
-    return f"on Debian: apt-get install -y {PACKAGES}"

@@ -1,7 +1,4 @@
-"""Datasets, policies and evaluations that a command is given.
-
-A wrong path is found by its files alone, before anything heavy is imported.
-"""
+"""Datasets, policies and evaluations of a command; a wrong path is found by its files, before heavy imports."""
 
 from __future__ import annotations
 
@@ -63,19 +60,15 @@ def _inside(root: Path) -> str:
 
 
 def find_policy(path: Path) -> Path:
-    """Return the `pretrained_model` folder in `path`, which may be that folder, a checkpoint or a run.
-
-    Of a run it is the best policy, else the newest checkpoint.
-    """
+    """Return the `pretrained_model` folder in that folder, a checkpoint or a run: the best one, else the newest."""
     for place in _POLICY_FOLDERS:
         if (path / place / "config.json").is_file():
             return path / place
     for place in _NEWEST_POLICY:
         if found := sorted(path.glob(f"{place}/config.json")):
             return found[-1].parent
-    raise UsageError(
-        f"no policy in {path}; expected LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
-    )
+    wanted = f"LeRobot's pretrained_model folder, or a run that holds one{hub_hint(path)}"
+    raise UsageError(f"no policy in {path}; expected {wanted}")
 
 
 def start_policy(settings: Open) -> Open:
@@ -114,9 +107,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
 def check_policy(
     path: Path, meta: CheckpointMeta | None, env: EnvConfig, *, draw: bool = True, trust: bool = False
 ) -> CameraConfig | None:
-    """Return the cameras whose pictures the policy takes, None for none.
-
-    Warns where it was trained on something else than `env`.
+    """Return the cameras whose pictures the policy takes, if any; warn where it was trained on something else.
 
     draw: make its first pictures here, to see that they can be made. trust: see `LearnedPolicy.load`. Raises
     `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
@@ -161,15 +152,12 @@ def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool)
 
     from manip_il.sim.env import ManipEnv
 
-    if cameras is None or not draw:
-        world = ManipEnv(config=env)
-    else:
-        world = ManipEnv(config=env, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+    world = ManipEnv.of(env, cameras if draw else None)
     world.start(0)
     observation = world.observe()
-    if cameras is not None and not draw:
-        return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
-    return observation
+    if cameras is None or draw:
+        return observation
+    return replace(observation, images={name: np.zeros((*cameras.size, 3), np.uint8) for name in cameras.names})
 
 
 def observation_text(cameras: CameraConfig, path: Path) -> str:

@@ -69,20 +69,15 @@ class StopRequest:
             self._outer.requested |= self.requested
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._pid:
-            self._in_worker(number)
+        if os.getpid() != self._pid:  # a forked worker inherits the handlers: it ignores Ctrl-C, and dies of SIGTERM
+            if number == signal.SIGTERM:
+                signal.signal(number, signal.SIG_DFL)
+                os.kill(os.getpid(), number)
         elif self.requested:
             raise KeyboardInterrupt
         else:
             self.requested = True
             os.write(2, _MESSAGE)  # print() may not be entered twice, and a signal can come inside one
-
-    @staticmethod
-    def _in_worker(number: int) -> None:
-        """Handle a signal in a forked worker, which inherits the handlers: ignore Ctrl-C, die of SIGTERM."""
-        if number == signal.SIGTERM:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
 
 
 def resume_command(words: Sequence[str], program: str = "manip-il") -> str:

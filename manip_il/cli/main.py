@@ -83,7 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()  # here, where a reader that has gone away can still be answered
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, BrokenPipeError) and _stdout_is_gone():
-            _silence_stdout()
+            # Python flushes once more at exit, and would complain there.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return EXIT_BROKEN_PIPE
         if debug:
             print(_clean(traceback.format_exc(), words), file=sys.stderr, end="")
@@ -159,40 +160,33 @@ def _group(word: str) -> list[str]:
 
 def _report(error: BaseException, words: list[str]) -> int:
     """Say on standard error what happened, in one line; return the exit code."""
+    code = 1
     if isinstance(error, KeyboardInterrupt):
-        _complain(f"interrupted{_how_to_go_on(error, words)}", words)
-        return EXIT_INTERRUPTED
-    if isinstance(error, ManipError):
-        _complain(f"error: {error}", words)
-        return error.exit_code
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        _complain(f"error: {error.strerror}: {error.filename}", words)
-        return 1
-    _complain(f"error: {type(error).__name__}: {error}; run again with --debug for the traceback", words)
-    return 1
+        text, code = f"interrupted{_how_to_go_on(error, words)}", EXIT_INTERRUPTED
+    elif isinstance(error, ManipError):
+        text, code = f"error: {error}", error.exit_code
+    elif isinstance(error, OSError) and error.strerror and error.filename:
+        text = f"error: {error.strerror}: {error.filename}"
+    else:
+        text = f"error: {type(error).__name__}: {error}; run again with --debug for the traceback"
+    line = " ".join(_clean(text, words).split())
+    if len(line) > LONGEST_LINE:  # without its middle: what to do next stands at the end
+        line = f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
+    print(f"{PROGRAM}: {line}", file=sys.stderr, flush=True)
+    return code
 
 
 def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
     if isinstance(error, Interrupted):
         return f"; kept: {error.kept}; continue with: {error.resume_command or resume_command(words)}"
     try:
-        name, words_of_it = _split(words)
-        options: Any = parse(load(name), words_of_it)
+        name, rest = _split(words)
+        options: Any = parse(load(name), rest)
     except (Exception, KeyboardInterrupt):  # stopped while it was loading, or stopped once more
         return ""
     if not hasattr(options, "resume") or not getattr(options, "output_dir", Path()).exists():  # nothing to resume
         return ""
     return f"; finished work is kept; continue with: {resume_command(words)}"
-
-
-def _complain(text: str, words: list[str]) -> None:
-    print(f"{PROGRAM}: {_one_line(text, words)}", file=sys.stderr, flush=True)
-
-
-def _one_line(text: str, words: list[str]) -> str:
-    """Without its middle where it is too long to be read: what to do next stands at the end."""
-    line = " ".join(_clean(text, words).split())
-    return line if len(line) <= LONGEST_LINE else f"{line[: LONGEST_LINE - 500]} ... {line[-400:]}"
 
 
 def _clean(text: str, words: list[str]) -> str:
@@ -244,15 +238,13 @@ def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
 
 def _row(option: Option) -> tuple[str, str]:
     left = option.label if option.positional else f"{option.label}={metavar(option.type)}"
-    return left, f"{option.help} [{_default_text(option)}]".lstrip()
-
-
-def _default_text(option: Option) -> str:
     if option.default is MISSING:
-        return "required"
-    if option.is_open or option.default is None or option.default == []:
-        return "none"
-    return word(option.default) or "empty"
+        default = "required"
+    elif option.is_open or option.default is None or option.default == []:
+        default = "none"
+    else:
+        default = word(option.default) or "empty"
+    return left, f"{option.help} [{default}]".lstrip()
 
 
 def _stdout_is_gone() -> bool:
@@ -263,11 +255,6 @@ def _stdout_is_gone() -> bool:
         return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
     except (OSError, ValueError):
         return False
-
-
-def _silence_stdout() -> None:
-    """Python flushes once more at exit, and would complain there."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.cli.inputs import require_dataset
 from manip_il.cli.outputs import prepare_output, require_new, save_options
 from manip_il.cli.progress import progress, say
+from manip_il.data.atomic import new_folder
 from manip_il.errors import UsageError
 from manip_il.option import option
-
-if TYPE_CHECKING:
-    from manip_il.mcap.importing import Import
-    from manip_il.mcap.mapping import Mapping
 
 
 @dataclass
@@ -40,7 +36,6 @@ class McapExportOptions:
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
-        from manip_il.data.atomic import new_folder
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.mcap.export import MAPPING, export_dataset, open_source
 
@@ -81,7 +76,7 @@ class McapImportOptions:
 
     def run(self) -> None:
         """Import every file; the dataset appears when it is whole."""
-        from manip_il.mcap.importing import list_files
+        from manip_il.mcap.importing import import_files, list_files
         from manip_il.mcap.mapping import load_mapping
 
         mapping = load_mapping(self.mapping)
@@ -89,20 +84,14 @@ class McapImportOptions:
         counts: Counter[str] = Counter()
         used: Counter[str] = Counter()
         episodes = frames = 0
-        for done in self._import(paths, mapping):
-            counts.update(done.counts)
-            used.update(done.used)
-            episodes, frames = episodes + 1, frames + done.frames
-        say(_table(counts, used))
-        say(f"imported {episodes:,} episodes, {frames:,} frames to {self.dataset}")
-
-    def _import(self, paths: list[Path], mapping: Mapping) -> Iterator[Import]:
-        from manip_il.mcap.importing import import_files
-
         with progress(len(paths), "import") as bar:
             for done in import_files(paths, self.dataset, mapping):
                 bar.advance()
-                yield done
+                counts.update(done.counts)
+                used.update(done.used)
+                episodes, frames = episodes + 1, frames + done.frames
+        say(_table(counts, used))
+        say(f"imported {episodes:,} episodes, {frames:,} frames to {self.dataset}")
 
 
 def _table(counts: Counter[str], used: Counter[str]) -> str:

@@ -1,8 +1,8 @@
 """Options of commands: what a dataclass of options holds, which values a type accepts, and what help calls them.
 
-A field's type is int, float, bool, str, Path, a `Literal`, an `Enum` (by name), a list of those, a union of those or
-with None, another dataclass (a group, `--dataset.root`), or `Open`: a group of which only another program knows the
-options (`--policy.*`), as a dict of whatever was given.
+A field's type is int, float, bool, str, Path, a `Literal` of names, a list of those, one of those or None, another
+dataclass (a group, `--dataset.root`), or `Open`: a group of which only another program knows the options
+(`--policy.*`), as a dict of whatever was given.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import types
 import typing
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass
-from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, Union
 
@@ -61,8 +60,8 @@ def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     `command_line_only=True` for an option that no file may set, and that no file of options holds.
     """
     found: list[Option] = []
-    for field, field_type in typed_fields(cls):
-        name, default = prefix + field.name, default_of(field, base)
+    for field, field_type, default in fields_of(cls, base):
+        name = prefix + field.name
         if dataclasses.is_dataclass(field_type):
             found += options_of(typing.cast(type, field_type), None if default is MISSING else default, f"{name}.")
         else:
@@ -71,17 +70,13 @@ def options_of(cls: type, base: Any = None, prefix: str = "") -> list[Option]:
     return found
 
 
-def typed_fields(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
-    """Yield every field of a dataclass that its constructor takes, with its type."""
+def fields_of(cls: type, base: Any) -> Iterator[tuple[dataclasses.Field[Any], Any, Any]]:
+    """Yield every field that a dataclass's constructor takes, its type, and its value in `base`, else its default."""
     hints = typing.get_type_hints(cls)
-    return ((field, hints[field.name]) for field in dataclasses.fields(cls) if field.init)
-
-
-def default_of(field: dataclasses.Field[Any], base: Any) -> Any:
-    """Return the field's value in `base`, or its default where `base` is None."""
-    if base is not None:
-        return getattr(base, field.name)
-    return field.default_factory() if field.default_factory is not MISSING else field.default
+    for field in dataclasses.fields(cls):
+        own = field.default if field.default_factory is MISSING else field.default_factory()
+        if field.init:
+            yield field, hints[field.name], own if base is None else getattr(base, field.name)
 
 
 def value_of(options: Any, name: str) -> Any:
@@ -96,8 +91,6 @@ def to_plain(value: Any) -> Any:
         return {f.name: to_plain(getattr(value, f.name)) for f in fields}
     if isinstance(value, dict):
         return {key: to_plain(item) for key, item in value.items()}
-    if isinstance(value, Enum):
-        return value.name
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, list | tuple):
@@ -113,9 +106,8 @@ def command_line(name: str, options: Any) -> str:
         if known.positional:
             words += map(str, value if isinstance(value, list) else [value])
         elif known.is_open:
-            words += [
-                f"--{known.name}.{key}={one if isinstance(one, str) else json.dumps(one)}" for key, one in value.items()
-            ]
+            given = {key: one if isinstance(one, str) else json.dumps(one) for key, one in value.items()}
+            words += [f"--{known.name}.{key}={one}" for key, one in given.items()]
         elif (known.default is MISSING or value != known.default) and known.name not in ("resume", "overwrite"):
             words.append(f"--{known.name}={word(value)}")
     return shlex.join(words)
@@ -131,30 +123,27 @@ def word(value: Any) -> str:
 
 def metavar(option_type: Any) -> str:
     """Return what stands for the value in the help: `INT`, `PATH`, `mse|l1`, `FLOAT,...`."""
+    option_type = without_none(option_type)
     if typing.get_origin(option_type) is list:
         return f"{metavar(typing.get_args(option_type)[0])},..."
-    if members := _union_members(option_type):
-        return "|".join(metavar(member) for member in members if member is not types.NoneType)
-    if named := choices(option_type):
-        return "|".join(named)
-    return _METAVARS.get(option_type, "VALUE")
+    return "|".join(choices(option_type)) or _METAVARS.get(option_type, "VALUE")
 
 
 def expected(option_type: Any) -> str:
     """Return what an error message asks for."""
+    if (some := without_none(option_type)) is not option_type:
+        return f"{expected(some)} or null"
     if typing.get_origin(option_type) is list:
         return f"a comma-separated list, each {expected(typing.get_args(option_type)[0])}"
-    if members := _union_members(option_type):
-        return " or ".join("null" if member is types.NoneType else expected(member) for member in members)
-    if named := choices(option_type):
-        return f"one of {', '.join(named)}"
-    return _EXPECTED[option_type]
+    named = choices(option_type)
+    return f"one of {', '.join(named)}" if named else _EXPECTED[option_type]
 
 
 def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
     """Return `value` as the declared type; `ValueError` where it is none. is_word: `null` and commas have a meaning."""
-    if members := _union_members(option_type):
-        return _decode_union(members, value, is_word)
+    if (some := without_none(option_type)) is not option_type:
+        is_none = value is None or (is_word and value.lower() in ("null", "none"))
+        return None if is_none else decode(some, value, is_word=is_word)
     if typing.get_origin(option_type) is list:
         if is_word:
             inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
@@ -166,31 +155,10 @@ def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
         item_type = typing.get_args(option_type)[0]
         return [decode(item_type, item) for item in value]
     if named := choices(option_type):
-        return _decode_choice(option_type, named, value)
+        if value not in named:
+            raise ValueError
+        return value
     return _decode_scalar(option_type, value)
-
-
-def _decode_union(members: tuple[Any, ...], value: Any, is_word: bool) -> Any:
-    if types.NoneType in members and (value is None or (is_word and value.lower() in ("null", "none"))):
-        return None
-    for member in members:
-        if member is not types.NoneType:
-            try:
-                return decode(member, value, is_word=is_word)
-            except ValueError:
-                continue
-    raise ValueError
-
-
-def _decode_choice(option_type: Any, named: dict[str, Any], value: Any) -> Any:
-    if isinstance(value, str) and value in named:
-        return named[value]
-    if isinstance(option_type, type):  # an Enum, by its value
-        return option_type(value)
-    for choice in named.values():
-        if type(choice) is type(value) and choice == value:
-            return choice
-    raise ValueError
 
 
 def _decode_scalar(option_type: Any, value: Any) -> Any:
@@ -214,16 +182,14 @@ def _decode_scalar(option_type: Any, value: Any) -> Any:
     raise ValueError
 
 
-def _union_members(option_type: Any) -> tuple[Any, ...]:
-    return typing.get_args(option_type) if typing.get_origin(option_type) in (Union, types.UnionType) else ()
+def without_none(option_type: Any) -> Any:
+    """Return `X` of `X | None`, and any other type as it is."""
+    if typing.get_origin(option_type) not in (Union, types.UnionType):
+        return option_type
+    return next(member for member in typing.get_args(option_type) if member is not types.NoneType)
 
 
-def choices(option_type: Any) -> dict[str, Any]:
-    """Return name -> value of a `Literal` or an `Enum`, also within a union; empty for any other type."""
-    if members := _union_members(option_type):
-        return {name: value for member in members for name, value in choices(member).items()}
-    if typing.get_origin(option_type) is Literal:
-        return {str(choice): choice for choice in typing.get_args(option_type)}
-    if isinstance(option_type, type) and issubclass(option_type, Enum):
-        return dict(option_type.__members__)
-    return {}
+def choices(option_type: Any) -> tuple[str, ...]:
+    """Return the names of a `Literal`, also of one or None; none for any other type."""
+    option_type = without_none(option_type)
+    return typing.get_args(option_type) if typing.get_origin(option_type) is Literal else ()

@@ -22,10 +22,7 @@ _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a f
 
 @contextmanager
 def open_output(options: Any, free: Iterable[str] = (), may_grow: str | None = None) -> Generator[Path]:
-    """Hold and prepare `options.output_dir`, and write `config.yaml` into it.
-
-    A run that is resumed must have the same options as before, see `check_same_options`.
-    """
+    """Hold and prepare `options.output_dir`, with `config.yaml` in it; a resumed run must have the same options."""
     folder, resume = options.output_dir, getattr(options, "resume", False)
     with exclusive(folder):
         prepare_output(folder, resume=resume, overwrite=options.overwrite)
@@ -59,11 +56,9 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if folder.is_symlink() and not folder.exists():
         raise UsageError(f"{folder} is a link to nothing; expected a folder")
-    if not folder.exists():
-        return
-    if not folder.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file; expected a folder")
-    if resume or not any(folder.iterdir()):
+    if resume or not folder.exists() or not any(folder.iterdir()):
         return
     if not overwrite:
         raise FolderExistsError(folder)
@@ -144,11 +139,13 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    lines = path.read_bytes().split(b"\n")
-    tail = lines.pop()
-    records = [_require_record(path, number, line) for number, line in enumerate(lines, start=1)]
-    last = _record(tail)
-    return [*records, last] if last is not None else records
+    *lines, tail = path.read_bytes().split(b"\n")
+    records = [_record(line) for line in lines]
+    if None in records:
+        number = records.index(None)
+        shown = lines[number][:80].decode(errors="replace")
+        raise ManipError(f"{path}, line {number + 1}: expected a JSON object, got {shown!r}")
+    return [record for record in (*records, _record(tail)) if record is not None]
 
 
 def require_ours(folder: Path) -> None:
@@ -169,19 +166,15 @@ def require_ours(folder: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    config = folder / "config.yaml"
+    config = folder / CONFIG_FILE
     if config.is_file() and config.read_bytes().startswith(CONFIG_HEADER.encode()):
         return True
     # Any LeRobot dataset has meta/info.json; only ours has both actions.
-    features = _json_object(folder / "meta" / "info.json").get("features")
-    if isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys():
-        return True
-    return {"success_rate", "fingerprint"} <= _json_object(folder / "eval.json").keys()
-
-
-def _json_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file, or an empty one."""
-    return (_record(path.read_bytes()) or {}) if path.is_file() else {}
+    files = (folder / "meta" / "info.json", folder / "eval.json")
+    info, result = ((_record(path.read_bytes()) or {}) if path.is_file() else {} for path in files)
+    features = info.get("features")
+    is_dataset = isinstance(features, dict) and {"executed_action", "sim_state"} <= features.keys()
+    return is_dataset or {"success_rate", "fingerprint"} <= result.keys()
 
 
 def _delete(folder: Path) -> None:
@@ -200,7 +193,8 @@ def _mend_tail(path: Path) -> None:
         return
     with path.open("rb+") as file:
         size = file.seek(0, os.SEEK_END)
-        if size == 0 or _read_at(file, size - 1) == b"\n":
+        file.seek(max(size - 1, 0))
+        if file.read(1) in (b"", b"\n"):
             return
         file.seek(0)
         content = file.read()
@@ -211,23 +205,11 @@ def _mend_tail(path: Path) -> None:
             file.truncate(whole)
 
 
-def _read_at(file: Any, position: int) -> bytes:
-    file.seek(position)
-    return file.read(1)
-
-
 def _record(line: bytes) -> dict[str, Any] | None:
     try:
         return checks.mapping("a record", checks.parse_json("a record", line, nan_is_none=True))
     except ManipError:
         return None
-
-
-def _require_record(path: Path, number: int, line: bytes) -> dict[str, Any]:
-    record = _record(line)
-    if record is None:
-        raise ManipError(f"{path}, line {number}: expected a JSON object, got {line[:80].decode(errors='replace')!r}")
-    return record
 
 
 def _plain(value: Any) -> Any:

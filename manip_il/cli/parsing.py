@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 from manip_il import __version__
 from manip_il.checks import shorten
-from manip_il.cli.options import Open, Option, choices, decode, default_of, expected, options_of, to_plain, typed_fields
+from manip_il.cli.options import Open, Option, choices, decode, expected, fields_of, options_of, to_plain, without_none
 from manip_il.errors import UsageError, did_you_mean, nearest
 
 CONFIG_PATH = "config_path"  # LeRobot's name for the option that reads YAML
@@ -44,9 +44,7 @@ def parse[T](cls: type[T], words: Sequence[str], command: str = "") -> T:
     """
     known = {option.name: option for option in options_of(cls)}
     from_words, config_paths = _read_words(words, known, command)
-    from_files: dict[str, _Given] = {}
-    for path in config_paths:
-        from_files |= _read_tree(_read_yaml(Path(path)), known, path)
+    from_files = _read_layers(((path, _read_yaml(Path(path))) for path in config_paths), known)
     return _build(cls, from_files | from_words)
 
 
@@ -60,11 +58,7 @@ def from_layers[T](cls: type[T], layers: Sequence[tuple[str, Mapping[str, Any]]]
 
     layers: the origin of a tree, for error messages, and the tree. `UsageError` as from a YAML file.
     """
-    known = {option.name: option for option in options_of(cls)}
-    given: dict[str, _Given] = {}
-    for origin, tree in layers:
-        given |= _read_tree(tree, known, origin)
-    return _build(cls, given)
+    return _build(cls, _read_layers(layers, {option.name: option for option in options_of(cls)}))
 
 
 def dump_yaml(options: Any) -> str:
@@ -86,7 +80,11 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str)
             if not places:
                 raise unexpected_word(word, known, command)
             option = places[0] if places[0].is_list else places.pop(0)
-            _place(word, option, given)
+            if option.is_list:  # takes every word that is left
+                before = given[option.name].value if option.name in given else []
+                given[option.name] = _Given([*before, word], option.label, False)
+            else:
+                given[option.name] = _Given(word, option.label, True)
             continue
         name, equals, value = word[2:].partition("=")
         if name not in known and name.replace("-", "_") in known:  # as other programs write it
@@ -105,15 +103,6 @@ def _read_words(words: Sequence[str], known: Mapping[str, Option], command: str)
         else:
             given[name] = _Given(value, f"--{name}", True)
     return given, config_paths
-
-
-def _place(word: str, option: Option, given: dict[str, _Given]) -> None:
-    """Give an option without a name its value; a list takes every word that is left."""
-    if not option.is_list:
-        given[option.name] = _Given(word, option.label, True)
-        return
-    before = given[option.name].value if option.name in given else []
-    given[option.name] = _Given([*before, word], option.label, False)
 
 
 def _open_group(name: str, known: Mapping[str, Option]) -> str:
@@ -151,40 +140,43 @@ def _read_yaml(path: Path) -> dict[Any, Any]:
     return tree or {}
 
 
-def _read_tree(tree: Mapping[Any, Any], known: Mapping[str, Option], origin: str) -> dict[str, _Given]:
-    return {name: _Given(value, f"{origin}: {name}", False) for name, value in _leaves(tree, known, origin)}
+def _read_layers(layers: Iterable[tuple[str, Mapping[Any, Any]]], known: Mapping[str, Option]) -> dict[str, _Given]:
+    given: dict[str, _Given] = {}
+    for origin, tree in layers:
+        given |= _read_tree(tree, known, origin)
+    return given
 
 
-def _leaves(
+def _read_tree(
     tree: Mapping[Any, Any], known: Mapping[str, Option], origin: str, prefix: str = ""
-) -> Iterator[tuple[str, Any]]:
+) -> dict[str, _Given]:
+    given: dict[str, _Given] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
-        if name in known and known[name].is_open:
-            if not isinstance(value, dict | None):
-                raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
-            yield from ((f"{name}.{inner}", one) for inner, one in (value or {}).items())
-        elif name in known or _open_group(name, known):
-            yield name, value
-        elif not any(option.startswith(f"{name}.") for option in known):
+        is_open = name in known and known[name].is_open
+        if not is_open and (name in known or _open_group(name, known)):
+            given[name] = _Given(value, f"{origin}: {name}", False)
+        elif not is_open and not any(option.startswith(f"{name}.") for option in known):
             raise unknown_option(f"key in {origin}:", name, known, "", "")
-        elif isinstance(value, dict):
-            yield from _leaves(value, known, origin, f"{name}.")
-        elif value is not None:
+        elif not isinstance(value, dict | None):
             raise UsageError(f"{origin}: {name}: expected a mapping of options, got {shorten(value)}")
+        else:
+            given |= _read_tree(value or {}, known, origin, f"{name}.")
+    return given
 
 
 def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefix: str = "") -> T:
     """Return an instance of `cls` of the given values, else `base`'s, else the defaults."""
     arguments: dict[str, Any] = {}
-    for field, field_type in typed_fields(cls):
-        name, default = prefix + field.name, default_of(field, base)
+    for field, field_type, default in fields_of(cls, base):
+        name = prefix + field.name
         if dataclasses.is_dataclass(field_type):
             nested = None if default is MISSING else default
             arguments[field.name] = _build(typing.cast(type, field_type), given, nested, f"{name}.")
         elif field_type == Open:
+            inside = {key: one.value for key, one in given.items() if key.startswith(f"{name}.")}
             before = {} if default is MISSING else default
-            arguments[field.name] = before | _inside(name, given)
+            arguments[field.name] = before | {key.removeprefix(f"{name}."): value for key, value in inside.items()}
         elif name in given:
             if field.metadata.get("command_line_only") and not given[name].is_word:
                 raise UsageError(f"{given[name].origin}: this can only be set on the command line; give --{name}=...")
@@ -195,10 +187,6 @@ def _build[T](cls: type[T], given: Mapping[str, _Given], base: Any = None, prefi
         else:
             arguments[field.name] = default
     return cls(**arguments)
-
-
-def _inside(group: str, given: Mapping[str, _Given]) -> Open:
-    return {name.removeprefix(f"{group}."): one.value for name, one in given.items() if name.startswith(f"{group}.")}
 
 
 def _decode_given(field_type: Any, given: _Given) -> Any:
@@ -236,7 +224,7 @@ def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> Usa
         return unknown_option("option", name, known, "--", command)
     if word.endswith((".yaml", ".yml")):
         return UsageError(f"{text}; a file of options is given as --config_path={word}")
-    paths = [one.name for one in known.values() if Path in _types(one.type) and one.name != "output_dir"]
+    paths = [one.name for one in known.values() if without_none(one.type) is Path and one.name != "output_dir"]
     opens = [f"{one.name}.path" for one in known.values() if one.is_open and one.name == "policy"]
     if paths or opens:
         return UsageError(f"{text}; options are written --name=value (did you mean --{(paths or opens)[0]}={word}?)")
@@ -264,8 +252,3 @@ def _likeness(name: str, option: str) -> float:
 
 def _help(command: str) -> str:
     return f"manip-il {command or 'COMMAND'} --help"
-
-
-def _types(option_type: object) -> tuple[object, ...]:
-    """Return the members of a union, or the type alone."""
-    return typing.get_args(option_type) or (option_type,)

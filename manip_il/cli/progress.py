@@ -7,13 +7,15 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.interrupt import Interrupted, StopRequest
 from manip_il.errors import ManipError, UsageError
 
 if TYPE_CHECKING:
     from manip_il.algorithms.run import Watch
+    from manip_il.evaluation.results import EpisodeResult
+    from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
 _UNITS = ("B", "kB", "MB", "GB", "TB")
@@ -21,12 +23,11 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 _quiet = False
 
 
-class Progress(Protocol):
-    """Display of work under way."""
+class Progress:
+    """Display of work under way; of this class itself, none."""
 
     def advance(self, n: int = 1, **fields: object) -> None:
         """Add `n` steps; `fields` (loss=0.12, success=0.9) replace those displayed so far."""
-        ...
 
 
 def set_quiet(quiet: bool) -> None:
@@ -50,7 +51,7 @@ def warn(lines: Iterable[str]) -> None:
 def progress(total: int | None, description: str, *, of_bytes: bool = False) -> Generator[Progress]:
     """Show the progress of `total` steps (None where the number is unknown), or bytes, while the `with` lasts."""
     if _quiet:
-        yield _Silent()
+        yield Progress()
     elif sys.stderr.isatty():
         with _bar(total, description, of_bytes) as bar:
             yield bar
@@ -62,12 +63,7 @@ def progress(total: int | None, description: str, *, of_bytes: bool = False) -> 
             lines.finish()
 
 
-class _Silent:
-    def advance(self, n: int = 1, **fields: object) -> None:
-        pass
-
-
-class _Lines:
+class _Lines(Progress):
     """Lines at most every `INTERVAL`, and one at the end: `record: 12/50 (3.4/s, success 0.92)`."""
 
     def __init__(self, total: int | None, description: str, text: Callable[[float], str]):
@@ -97,7 +93,7 @@ class _Lines:
         print(f"{self._description}: {count} ({details})", file=sys.stderr, flush=True)
 
 
-class _Bar:
+class _Bar(Progress):
     def __init__(self, bar: Any, task: Any):
         self._bar, self._task = bar, task
         self._fields: dict[str, object] = {}
@@ -130,7 +126,7 @@ def bytes_text(count: float) -> str:
     unit = 0
     while count >= 999.5 and unit < len(_UNITS) - 1:
         count, unit = count / 1000, unit + 1
-    return f"{count:.0f} {_UNITS[unit]}" if unit == 0 else f"{count:.3g} {_UNITS[unit]}"
+    return f"{count:{'.3g' if unit else '.0f'}} {_UNITS[unit]}"
 
 
 def _count_text(count: float) -> str:
@@ -143,15 +139,6 @@ def _fields_text(fields: dict[str, object]) -> str:
     )
 
 
-class Outcome(Protocol):
-    """An episode that has ended, or its result."""
-
-    @property
-    def success(self) -> bool:
-        """Whether the task was solved at some time."""
-        ...
-
-
 class Stages:
     """One progress bar at a time; use as a context manager. A stop request takes effect at the next step.
 
@@ -162,7 +149,7 @@ class Stages:
         self.kept = kept
         self._stop = StopRequest()
         self._open = ExitStack()
-        self._bar: Progress | None = None
+        self._bar = Progress()
         self._done = self._solved = 0
 
     def __enter__(self) -> Stages:
@@ -187,30 +174,25 @@ class Stages:
     def close(self) -> None:
         """Close the bar."""
         self._open.close()
-        self._bar = None
+        self._bar = Progress()
 
-    def episode(self, episode: Outcome) -> None:
+    def episode(self, episode: Episode | EpisodeResult) -> None:
         """Count an episode that has ended."""
         self._done += 1
         self._solved += episode.success
-        if self._bar is not None:
-            self._bar.advance(success=self._solved / self._done)
+        self._bar.advance(success=self._solved / self._done)
         self.check()
 
     def step(self) -> None:
         """Count a step that is done."""
-        if self._bar is not None:
-            self._bar.advance()
+        self._bar.advance()
         self.check()
 
     def log(self, record: dict[str, Any]) -> None:
         """Show a fit's metrics at a step; {} where there are none."""
-        if not record:
-            self.check()
-            return
-        if self._bar is not None:
+        if record:
             self._bar.advance(record["step"] - self._done, loss=record["loss"])
-        self._done = record["step"]
+            self._done = record["step"]
         self.check()
 
     def check(self) -> None:

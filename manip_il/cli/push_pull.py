@@ -19,7 +19,7 @@ from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.store.push import Plan
-    from manip_il.store.remote import Published, RemoteUrl
+    from manip_il.store.remote import RemoteUrl
 
 DISPLAY_EVERY = 0.1  # between two updates of the display [s]
 
@@ -99,7 +99,11 @@ class PushOptions:
         if published is None:
             _say_plan(plan, url)
             return
-        say(_summary(published, url))
+        if published.uploaded or published.removed:
+            counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
+            say(f"{url}: {counts}; {published.removed} removed; {published.kept} unchanged")
+        else:
+            say(f"{url}: {published.kept} files, all there already")
         say(f"next: manip-il pull {url} FOLDER")
 
 
@@ -109,17 +113,8 @@ def _say_plan(plan: Plan, url: object) -> None:
     for path in plan.remove:
         say(f"remove   {path}")
     kept = len(plan.manifest.files) - len(plan.upload)
-    counts = (
-        f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload; {len(plan.remove)} to remove; {kept} unchanged"
-    )
-    say(f"{url}: {counts}; nothing was done")
-
-
-def _summary(published: Published, url: object) -> str:
-    if not published.uploaded and not published.removed:
-        return f"{url}: {published.kept} files, all there already"
-    counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
-    return f"{url}: {counts}; {published.removed} removed; {published.kept} unchanged"
+    upload = f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload"
+    say(f"{url}: {upload}; {len(plan.remove)} to remove; {kept} unchanged; nothing was done")
 
 
 @dataclass
@@ -154,10 +149,8 @@ class PullOptions:
             with resumable():
                 pulled = pull(url, remote, self.target, show_bytes, overwrite=self.overwrite, dry_run=self.dry_run)
         except FolderExistsError:
-            text = (
-                f"{self.target} or its journals exist already; replace them with --overwrite=true, or name a new folder"
-            )
-            raise UsageError(text) from None
+            remedy = "replace them with --overwrite=true, or name a new folder"
+            raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
         finally:
             warn(remote.warnings)
         manifest = pulled.manifest

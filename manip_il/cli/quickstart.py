@@ -12,12 +12,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
 from manip_il.algorithms.config import RunConfig
-from manip_il.cli.common_options import (
-    EnvOptions,
-    engine_option,
-    seed_option,
-    workers_option,
-)
+from manip_il.algorithms.rounds import RoundResult, best_round
+from manip_il.cli import common_options as common
 from manip_il.cli.dagger import FREE, DaggerOptions, learning_curve, round_timings, run_rounds
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
@@ -25,9 +21,9 @@ from manip_il.cli.progress import Stages, say
 from manip_il.cli.trials import Pictures, Shot, Trial, film_shots, suite_conditions
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option, option_of
+from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.rounds import RoundResult
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import Kind, PolicyRow
@@ -58,7 +54,7 @@ class PolicyGroup:
 
 
 @dataclass
-class QuickstartOptions(EnvOptions):
+class QuickstartOptions(common.EnvOptions):
     """Run a small complete example: the expert demonstrates, a policy is cloned, DAgger improves it.
 
     Compares the expert, the cloned policy, one cloned from as many labels as DAgger used, and DAgger's best round on
@@ -76,9 +72,9 @@ class QuickstartOptions(EnvOptions):
     validation_episodes: int = option_of(RunConfig, "validation_episodes", 100)
     test_episodes: int = option(200, "unseen test episodes, used for no choice")
     disturbed_episodes: int = option(100, "the first of them again, disturbed")
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
     output_dir: Path = option(Path("runs/quickstart"), "folder of the run")
     resume: bool = option(False, "continue an interrupted run")
     overwrite: bool = option(False, "replace an existing run")
@@ -158,7 +154,6 @@ class _Quickstart:
         )
 
     def _contestants(self, results: list[RoundResult]) -> list[Contestant]:
-        from manip_il.algorithms.rounds import best_round
         from manip_il.cli.cloning_baseline import clone_with_labels
 
         first, best = results[0], best_round(results)
@@ -178,8 +173,6 @@ class _Quickstart:
 
     def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
         """Return folder -> policy -> evaluation; those of an interrupted run are read."""
-        from manip_il.seeding import stream_seeds
-
         options, more = self.options, [one for one in contestants if one.key == "cloned_more"]
         measured: dict[str, dict[str, EvalResult]] = {}
         for folder, stream, count, measured_ones in (
@@ -206,9 +199,10 @@ class _Quickstart:
         trial = self._trial("nominal", range(seed, seed + 1))
         shots: list[Shot] = []
         for one in contestants:
-            episode = run_states(trial.job(one.policy), seed)
+            job = trial.job(one.policy)
+            episode = run_states(job, seed)
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
-            shots.append(Shot(trial.job(one.policy), episode, one.name, caption))
+            shots.append(Shot(job, episode, one.name, caption))
         self.stages.start("films", len(shots))
         return film_shots(shots, self.stages)
 
@@ -270,10 +264,7 @@ def read_timings(path: Path) -> dict[str, float]:
 
 
 def quickstart_verdict(rows: Sequence[PolicyRow], significant: bool) -> str:
-    """Return the first sentence of the report.
-
-    significant: whether DAgger and cloning with as many labels are shown to differ.
-    """
+    """Return the report's first sentence; significant: whether DAgger differs from cloning with as many labels."""
     from manip_il.evaluation.intervals import format_percent
 
     _, cloned, more, dagger = rows

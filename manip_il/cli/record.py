@@ -1,7 +1,4 @@
-"""`manip-il record`, `build` and `render`: a LeRobot dataset of the expert's demonstrations.
-
-It is made again from its journals, or with other pictures.
-"""
+"""`manip-il record`, `build`, `render`: a dataset of demonstrations, again from its journals, with other pictures."""
 
 from __future__ import annotations
 
@@ -10,14 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il import checks
-from manip_il.cli.common_options import (
-    EnvOptions,
-    ImageGroup,
-    engine_option,
-    require_workers,
-    seed_option,
-    workers_option,
-)
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset, require_folder
 from manip_il.cli.outputs import (
     check_output,
@@ -28,6 +18,7 @@ from manip_il.cli.outputs import (
     save_options,
 )
 from manip_il.cli.progress import Stages, progress, say, warn
+from manip_il.data.atomic import exclusive
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
 from manip_il.sim.config import Look
@@ -61,7 +52,7 @@ class DatasetGroup:
 
 
 @dataclass
-class RecordOptions(EnvOptions):
+class RecordOptions(common.EnvOptions):
     """Record successful demonstrations of the expert as a LeRobot dataset.
 
     Every finished episode is written to ROOT.journals at once; the dataset appears when all episodes are recorded.
@@ -70,10 +61,10 @@ class RecordOptions(EnvOptions):
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
-    image: ImageGroup = field(default_factory=ImageGroup)
-    seed: int = seed_option()
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
+    image: common.ImageGroup = field(default_factory=common.ImageGroup)
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
     resume: bool = option(False, "continue a recording, or add more episodes")
     overwrite: bool = option(False, "replace an existing dataset")
 
@@ -82,7 +73,7 @@ class RecordOptions(EnvOptions):
         if self.dataset.num_episodes < 1:
             raise UsageError(f"--dataset.num_episodes is {self.dataset.num_episodes}; expected at least 1")
         require_repo_id("--dataset.repo_id", self._repo_id())
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         root, journals = self._folders()
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
@@ -97,7 +88,6 @@ class RecordOptions(EnvOptions):
             from manip_il.data.video import VideoConfig
 
             VideoConfig(**asdict(self.dataset.rgb_encoder)).check(cameras.size, env.control_hz)
-        from manip_il.data.atomic import exclusive
         from manip_il.engine.engine import Engine
         from manip_il.engine.jobs import RolloutJob
 
@@ -178,7 +168,6 @@ class BuildOptions:
 
     def run(self) -> None:
         """Build the dataset; `ManipError` where a journal could not be read."""
-        from manip_il.data.atomic import exclusive
         from manip_il.data.build import build
 
         with exclusive(self.dataset):
@@ -201,14 +190,14 @@ class RenderOptions:
     source: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
     cameras: list[str] = option(lambda: ["front", "wrist"], "front, wrist or both")
-    image: ImageGroup = field(default_factory=ImageGroup)
+    image: common.ImageGroup = field(default_factory=common.ImageGroup)
     look: Look = field(default_factory=Look)
     workers: int | None = option(None, "processes; by default one per core")
     overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
-        require_workers(self.workers)
+        common.require_workers(self.workers)
         require_dataset(self.source)
         source, target = self.source.resolve(), self.target.resolve()
         if source.is_relative_to(target) or target.is_relative_to(source):
@@ -221,7 +210,6 @@ class RenderOptions:
         cameras = self.image.config(self.cameras, self.look)
         if cameras is None:
             raise UsageError("--cameras names none; expected front, wrist or both")
-        from manip_il.data.atomic import exclusive
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.engine.engine import default_workers

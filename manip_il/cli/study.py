@@ -11,10 +11,10 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
+from manip_il.cli import common_options as common
 from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
-from manip_il.cli.common_options import engine_option, require_workers, trust_option, workers_option
 from manip_il.cli.compare import rule_json
 from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
 from manip_il.cli.options import to_plain
@@ -22,14 +22,14 @@ from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, read_js
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
 from manip_il.cli.trials import Trial
+from manip_il.data.atomic import new_folder
 from manip_il.errors import UsageError
 from manip_il.evaluation.comparison import Arm
 from manip_il.evaluation.results import write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
+from manip_il.evaluation.tables import print_table
 from manip_il.option import option
-
-if TYPE_CHECKING:
-    from manip_il.evaluation.study_report import StudyReport
+from manip_il.seeding import stream_seeds
 
 ROUND_0 = "round_000"
 # Options on which round 0 (demonstrations and the first fit) does not depend
@@ -50,9 +50,9 @@ class StudyOptions:
     example: ClassVar[str] = "manip-il study configs/studies/chunk_labels.yaml --output_dir=runs/labels"
     file: Path = option(MISSING, "YAML of the study", positional=True)
     training_seeds: int | None = option(None, "in place of the file's; a resumed study may have more")
-    engine: Literal["local", "ray"] = engine_option()
-    workers: int | None = workers_option()
-    trust: bool = trust_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    trust: bool = common.trust_option()
     output_dir: Path = option(Path("runs/study"), "folder of the study")
     resume: bool = option(False, "continue an interrupted study")
     overwrite: bool = option(False, "replace an existing study")
@@ -60,10 +60,9 @@ class StudyOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         if not self.file.is_file():
-            raise UsageError(
-                f"{self.file} does not exist; expected the YAML of a study, such as configs/studies/*.yaml"
-            )
-        require_workers(self.workers)
+            wanted = "the YAML of a study, such as configs/studies/*.yaml"
+            raise UsageError(f"{self.file} does not exist; expected {wanted}")
+        common.require_workers(self.workers)
         require_output(self.output_dir, "study", resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
@@ -77,8 +76,15 @@ class StudyOptions:
             study = self._test(plan)
             write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
             atomic_write(folder / TABLE_FILE, table_markdown(study))
-            self._report(plan, study).write(folder / REPORT_FILE)
-        self._say(study)
+            self._report(plan, study)
+        print_table(study.results_table())
+        print_table(study.target_table())
+        for sentence in (study.verdict, *study.facts):
+            say(sentence)
+        say(f"table: {folder / TABLE_FILE}")
+        say(f"result: {folder / FILE_NAME}")
+        say(f"report: {folder / REPORT_FILE}")
+        say(f"next: {self._next(study)}")
 
     def _learn(self, plan: Plan) -> None:
         """Run one after the other, seed by seed, so that a study that is stopped early has all arms."""
@@ -98,7 +104,6 @@ class StudyOptions:
 
     def _test(self, plan: Plan) -> Study:
         from manip_il.engine.engine import Engine
-        from manip_il.seeding import stream_seeds
 
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]
@@ -120,7 +125,7 @@ class StudyOptions:
     def _folder(self, name: str, seed: int) -> Path:
         return self.output_dir / name / f"seed_{seed}"
 
-    def _report(self, plan: Plan, study: Study) -> StudyReport:
+    def _report(self, plan: Plan, study: Study) -> None:
         from manip_il.evaluation.study_report import study_report
 
         result = study.arms[0].members[0].result
@@ -130,19 +135,7 @@ class StudyOptions:
         if self.trust:
             words.append("--trust=true")
         title = f"Study: {result.robot} {result.task}, {self.file.stem}"
-        return study_report(study, title, shlex.join(words), to_plain(plan.file))
-
-    def _say(self, study: Study) -> None:
-        from manip_il.evaluation.tables import print_table
-
-        print_table(study.results_table())
-        print_table(study.target_table())
-        for sentence in (study.verdict, *study.facts):
-            say(sentence)
-        say(f"table: {self.output_dir / TABLE_FILE}")
-        say(f"result: {self.output_dir / FILE_NAME}")
-        say(f"report: {self.output_dir / REPORT_FILE}")
-        say(f"next: {self._next(study)}")
+        study_report(study, title, shlex.join(words), to_plain(plan.file)).write(self.output_dir / REPORT_FILE)
 
     def _next(self, study: Study) -> str:
         best = max(study.arms, key=lambda arm: arm.test_rate)
@@ -164,8 +157,6 @@ def share_start(options: DaggerOptions, others: Iterable[DaggerOptions]) -> bool
 
     Its line of metrics comes along, so that the run is charged for what its round 0 took.
     """
-    from manip_il.data.atomic import new_folder
-
     if options.output_dir.exists():
         return False
     for other in others:

@@ -70,7 +70,10 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
         file = replace(file, training_seeds=training_seeds)
     _check_numbers(path, file)
     arms = {name: replace(_arm(path, file, name), trust=trust) for name in file.arms}
-    envs = {name: _env(path, name, options) for name, options in arms.items()}
+    envs: dict[str, EnvConfig] = {}
+    for name, options in arms.items():
+        with _named(path, name):
+            envs[name] = options.config().env
     first = next(iter(envs))
     for name, env in envs.items():
         require_same_env(f"arm {first!r}", envs[first], f"arm {name!r}", env)
@@ -86,10 +89,7 @@ def keep_file(folder: Path, file: StudyFile) -> None:
 
 
 def check_same_file(folder: Path, file: StudyFile) -> None:
-    """Raise `MismatchError` naming the option unless the study in `folder` was started with the same file.
-
-    There may be more training seeds than before.
-    """
+    """Raise `MismatchError` for an option that differs from the study's in `folder`; training seeds may be more."""
     path = folder / STUDY_FILE
     if not path.is_file():
         return
@@ -112,16 +112,12 @@ def _check_numbers(path: Path, file: StudyFile) -> None:
     if not 0 < file.target <= 1:
         raise UsageError(f"{path}: target is {file.target}; expected a share above 0 and up to 1, such as 0.95")
     for name in file.arms:
-        if not _is_arm_name(name):
+        is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
+        if not is_name or ".." in name or name == FOLDER:
             raise UsageError(
                 f"{path}: an arm is named {checks.shorten(name)}, which becomes a folder; expected letters, digits, "
                 f"_ . and -, at most {checks.LONGEST_NAME}{', and not ' + FOLDER if name == FOLDER else ''}"
             )
-
-
-def _is_arm_name(name: object) -> bool:
-    is_name = isinstance(name, str) and ARM_NAME.fullmatch(name) and len(name) <= checks.LONGEST_NAME
-    return bool(is_name) and ".." not in str(name) and name != FOLDER
 
 
 def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
@@ -132,16 +128,10 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
         )
     layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
     for where, tree in layers:
-        for own in OWN:
-            if own in tree:
-                raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
+        if own := next((own for own in OWN if own in tree), None):
+            raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
     with _named(path, name):
         return from_layers(DaggerOptions, layers)
-
-
-def _env(path: Path, name: str, options: DaggerOptions) -> EnvConfig:
-    with _named(path, name):
-        return options.config().env
 
 
 @contextmanager

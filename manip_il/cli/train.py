@@ -7,18 +7,16 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from manip_il.cli.common_options import policy_help, trust_option
+from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
 from manip_il.cli.options import Open
 from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
 from manip_il.cli.progress import Stages, progress, say, set_quiet
+from manip_il.data.atomic import exclusive
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option, option_of
-
-if TYPE_CHECKING:
-    pass
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
@@ -65,7 +63,7 @@ class TrainOptions:
     log_freq: int = option_of(FitConfig, "log_freq")
     tensorboard: bool = option_of(FitConfig, "tensorboard")
     wandb: Open = option_of(FitConfig, "wandb")
-    trust: bool = trust_option()
+    trust: bool = common.trust_option()
     resume: bool = option(False, "continue from the last checkpoint")
     overwrite: bool = option(False, "replace an existing run")
 
@@ -78,7 +76,6 @@ class TrainOptions:
 
     def run(self) -> None:
         """Read the dataset, fit, and say where the checkpoint is."""
-        from manip_il.data.atomic import exclusive
         from manip_il.data.lerobot_read import read_fingerprint, read_spec
         from manip_il.learn.lerobot_config import LeRobotFit
 
@@ -108,11 +105,10 @@ class TrainOptions:
         policy, seed = start_policy(self.policy), stream_base("training", self.seed)
         return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
 
-    def _save_options(self) -> None:
+    def _begin(self, config: FitConfig) -> Stages:
+        """Write the options, now that what can be wrong has been found, and return the display."""
         if _is_first_process():
             save_options(self.output_dir, self)
-
-    def _stages(self, config: FitConfig) -> Stages:
         steps = config.steps_per_checkpoint
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
@@ -121,8 +117,7 @@ class TrainOptions:
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
-        self._save_options()
-        with self._stages(config) as stages:
+        with self._begin(config) as stages:
             table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
             stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
             return fit(
@@ -153,8 +148,7 @@ class TrainOptions:
                 resume=self.resume,
                 on_frames=seen,
             )
-        self._save_options()  # now, as much of what can be wrong has been found by now
-        with self._stages(config) as stages:
+        with self._begin(config) as stages:
             kind, samples = trainer.lerobot.policy.type, len(trainer.samples.train)
             stages.start(f"train {kind} on {samples:,} samples", config.total_steps)
             return trainer.fit(stages.log)
@@ -179,7 +173,7 @@ class TrainOptions:
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
         """Return the options of the policy that `--policy.type` names."""
-        return policy_help(words)
+        return common.policy_help(words)
 
 
 def _is_first_process() -> bool:

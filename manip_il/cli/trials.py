@@ -17,11 +17,14 @@ from manip_il.option import option
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.report_data import Film, Paths, Strip
     from manip_il.evaluation.results import EvalResult
+    from manip_il.mdp import Episode
     from manip_il.sim.conditions import Condition
     from manip_il.sim.config import EnvConfig
 
 FOLDER = "evaluations"
+FILM_EVERY = 2  # control steps a frame of film
 SUITES = {
     "nominal": ("nominal",),
     "disturbed": ("knocked", "sensing"),
@@ -29,6 +32,7 @@ SUITES = {
     "all": ("nominal", "knocked", "sensing", "object", "view"),
 }
 CONDITIONS = SUITES["all"]
+_YAML = (".yaml", ".yml")
 SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
 
 
@@ -41,10 +45,7 @@ class TrialGroup:
 
 @dataclass(frozen=True)
 class Trial:
-    """Environment, seeds and conditions in which policies are tested.
-
-    trust: whether models that their checkpoints name may be loaded.
-    """
+    """Environment, seeds and conditions of tests; trust: whether models that checkpoints name may be loaded."""
 
     env: EnvConfig
     seeds: range
@@ -96,9 +97,8 @@ class Trial:
             result = evaluate(engine, self.job(policy), self.seeds, name, stages.episode, suite=self.suite)
             stages.close()
             if complete and len(result.episodes) < len(self.seeds):
-                raise ManipError(
-                    f"{name} has {len(result.episodes)} of {len(self.seeds)} test episodes, because workers died"
-                )
+                have = f"{len(result.episodes)} of {len(self.seeds)}"
+                raise ManipError(f"{name} has {have} test episodes, because workers died")
             result.write(file)
         return EvalResult.read(file)
 
@@ -107,8 +107,7 @@ class Trial:
         from manip_il.evaluation.results import EvalSettings
 
         settings = EvalSettings.of(self.job(Path()), self.suite)
-        wanted = {"robot": self.env.robot, "task": self.env.task, "settings": settings}
-        for what, value in wanted.items():
+        for what, value in {"robot": self.env.robot, "task": self.env.task, "settings": settings}.items():
             if getattr(result, what) != value:
                 raise MismatchError(what, name, getattr(result, what), "this comparison", value)
         theirs = {episode.seed for episode in result.episodes}
@@ -140,7 +139,7 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
     from manip_il.tasks.table import get_task
 
     has_object = bool(get_task(task).grasped)
-    asked = [_read(name) for name in SUITES.get(suite, (suite,))]
+    asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
     left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
     if not left:
         blind = "" if sees else " and a policy without cameras"
@@ -150,27 +149,20 @@ def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, .
 
 def require_suite(suite: str) -> None:
     """Raise `UnknownName` for an unknown suite, `UsageError` for a missing file; nothing is read."""
-    if _is_file(suite):
+    if suite.endswith(_YAML):
         if not Path(suite).is_file():
             raise UsageError(f"--suite={suite}: no such file; expected a YAML of ranges")
     elif suite not in (*SUITES, *CONDITIONS):
         raise UnknownName("suite", suite, [*SUITES, *CONDITIONS[1:]])
 
 
-def _is_file(suite: str) -> bool:
-    return suite.endswith((".yaml", ".yml"))
-
-
-def _read(name: str) -> Condition:
-    require_suite(name)
-    return read_condition(Path(name) if _is_file(name) else _suites_folder() / f"{name}.yaml")
-
-
-def read_condition(path: Path) -> Condition:
-    """Return a YAML of ranges as a condition of the file's name; `UsageError` names what is wrong with it."""
+def read_condition(name: str) -> Condition:
+    """Return a condition by its name, or a YAML of ranges by its path; `UsageError` names what is wrong with it."""
     from manip_il.sim.conditions import Condition
     from manip_il.yaml_file import read_yaml
 
+    require_suite(name)
+    path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"
     tree = read_yaml(path, "a YAML of ranges")
     if not isinstance(tree, dict | None):
         raise UsageError(f"{path} holds {type(tree).__name__}; expected a mapping of names to ranges")
@@ -186,14 +178,6 @@ def _suites_folder() -> Path:
     raise ManipError(f"the suites' YAML files are missing; looked in {' and '.join(map(str, places))}; install again")
 
 
-if TYPE_CHECKING:
-    from manip_il.engine.jobs import RolloutJob
-    from manip_il.evaluation.report_data import Film, Paths, Strip
-    from manip_il.mdp import Episode
-
-FILM_EVERY = 2  # control steps a frame of film
-
-
 @dataclass(frozen=True)
 class Shot:
     """One episode to show. success: how the picture is marked, None for no mark."""
@@ -203,6 +187,15 @@ class Shot:
     title: str
     caption: str = ""
     success: bool | None = None
+
+    @classmethod
+    def of(cls, job: RolloutJob, episode: Episode) -> Shot:
+        """Show an episode with its outcome, seed, and the condition where not nominal: `Seed 4000000, knocked`."""
+        from manip_il.sim.conditions import NOMINAL, draw
+
+        condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
+        title = f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
+        return cls(job, episode, title, success=episode.success)
 
     def film(self) -> tuple[Film, Strip]:
         """Return the episode as it looked. Raises `RenderError` where there is no OpenGL."""
@@ -247,11 +240,3 @@ def film_shots(shots: Sequence[Shot], stages: Stages) -> Pictures:
     finally:
         stages.close()
     return Pictures(tuple(film for film, _ in made), tuple(strip for _, strip in made))
-
-
-def condition_caption(job: RolloutJob, episode: Episode) -> str:
-    """Return the seed, and the condition where that is not nominal: `Seed 4000000, knocked`."""
-    from manip_il.sim.conditions import NOMINAL, draw
-
-    condition = draw(job.conditions or (NOMINAL,), episode.seed).condition
-    return f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
