@@ -115,7 +115,8 @@ class _Run:
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
             moment, run = moments[episode.seed], self._undisturbed[episode.seed]
-            if has_changed(episode, run, moment):
+            state, action = (episode.columns[key][moment] for key in (schema.SIM_STATE, schema.EXECUTED_ACTION))
+            if not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment])):
                 cases.append(self._case(episode, moment, run.steps - moment))
         known = kinds_for(get_task(self._env.task))[kind]
         return self._row("action" if known.wrong else "state", kind, known.words, cases)
@@ -151,9 +152,3 @@ class _Run:
 def draw_moment(seed: int, kind: str, steps: int) -> int:
     """Return one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
-
-
-def has_changed(episode: Episode, run: Undisturbed, moment: int) -> bool:
-    """Return whether the state or the action at `moment` differs from the undisturbed run's."""
-    state, action = episode.columns[schema.SIM_STATE][moment], episode.columns[schema.EXECUTED_ACTION][moment]
-    return not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment]))

@@ -37,7 +37,12 @@ class Axis:
 
     def ticks(self) -> list[float]:
         """Return round values on the axis, at most `MAX_TICKS`."""
-        return _log_ticks(self.low, self.high) if self.log else _linear_ticks(self.low, self.high)
+        if self.log:
+            return _log_ticks(self.low, self.high)
+        least = (self.high - self.low) / (MAX_TICKS - 1)
+        magnitude = 10.0 ** math.floor(math.log10(least))
+        step = next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= least - 1e-12 * magnitude)
+        return [i * step for i in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)]
 
     @classmethod
     def around(cls, values: Sequence[float]) -> Axis:
@@ -208,14 +213,11 @@ class CurveCharts:
     @property
     def numbers(self) -> dict[str, str]:
         """Every point's name and costs, and its success."""
+        points = [(series.name, name, p) for series in self.series for name, run in series.runs.items() for p in run]
         numbers: dict[str, str] = {}
-        for series in self.series:
-            for name, run in series.runs.items():
-                for point in run:
-                    costs = [
-                        format_amount(cost, amount) for cost in COSTS if (amount := point.amount(cost)) is not None
-                    ]
-                    numbers[", ".join(filter(None, [series.name, name, point.name, *costs]))] = str(point.success)
+        for series, name, point in points:
+            costs = [format_amount(cost, amount) for cost in COSTS if (amount := point.amount(cost)) is not None]
+            numbers[", ".join(filter(None, [series, name, point.name, *costs]))] = str(point.success)
         return numbers
 
 
@@ -241,13 +243,6 @@ def _mark(series: Series, amount: float, point: CurvePoint, x: CostAxis, y: Axis
     return Mark(x.percent(amount), 100 - y.percent(100 * point.success.rate), f"{words}: {point.success}", (high, low))
 
 
-def _linear_ticks(low: float, high: float) -> list[float]:
-    step = _round_step((high - low) / (MAX_TICKS - 1))
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [index * step for index in range(first, last + 1)]
-
-
 def _log_ticks(low: float, high: float) -> list[float]:
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for multiples in ((1, 2, 5), (1, 3), (1,)):
@@ -255,11 +250,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
         if len(ticks) <= MAX_TICKS:
             return ticks
     return ticks[:: math.ceil(len(ticks) / MAX_TICKS)]
-
-
-def _round_step(step: float) -> float:
-    magnitude = 10.0 ** math.floor(math.log10(step))
-    return next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= step - 1e-12 * magnitude)
 
 
 def _format_count(value: float) -> str:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
 
+_KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
 _HZ, _SUCCESS_STEPS = 20, 5  # of files without them
 _MOST_CONDITIONS = 100  # of a suite
 _UNITS = {
@@ -94,22 +95,15 @@ class EpisodeResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as `eval.json` holds it."""
-        own = {
-            "seed": self.seed,
-            "success": self.success,
-            "success_at_end": self.success_at_end,
-            "steps": self.steps,
-            "return": self.ret,
-            "phase_at_end": self.phase_at_end,
-        }
-        return own | {key: value for key, value in self.detail.items() if key not in own}
+        values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
+        detail = {key: value for key, value in self.detail.items() if key not in _KEYS}
+        return dict(zip(_KEYS, values, strict=True)) | detail
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
         """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
         data = checks.mapping("an episode", data)
-        known = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")
-        detail = {key: value for key, value in data.items() if key not in known}
+        detail = {key: value for key, value in data.items() if key not in _KEYS}
         if detail.get("steps_to_success") is not None:
             checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
         if "condition" in detail:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -69,8 +69,9 @@ def evaluation_verdict(result: EvalResult) -> str:
 
 def evaluation_facts(result: EvalResult, factors: Sequence[Factor]) -> tuple[str, ...]:
     """Return further sentences: main phase, hardest condition, first factor, successes that did not last."""
-    facts = (_phase_fact(result), _condition_fact(result), _factor_fact(factors), _end_fact(result))
-    return tuple(filter(None, facts))
+    lost = sum(episode.success and not episode.success_at_end for episode in result.episodes)
+    ends = f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame." if lost else ""
+    return tuple(filter(None, (_phase_fact(result), _condition_fact(result), _factor_fact(factors), ends)))
 
 
 def _main_phase(result: EvalResult) -> str:
@@ -103,20 +104,16 @@ def _factor_fact(factors: Sequence[Factor]) -> str:
     if not factors or not factors[0].significant:
         return ""
     first = factors[0]
+    # A number that takes two values alone has two bins.
+    names = THIRDS if len(first.bins) == len(THIRDS) else ("lowest", "highest")
     worst = first.bins[first.worst]
-    best = max(first.bins, key=lambda one: one.success.rate)
-    names = dict(zip(first.bins, first.bin_names, strict=True))
+    best, of_best = max(zip(first.bins, names, strict=True), key=lambda one: one[0].success.rate)
     return (
         f"Failures are associated most with {first.name}. "
-        f"{format_percent(worst.success.rate)} succeed in its {names[worst]} "
-        f"({worst.low:.3g} to {worst.high:.3g}), {format_percent(best.success.rate)} in its {names[best]}, "
+        f"{format_percent(worst.success.rate)} succeed in its {names[first.worst]} "
+        f"({worst.low:.3g} to {worst.high:.3g}), {format_percent(best.success.rate)} in its {of_best}, "
         f"corrected {format_p(first.corrected)}."
     )
-
-
-def _end_fact(result: EvalResult) -> str:
-    lost = sum(episode.success and not episode.success_at_end for episode in result.episodes)
-    return f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame." if lost else ""
 
 
 def _spaced(phase: str) -> str:
@@ -158,11 +155,6 @@ class Factor:
     def worst(self) -> int:
         """The bin with the lowest success."""
         return min(range(len(self.bins)), key=lambda index: self.bins[index].success.rate)
-
-    @property
-    def bin_names(self) -> tuple[str, ...]:
-        """Names of the bins: a number that takes two values alone has two."""
-        return THIRDS if len(self.bins) == len(THIRDS) else ("lowest", "highest")
 
 
 @dataclass(frozen=True)
@@ -211,9 +203,9 @@ def hardest_condition(result: EvalResult) -> HardestCondition | None:
         fisher_exact((part.successes, total.successes - part.successes), (part.n, total.n - part.n))
         for part in parts.values()
     ]
-    corrected = dict(zip(parts, holm(p_values), strict=True))
-    worst = min(parts, key=lambda name: parts[name].rate)
-    return HardestCondition(worst, parts[worst], corrected[worst])
+    ranked = zip(parts.items(), holm(p_values), strict=True)
+    (worst, success), p_value = min(ranked, key=lambda one: one[0][1].rate)
+    return HardestCondition(worst, success, p_value)
 
 
 def factor_table(factors: Sequence[Factor]) -> Table:
@@ -236,7 +228,7 @@ def _bin_cell(one: Bin, marked: bool) -> str:
 
 def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[float, bool]]]:
     thing = moving_thing(episodes)
-    columns: dict[str, list[tuple[float, bool]]] = {}
+    columns: defaultdict[str, list[tuple[float, bool]]] = defaultdict(list)
     for episode in episodes:
         start, goal = episode.start, episode.goal
         # An object starts on the table: its height there is its size, which is a drawn number of its own.
@@ -246,7 +238,7 @@ def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[floa
         if start is not None and goal is not None:
             values["distance from start to goal [m]"] = math.dist(start, goal)
         for name, value in values.items():
-            columns.setdefault(name, []).append((value, episode.success))
+            columns[name].append((value, episode.success))
     return columns
 
 

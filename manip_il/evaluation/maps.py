@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -79,8 +79,7 @@ class MapMark:
     words: str = ""
 
 
-@dataclass(frozen=True)
-class DrawnMark:
+class DrawnMark(NamedTuple):
     """A mark in one view [px]. end: None where there is none inside the picture."""
 
     mark: MapMark
@@ -126,36 +125,25 @@ class FailureMap:
 
 def failure_map(result: EvalResult) -> FailureMap | None:
     """Return the map of an evaluation; None where no episode has its places."""
-    marks = map_marks(result)
+    found = (_map_mark(episode, "solved" if episode.success else "failed") for episode in result.episodes)
+    marks = tuple(mark for mark in found if mark is not None)
     return FailureMap(marks, result.policy, moving_thing(result.episodes)) if marks else None
 
 
 def paired_maps(comparison: Comparison) -> list[FailureMap]:
-    """Return the maps of both arms; none where no episode has its places."""
-    both = paired_marks(comparison)
-    moving = moving_thing(comparison.left.members[0].result.episodes)
-    maps = [FailureMap(marks, name, moving) for marks, name in zip(both, comparison.names, strict=True)]
-    return maps if all(both) else []
-
-
-def map_marks(result: EvalResult) -> tuple[MapMark, ...]:
-    """Return every episode whose start and goal are known, in the order of the file."""
-    found = (_map_mark(episode, "solved" if episode.success else "failed") for episode in result.episodes)
-    return tuple(mark for mark in found if mark is not None)
-
-
-def paired_marks(comparison: Comparison) -> tuple[tuple[MapMark, ...], tuple[MapMark, ...]]:
-    """Return the left arm's and the right arm's marks, in the order of the test episodes.
+    """Return the maps of both arms, marks in the order of the test episodes; none where no episode has its places.
 
     `failed`: the arm failed where the other did not, with several training seeds in more of them; `shared`: it failed,
     and the other at least as often.
     """
-    left, right = _failures(comparison.left), _failures(comparison.right)
-    return _arm_marks(comparison.left, left, right), _arm_marks(comparison.right, right, left)
+    moving = moving_thing(comparison.left.members[0].result.episodes)
+    failures = [_failures(arm) for arm in comparison.arms]
+    both = [_arm_marks(arm, *counts) for arm, counts in zip(comparison.arms, (failures, failures[::-1]), strict=True)]
+    maps = [FailureMap(marks, name, moving) for marks, name in zip(both, comparison.names, strict=True)]
+    return maps if all(both) else []
 
 
-@dataclass(frozen=True)
-class DrawnPaths:
+class DrawnPaths(NamedTuple):
     """Hand, object and goal in one view [px]: lines (T, 2), the goal (2,)."""
 
     view: View
@@ -169,9 +157,9 @@ def draw_paths(paths: Paths) -> list[DrawnPaths]:
     points = np.vstack([paths.hand, paths.obj, paths.goal[None]])
     spread = np.ptp(points, axis=0)
     views = [fit_view(points, *axes, PATHS_HEIGHT) for axes in ((0, 1), (0 if spread[0] >= spread[1] else 1, 2))]
+    lines = [line[_evenly(len(line), MAX_POINTS)] for line in (paths.hand, paths.obj)]
     return [
-        DrawnPaths(view, view.project(paths.goal[None])[0], *(view.project(_thin(p)) for p in (paths.hand, paths.obj)))
-        for view in views
+        DrawnPaths(view, view.project(paths.goal[None])[0], *(view.project(line) for line in lines)) for view in views
     ]
 
 
@@ -219,10 +207,6 @@ def _draw(mark: MapMark, view: View) -> DrawnMark:
     inside = edge < end[0] < WIDTH - edge and edge < end[1] < view.height - edge
     drawn_end = tuple(end) if mark.outcome != "solved" and mark.end is not None and inside else None
     return DrawnMark(mark, tuple(start), tuple(goal), drawn_end)
-
-
-def _thin(points: F64) -> F64:
-    return points[_evenly(len(points), MAX_POINTS)]
 
 
 def _evenly(count: int, most: int) -> list[int]:

@@ -78,7 +78,7 @@ class CurvePoint:
 
     def amount(self, cost: Cost) -> float | None:
         """Return labels, episodes or seconds; None where not known."""
-        return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[cost]
+        return getattr(self, cost)
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,9 @@ from manip_il.evaluation.compare_report import compare_report
 from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import encode_picture
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.maps import map_marks, paired_marks
+from manip_il.evaluation.maps import FailureMap, failure_map, paired_maps
 from manip_il.evaluation.report import Report, RunReport
 from manip_il.evaluation.report_data import CurvePoint, LearningCurve, PolicyRow, Strip
-from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.study_report import study_report
 
 from .browser import HEIGHT, Opened, chromium, opened
@@ -173,21 +172,19 @@ def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path:
     eval_case().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", width) as seen:
         for index in range(2):
-            assert marks_in(seen, index) == counted(RESULT)
+            assert marks_in(seen, index) == counted(failure_map(RESULT))
 
 
 def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
     compare_case().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", 1280) as seen:
-        for arm, marks in enumerate(paired_marks(COMPARISON)):
-            expected = {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
-            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == expected
+        for arm, map_of_arm in enumerate(paired_maps(COMPARISON)):
+            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == counted(map_of_arm)
         assert marks_in(seen, 0)["failed"] > 0 == marks_in(seen, 2)["failed"]
 
 
-def counted(result: EvalResult) -> dict[str, int]:
-    marks = map_marks(result)
-    return {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
+def counted(given: FailureMap) -> dict[str, int]:
+    return {kind: sum(mark.outcome == kind for mark in given.marks) for kind in ("failed", "shared", "solved")}
 
 
 def marks_in(seen: Opened, index: int) -> dict[str, int]:
