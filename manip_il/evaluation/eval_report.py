@@ -156,13 +156,6 @@ class EvalReport(Report):
         return factor_table([factor for factor in self.factors if not factor.significant])
 
     @property
-    def insignificant_heading(self) -> str:
-        """Heading of the folded table."""
-        if not self.significant.rows:
-            return "All that varied"
-        return f"{len(self.insignificant.rows)} more that varied, without a difference beyond chance"
-
-    @property
     def no_factor(self) -> str:
         """Sentence in place of a table without rows."""
         if len(self.factors) == 1:

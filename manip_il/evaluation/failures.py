@@ -88,16 +88,15 @@ def _phase_fact(result: EvalResult) -> str:
 
 
 def _condition_fact(result: EvalResult) -> str:
-    hardest = hardest_condition(result)
+    hardest, count = hardest_condition(result), len(result.by_condition)
     if hardest is None or result.success.successes in (0, result.success.n):
         return ""
-    count = len(result.by_condition)
-    if hardest.significant:
-        return (
-            f"Of {count} conditions {hardest.name} is the hardest: {hardest.success} of {hardest.success.n:,} "
-            f"episodes, against all others {format_p(hardest.p_value)} (Fisher's exact test, corrected for the choice)."
-        )
-    return f"No condition of the {count} is shown to be harder than the others."
+    if not hardest.significant:
+        return f"No condition of the {count} is shown to be harder than the others."
+    return (
+        f"Of {count} conditions {hardest.name} is the hardest: {hardest.success} of {hardest.success.n:,} "
+        f"episodes, against all others {format_p(hardest.p_value)} (Fisher's exact test, corrected for the choice)."
+    )
 
 
 def _factor_fact(factors: Sequence[Factor]) -> str:
@@ -186,11 +185,10 @@ def find_factors(result: EvalResult) -> tuple[Factor, ...]:
         for episode in part.episodes:
             for name, value in episode.drawn_numbers.items():
                 columns.setdefault(prefix + name, []).append((value, episode.success))
-    made = [_factor(name, column, result.confidence) for name, column in columns.items()]
-    factors = [factor for factor in made if factor is not None]
+    made = (_factor(name, column, result.confidence) for name, column in columns.items())
+    factors = sorted((factor for factor in made if factor is not None), key=lambda factor: factor.p_value)
     corrected = holm([factor.p_value for factor in factors])
-    factors = [replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True)]
-    return tuple(sorted(factors, key=lambda factor: factor.p_value))
+    return tuple(replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True))
 
 
 def hardest_condition(result: EvalResult) -> HardestCondition | None:

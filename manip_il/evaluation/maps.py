@@ -71,7 +71,6 @@ def fit_view(points: F64, right: int, up: int, height: float) -> View:
 class MapMark:
     """One episode on the map; places in the world frame [m]. end: of object or hand, None where not known."""
 
-    seed: int
     outcome: Outcome
     start: Place
     goal: Place
@@ -170,7 +169,7 @@ def _map_mark(episode: EpisodeResult, outcome: Outcome) -> MapMark | None:
     words = [f"seed {episode.seed}", episode.condition, "solved" if episode.success else "failed"]
     if not episode.success and episode.phase_at_end:
         words.append(f"ended in {episode.phase_at_end}")
-    return MapMark(episode.seed, outcome, start, goal, episode.end, ", ".join(filter(None, words)))
+    return MapMark(outcome, start, goal, episode.end, ", ".join(filter(None, words)))
 
 
 def _failures(arm: Arm) -> Mapping[int, int]:
@@ -185,20 +184,15 @@ def _arm_marks(arm: Arm, own: Mapping[int, int], others: Mapping[int, int]) -> t
         failures = own[episode.seed]
         outcome: Outcome = "solved" if not failures else "failed" if failures > others[episode.seed] else "shared"
         mark = _map_mark(episode, outcome)
-        if mark is None:
-            continue
-        if count > 1:  # ends differ between training seeds
+        if mark and count > 1:  # ends differ between training seeds
             mark = replace(mark, end=None, words=f"seed {episode.seed}, failed in {failures} of {count} training seeds")
-        marks.append(mark)
+        marks += [mark] if mark else []
     return tuple(marks)
 
 
 def _thinned(marks: Sequence[MapMark]) -> list[MapMark]:
-    kept: list[MapMark] = []
-    for outcome in LAYERS:
-        these = [mark for mark in marks if mark.outcome == outcome]
-        kept += [these[index] for index in _evenly(len(these), MAX_MARKS)]
-    return kept
+    layers = ([mark for mark in marks if mark.outcome == outcome] for outcome in LAYERS)
+    return [these[index] for these in layers for index in _evenly(len(these), MAX_MARKS)]
 
 
 def _draw(mark: MapMark, view: View) -> DrawnMark:

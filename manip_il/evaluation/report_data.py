@@ -46,15 +46,8 @@ class PolicyRow:
         kind: Kind = "dagger",
     ) -> PolicyRow:
         """Return a row from one evaluation, and a second one under a disturbance where there is one."""
-        return cls(
-            name=name,
-            success=result.success,
-            labels=labels,
-            success_at_end=result.success_at_end,
-            steps_to_success=result.steps_to_success,
-            disturbed=disturbed.success if disturbed else None,
-            kind=kind,
-        )
+        again = disturbed.success if disturbed else None
+        return cls(name, result.success, labels, result.success_at_end, result.steps_to_success, again, kind)
 
 
 @dataclass(frozen=True)
