@@ -155,9 +155,8 @@ class Comparison:
         n, left, right = len(self.pairs), *self.names
         swapped = self.difference < 0
         better, worse = (left, right) if swapped else (right, left)
-        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
-        if n > 1:
-            tested += f" on each of {n} training seeds"
+        each = f" on each of {n} training seeds" if n > 1 else ""
+        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes{each}"
         over = f" on average over {n} training seeds (ahead in {self.ahead(better)} of {n})" if n > 1 else ""
         points = self._points(-1 if swapped else 1)
         if self.significant:

@@ -138,11 +138,6 @@ class Chart:
         """Labels and their places [percent from the top]."""
         return [(f"{tick:.0f} %", 100 - self.y.percent(tick)) for tick in self.y.ticks()]
 
-    @property
-    def target_place(self) -> float | None:
-        """The target's level [percent from the top]."""
-        return None if self.target is None else 100 - self.y.percent(100 * self.target)
-
 
 @dataclass(frozen=True)
 class CurveCharts:
@@ -190,8 +185,7 @@ class CurveCharts:
         """One chart a cost; the first series is drawn last, on top."""
         charts: list[Chart] = []
         for cost in self.costs:
-            amounts = [amount for point in self.points if (amount := point.amount(cost)) is not None]
-            x = CostAxis.around(cost, amounts)
+            x = CostAxis.around(cost, [amount for p in self.points if (amount := p.amount(cost)) is not None])
             drawn = [_draw(series, x, self.y, index % SHAPES) for index, series in enumerate(self.series)]
             charts.append(Chart(x, self.y, tuple(reversed(drawn)), self.target))
         return charts
@@ -230,10 +224,10 @@ def _draw(series: Series, x: CostAxis, y: Axis, shape: int) -> DrawnSeries:
     # Only rounds that every seed has: else the mean would jump where a seed ends.
     for points in zip(*runs, strict=False):
         amount, rate = fmean(amount for amount, _ in points), fmean(point.success.rate for _, point in points)
-        words = (
-            f"{series.name}, {points[0][1].name}, {format_amount(x.cost, amount)}: {format_percent(rate)} on average"
+        words = f"{series.name}, {points[0][1].name}, {format_amount(x.cost, amount)}"
+        marks.append(
+            Mark(x.percent(amount), 100 - y.percent(100 * rate), f"{words}: {format_percent(rate)} on average")
         )
-        marks.append(Mark(x.percent(amount), 100 - y.percent(100 * rate), words))
     return DrawnSeries(series, shape, tuple(marks), lines)
 
 

@@ -6,6 +6,7 @@ something else under the same name, which is then ignored.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -80,14 +81,9 @@ class EpisodeResult:
     def drawn_numbers(self) -> dict[str, float]:
         """Every drawn number by its name and unit, `mass [kg]`: components of a colour, lengths of other vectors."""
         drawn = self.detail.get("drawn")
-        if not isinstance(drawn, Mapping):
-            return {}
-        return {
-            name: value
-            for key, given in drawn.items()
-            for name, value in _numbers(str(key), given, _UNITS.get(str(key)))
-            if math.isfinite(value)
-        }
+        given = drawn.items() if isinstance(drawn, Mapping) else ()
+        numbers = itertools.chain.from_iterable(_numbers(str(key), one, _UNITS.get(str(key))) for key, one in given)
+        return {name: value for name, value in numbers if math.isfinite(value)}
 
     def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
         places = self.detail.get(when)
@@ -168,15 +164,9 @@ class EvalSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "horizon": self.horizon,
-            "tolerance": self.tolerance,
-            "control_hz": self.control_hz,
-            "success_steps": self.success_steps,
-            "hold": self.hold,
-            "suite": self.suite,
-            "conditions": [condition.to_json() for condition in self.conditions],
-        }
+        plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
+        conditions = [condition.to_json() for condition in self.conditions]
+        return {key: getattr(self, key) for key in plain} | {"conditions": conditions}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:

@@ -178,7 +178,8 @@ def find_factors(result: EvalResult) -> tuple[Factor, ...]:
     """
     if result.success.successes in (0, result.success.n):
         return ()
-    columns = {name: column for name, column in _coordinates(result.episodes).items() if _span(column) > SAME_PLACE}
+    places = _coordinates(result.episodes).items()
+    columns = {name: column for name, column in places if np.ptp([value for value, _ in column]) > SAME_PLACE}
     conditions = result.by_condition
     for condition, part in conditions.items():
         prefix = f"{condition}: " if condition and len(conditions) > 1 else ""
@@ -243,7 +244,7 @@ def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[floa
 def _factor(name: str, column: Sequence[tuple[float, bool]], confidence: float) -> Factor | None:
     """None for what hardly varies, or for too few episodes."""
     values = np.array([value for value, _ in column])
-    if len(column) < MIN_EPISODES or _span(column) <= 1e-6 * float(np.abs(values).max()):
+    if len(column) < MIN_EPISODES or np.ptp(values) <= 1e-6 * np.abs(values).max():
         return None
     bins = [
         Bin(low, high, Proportion.of([success for value, success in column if low <= value <= high], confidence))
@@ -252,11 +253,6 @@ def _factor(name: str, column: Sequence[tuple[float, bool]], confidence: float) 
     if len(bins) == 1:  # nearly all values are one
         return None
     return Factor(name, tuple(bins), fisher_exact([b.success.successes for b in bins], [b.success.n for b in bins]))
-
-
-def _span(column: Sequence[tuple[float, bool]]) -> float:
-    values = [value for value, _ in column]
-    return max(values) - min(values)
 
 
 def _thirds(values: F64) -> list[tuple[float, float]]:

@@ -47,11 +47,6 @@ class View:
         return "from above" if (self.right, self.up) == (0, 1) else "from the side"
 
     @property
-    def axis_names(self) -> tuple[str, str]:
-        """Names of the axes to the right and upwards."""
-        return "xyz"[self.right], "xyz"[self.up]
-
-    @property
     def bar(self) -> float:
         """Length of the bar that shows the scale, round and at most 60 pixels where possible [m]."""
         return max((length for length in _BAR_LENGTHS if length * self.scale <= 60), default=_BAR_LENGTHS[0])

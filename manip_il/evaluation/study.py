@@ -137,7 +137,7 @@ class Study:
         ours = [one.labels for one in self.reached(arm) if one]
         if len(ours) < len(arm.members):
             return "not reached"
-        baseline = next(one for one in self.arms if one.name == self.baseline)
+        baseline = self.comparisons[arm.name].left
         reached = self.reached(baseline)
         theirs = [(at or member.history[-1]).labels for member, at in zip(baseline.members, reached, strict=True)]
         return f"{'' if all(reached) else '> '}{sum(theirs) / sum(ours):.1f}"

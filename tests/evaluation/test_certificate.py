@@ -137,7 +137,7 @@ def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(mea
     assert [row.name for row in measured.rows] == [
         *("start", "jolt", "moved", "dropped", "closed", "open", "random", "opposite", "gripper", "noise")
     ]
-    whole = {case.seed: case.steps or 0 for case in measured.of("start")[0].cases}
+    whole = {case.seed: case.steps for case in measured.of("start")[0].cases}
     for one in [*measured.of("state"), *measured.of("action")]:
         assert len(one.cases) + one.left_out == 3
         for case in one.cases:
@@ -226,8 +226,7 @@ def certified(request, tmp_path_factory) -> Certificate:
 @pytest.mark.slow
 def test_the_certificate_of_pick_and_place_does_not_fall(certified: Certificate):
     [learner] = certified.of("learner")
-    rows = {"start": certified.of("start")[0], "state": certified.states, "action": certified.actions}
-    rows["learner"] = learner
+    rows = {one.group: one for one in (certified.of("start")[0], certified.states, certified.actions, learner)}
     rates = {group: row.success.rate for group, row in rows.items()}
     assert {group: rate for group, rate in rates.items() if rate < FLOORS[group]} == {}
     assert min(len(row.cases) for row in rows.values()) >= CASES // 2

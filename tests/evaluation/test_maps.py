@@ -105,7 +105,5 @@ def test_phases_come_in_the_order_of_the_task_and_unknown_ones_last():
     assert [row.name for row in rows] == ["approach", "descend", "open", "grasp", "carry", "at_goal", "none"]
     assert sum(row.counts[0] for row in rows) == sum(not e.success for e in made_eval().episodes)
     episodes = [EpisodeResult(1, False, False, 1, 0.0, "juggle"), EpisodeResult(2, False, False, 1, 0.0)]
-    assert [(row.name, row.counts) for row in phase_rows([episodes], "pick_place")[-2:]] == [
-        ("juggle", (1,)),
-        ("not recorded", (1,)),
-    ]
+    last_two = [(row.name, row.counts) for row in phase_rows([episodes], "pick_place")[-2:]]
+    assert last_two == [("juggle", (1,)), ("not recorded", (1,))]
