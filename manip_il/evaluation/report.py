@@ -167,16 +167,17 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    environment.filters.update(
-        prose=keep_together,
-        split_interval=split_interval,
-        base64=lambda content: base64.b64encode(content).decode("ascii"),
-        percent=lambda value: f"{value:.2f}%",
-        px=lambda value: f"{value:.1f}",
-        rate=format_percent,
-        durations=lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},
-        flatten=flatten,
-        strip_columns=strip_columns,
-        draw_paths=draw_paths,
-    )
+    filters: dict[str, Any] = {
+        "prose": keep_together,
+        "split_interval": split_interval,
+        "base64": lambda content: base64.b64encode(content).decode("ascii"),
+        "percent": lambda value: f"{value:.2f}%",
+        "px": lambda value: f"{value:.1f}",
+        "rate": format_percent,
+        "durations": lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},
+        "flatten": flatten,
+        "strip_columns": strip_columns,
+        "draw_paths": draw_paths,
+    }
+    environment.filters.update(filters)
     return environment

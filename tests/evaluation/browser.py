@@ -48,9 +48,14 @@ def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "d
     seen, own = Opened(page), path.resolve().as_uri()
     page.on("console", lambda message: seen.console.append(f"{message.type}: {message.text}"))
     page.on("pageerror", lambda error: seen.console.append(str(error)))
-    page.on("request", lambda one: one.url == own or one.url.startswith("data:") or seen.requests.append(one.url))
+    page.on("request", lambda request: _note(seen.requests, request.url, own))
     page.goto(own)
     try:
         yield seen
     finally:
         context.close()
+
+
+def _note(requests: list[str], url: str, own: str) -> None:
+    if url != own and not url.startswith("data:"):
+        requests.append(url)

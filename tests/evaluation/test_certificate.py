@@ -137,7 +137,7 @@ def test_every_kind_has_its_row_and_every_case_its_moment_on_the_experts_way(mea
     assert [row.name for row in measured.rows] == [
         *("start", "jolt", "moved", "dropped", "closed", "open", "random", "opposite", "gripper", "noise")
     ]
-    whole = {case.seed: case.steps for case in measured.of("start")[0].cases}
+    whole = {case.seed: case.steps or 0 for case in measured.of("start")[0].cases}
     for one in [*measured.of("state"), *measured.of("action")]:
         assert len(one.cases) + one.left_out == 3
         for case in one.cases:
