@@ -10,7 +10,6 @@ drawn actions, as here, is a lower bound of u: `Row.above_largest` says how much
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,9 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from manip_il.data.atomic import write_file
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.intervals import CONFIDENCE, Proportion
+from manip_il.evaluation.results import write_json
 from manip_il.evaluation.tables import Table
 
 FILE_NAME = "certificate.json"
@@ -213,43 +212,31 @@ class Certificate:
 
     def write(self, path: Path) -> None:
         """Write `path` whole or not at all, creating its folder."""
-        text = json.dumps(self.to_json(), allow_nan=False, ensure_ascii=False)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, (text + "\n").encode())
+        write_json(path, self.to_json(), indent=None)
 
 
 def summary_lines(certificate: Certificate) -> list[str]:
     """Return the table of recoveries, the table of wrong actions, and sentences on both, as plain lines."""
-    settings = certificate.settings
-    horizon = f"{settings.horizon} steps ({_seconds(settings.horizon, settings.control_hz)})"
+    settings, hz = certificate.settings, certificate.settings.control_hz
+    horizon = f"{settings.horizon} steps ({_seconds(settings.horizon, hz)})"
+    head = ("the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out")
+    rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
+    costs_head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
+    costs = tuple(_costs(row, hz) for row in [*certificate.of("action"), certificate.actions])
     return [
         f"expert on {certificate.robot} {certificate.task}: {settings.cases} cases a kind, --seed={settings.seed}",
         "",
-        *_recoveries(certificate, horizon),
+        *Table(head, tuple(map(_recovery, [*rows, *certificate.of("learner")]))).aligned_lines(),
         "",
-        *_wrong_actions(certificate),
+        *Table(costs_head, costs).aligned_lines(),
         "",
         *_sentences(certificate),
     ]
 
 
-def _recoveries(certificate: Certificate, horizon: str) -> list[str]:
-    rows = [*certificate.of("start"), *certificate.of("state"), certificate.states, certificate.actions]
-    rows += certificate.of("learner")
-    head = ("the expert continues from", f"solved in {horizon} [{CONFIDENCE:.0%}]", "mean steps", "cases", "left out")
-    cells: list[tuple[str, ...]] = []
-    for row in rows:
-        steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
-        cells.append((row.words, str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out)))
-    return Table(head, tuple(cells)).aligned_lines()
-
-
-def _wrong_actions(certificate: Certificate) -> list[str]:
-    hz = certificate.settings.control_hz
-    head = ("one wrong action costs, in steps", "mean", "95th", "99th", "largest", "never solved", "cases")
-    return Table(
-        head, tuple(_costs(row, hz) for row in [*certificate.of("action"), certificate.actions])
-    ).aligned_lines()
+def _recovery(row: Row) -> tuple[str, ...]:
+    steps = _NONE if row.mean_steps is None else f"{row.mean_steps:.1f}"
+    return (row.words, str(row.success or _NONE), steps, str(len(row.cases)), str(row.left_out))
 
 
 def _costs(row: Row, hz: int) -> tuple[str, ...]:
@@ -270,12 +257,11 @@ def _sentences(certificate: Certificate) -> list[str]:
 
 
 def _mu(actions: Row, hz: int) -> str:
-    assert actions.gaps is not None
-    assert actions.above_largest is not None
-    mu = f"mu (the u of Ross et al. 2011) is at least {actions.gaps.largest} steps"
-    mu += f" ({_seconds(actions.gaps.largest, hz)})"
-    if actions.gaps.unrecovered:
-        return f"{mu}, the whole horizon, as {actions.gaps.unrecovered} of {len(actions.cases)} were never solved"
+    gaps = actions.gaps
+    assert gaps is not None
+    mu = f"mu (the u of Ross et al. 2011) is at least {gaps.largest} steps ({_seconds(gaps.largest, hz)})"
+    if gaps.unrecovered:
+        return f"{mu}, the whole horizon, as {gaps.unrecovered} of {len(actions.cases)} were never solved"
     return f"{mu}; with {CONFIDENCE:.0%} confidence, at most {actions.above_largest:.1%} of such actions cost more"
 
 

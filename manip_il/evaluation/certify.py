@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from manip_il.data import schema
 from manip_il.engine.drivers import QueryRule
@@ -31,15 +30,6 @@ from manip_il.tasks.table import get_task
 _LOG = logging.getLogger(__name__)
 NOISE = 0.1  # standard deviation of the actions' noise, as a share of their range
 Progress = Callable[[Episode], None]
-
-
-@dataclass(frozen=True, eq=False)
-class Undisturbed:
-    """The expert's own run of a seed. steps: until solved; states (steps, m) and actions (steps, n) on the way."""
-
-    steps: int
-    states: NDArray[np.float64]
-    actions: NDArray[np.float32]
 
 
 def certify(
@@ -83,7 +73,7 @@ class _Run:
 
     def __init__(self, engine: Engine, env: EnvConfig, seeds: Sequence[int], on_episode: Progress | None):
         self._engine, self._env, self._seeds, self._seen = engine, env, seeds, on_episode
-        self._undisturbed: dict[int, Undisturbed] = {}
+        self._undisturbed: dict[int, tuple[int, Episode]] = {}  # seed -> steps until solved, the expert's own run
 
     def starts(self) -> Row:
         """Episodes as they begin."""
@@ -92,8 +82,7 @@ class _Run:
             case = self._case(episode, 0)
             cases.append(case)
             if case.steps is not None:
-                states, actions = episode.columns[schema.SIM_STATE], episode.columns[schema.EXECUTED_ACTION]
-                self._undisturbed[case.seed] = Undisturbed(case.steps, states, actions)  # pyright: ignore[reportArgumentType]
+                self._undisturbed[case.seed] = case.steps, episode
         if not self._undisturbed:
             raise ManipError(
                 f"the expert solved none of {len(self._seeds)} undisturbed episodes within {self._env.horizon} steps, "
@@ -109,14 +98,15 @@ class _Run:
 
     def perturbed(self, kind: str) -> Row:
         """Episodes perturbed once."""
-        moments = {seed: draw_moment(seed, kind, run.steps) for seed, run in self._undisturbed.items()}
+        moments = {seed: draw_moment(seed, kind, steps) for seed, (steps, _) in self._undisturbed.items()}
         longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
         job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
-            moment, run = moments[episode.seed], self._undisturbed[episode.seed]
-            if has_changed(episode, run, moment):
-                cases.append(self._case(episode, moment, run.steps - moment))
+            moment, (steps, run) = moments[episode.seed], self._undisturbed[episode.seed]
+            changed = (schema.SIM_STATE, schema.EXECUTED_ACTION)
+            if not all(np.array_equal(episode.columns[key][moment], run.columns[key][moment]) for key in changed):
+                cases.append(self._case(episode, moment, steps - moment))
         known = kinds_for(get_task(self._env.task))[kind]
         return self._row("action" if known.wrong else "state", kind, known.words, cases)
 
@@ -151,9 +141,3 @@ class _Run:
 def draw_moment(seed: int, kind: str, steps: int) -> int:
     """Return one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
-
-
-def has_changed(episode: Episode, run: Undisturbed, moment: int) -> bool:
-    """Return whether the state or the action at `moment` differs from the undisturbed run's."""
-    state, action = episode.columns[schema.SIM_STATE][moment], episode.columns[schema.EXECUTED_ACTION][moment]
-    return not (np.array_equal(state, run.states[moment]) and np.array_equal(action, run.actions[moment]))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import fmean
 from typing import Any, ClassVar
 
 from manip_il.evaluation.comparison import Comparison, Member
@@ -50,7 +52,7 @@ def condition_table(comparison: Comparison) -> Table | None:
     corrected = holm([sign_flip_exact(one) for one in margins])
     rows: list[tuple[str, ...]] = []
     for (name, own), p in zip(seeds.items(), corrected, strict=True):
-        rates = [_rate(outcomes, own) for outcomes in (left, right)]
+        rates = [fmean(success for seed in own for success in outcomes[seed]) for outcomes in (left, right)]
         difference = f"{100 * (rates[1] - rates[0]):+.1f} points"
         rows.append((name or NO_CONDITION, f"{len(own):,}", *map(format_percent, rates), difference, format_p(p)))
     return Table(("condition", "episodes", *comparison.names, "difference", "corrected p"), tuple(rows))
@@ -172,35 +174,25 @@ class CompareReport(Report):
 
 
 def _paired_fact(comparison: Comparison) -> str:
-    both, left, right, neither, total = (
-        sum(getattr(pair, count) for pair in comparison.pairs)
-        for count in ("both", "only_left", "only_right", "neither", "n")
-    )
+    counts = ((pair.n, pair.both, pair.only_right, pair.only_left, pair.neither) for pair in comparison.pairs)
+    n, both, right, left, neither = map(sum, zip(*counts, strict=True))
     over = f" of {len(comparison.pairs)} training seeds" if len(comparison.pairs) > 1 else ""
     a, b = comparison.names
-    return (
-        f"Of {total:,} paired episodes{over} both solved {both:,}, only {b} {right:,}, only {a} {left:,}, "
-        f"and neither {neither:,}."
-    )
+    only = f"only {b} {right:,}, only {a} {left:,}"
+    return f"Of {n:,} paired episodes{over} both solved {both:,}, {only}, and neither {neither:,}."
 
 
 def _cells(member: Member) -> tuple[str, ...]:
-    seed, chosen = "" if member.training_seed is None else str(member.training_seed), member.chosen
-    if chosen is None:
-        return (member.name, seed, "", "", "", "", "", str(member.result.success))
-    costs = (str(chosen.round), f"{chosen.labels:,}", f"{chosen.episodes:,}", format_seconds(chosen.seconds))
-    return (member.name, seed, *costs, format_percent(chosen.validation.rate), str(member.result.success))
+    seed, one, costs = "" if member.training_seed is None else str(member.training_seed), member.chosen, ("",) * 5
+    if one is not None:
+        costs = (str(one.round), f"{one.labels:,}", f"{one.episodes:,}", format_seconds(one.seconds))
+        costs += (format_percent(one.validation.rate),)
+    return (member.name, seed, *costs, str(member.result.success))
 
 
 def _outcomes(members: Sequence[Member]) -> dict[int, list[bool]]:
     """Test seed -> success of each training seed."""
-    outcomes: dict[int, list[bool]] = {}
-    for member in members:
-        for episode in member.result.episodes:
-            outcomes.setdefault(episode.seed, []).append(episode.success)
+    outcomes: defaultdict[int, list[bool]] = defaultdict(list)
+    for episode in (one for member in members for one in member.result.episodes):
+        outcomes[episode.seed].append(episode.success)
     return outcomes
-
-
-def _rate(outcomes: Mapping[int, Sequence[bool]], seeds: Sequence[int]) -> float:
-    flat = [success for seed in seeds for success in outcomes[seed]]
-    return sum(flat) / len(flat)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +16,7 @@ from manip_il.evaluation.rounds import History, Round, Rule, rule_facts
 from manip_il.evaluation.significance import PairedComparison, format_p, sign_flip_exact
 
 FILE_NAME = "compare.json"
+_OF_PAIR = ("both", "only_left", "only_right", "neither", "difference", "interval", "p_value")
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Comparison:
                 f"{_listed(self.right)}; runs are paired by seed, so both sides need the same ones"
             )
         # Also policies of different training seeds must have run the same episodes.
-        first, *others = [*self.left.members, *self.right.members]
+        first, *others = (*self.left.members, *self.right.members)
         for other in others:
             require_same_episodes(first.name, first.result, other.name, other.result)
         _ = self.pairs
@@ -130,11 +132,10 @@ class Comparison:
 
         It holds for these trained policies; `interval` is about other training seeds, too.
         """
-        margins: dict[int, int] = {}
-        for left, right in zip(self.left.members, self.right.members, strict=True):
-            lost = {episode.seed: episode.success for episode in left.result.episodes}
-            for episode in right.result.episodes:
-                margins[episode.seed] = margins.get(episode.seed, 0) + episode.success - lost[episode.seed]
+        margins: Counter[int] = Counter()
+        for arm, sign in ((self.left, -1), (self.right, 1)):
+            for episode in (one for member in arm.members for one in member.result.episodes):
+                margins[episode.seed] += sign * episode.success
         return sign_flip_exact(list(margins.values()))
 
     @property
@@ -154,9 +155,8 @@ class Comparison:
         n, left, right = len(self.pairs), *self.names
         swapped = self.difference < 0
         better, worse = (left, right) if swapped else (right, left)
-        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes"
-        if n > 1:
-            tested += f" on each of {n} training seeds"
+        each = f" on each of {n} training seeds" if n > 1 else ""
+        tested = f"{format_p(self.p_value)}, {self.pairs[0].n:,} paired episodes{each}"
         over = f" on average over {n} training seeds (ahead in {self.ahead(better)} of {n})" if n > 1 else ""
         points = self._points(-1 if swapped else 1)
         if self.significant:
@@ -177,7 +177,8 @@ class Comparison:
 
     def _points(self, sign: int, plus: str = "") -> str:
         low, high = sorted(100 * sign * end for end in self.interval)
-        return f"{_number(100 * sign * self.difference, plus)} points [{_number(low, plus)}, {_number(high, plus)}]"
+        # z: no minus before a 0.0
+        return f"{100 * sign * self.difference:{plus}z.1f} points [{low:{plus}z.1f}, {high:{plus}z.1f}]"
 
     @property
     def numbers(self) -> str:
@@ -209,7 +210,7 @@ class Comparison:
             "training_seeds": [
                 {"left_seed": left.training_seed, "right_seed": right.training_seed}
                 | {"left": left.to_json(), "right": right.to_json()}
-                | _pair_json(pair)
+                | {key: getattr(pair, key) for key in _OF_PAIR}
                 for left, right, pair in zip(self.left.members, self.right.members, self.pairs, strict=True)
             ],
         }
@@ -242,24 +243,7 @@ def seeds_facts(count: int) -> list[str]:
     ]
 
 
-def _pair_json(pair: PairedComparison) -> dict[str, Any]:
-    return {
-        "both": pair.both,
-        "only_left": pair.only_left,
-        "only_right": pair.only_right,
-        "neither": pair.neither,
-        "difference": pair.difference,
-        "interval": list(pair.interval),
-        "p_value": pair.p_value,
-    }
-
-
 def _listed(arm: Arm) -> str:
     if arm.training_seeds == [None]:
         return "one policy"
     return ", ".join("?" if seed is None else str(seed) for seed in arm.training_seeds)
-
-
-def _number(points: float, plus: str) -> str:
-    text = f"{points:{plus}.1f}"
-    return text.replace("-0.0", f"{plus}0.0") if text == "-0.0" else text

@@ -37,7 +37,12 @@ class Axis:
 
     def ticks(self) -> list[float]:
         """Return round values on the axis, at most `MAX_TICKS`."""
-        return _log_ticks(self.low, self.high) if self.log else _linear_ticks(self.low, self.high)
+        if self.log:
+            return _log_ticks(self.low, self.high)
+        least = (self.high - self.low) / (MAX_TICKS - 1)
+        magnitude = 10.0 ** math.floor(math.log10(least))
+        step = next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= least - 1e-12 * magnitude)
+        return [i * step for i in range(math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9) + 1)]
 
     @classmethod
     def around(cls, values: Sequence[float]) -> Axis:
@@ -133,11 +138,6 @@ class Chart:
         """Labels and their places [percent from the top]."""
         return [(f"{tick:.0f} %", 100 - self.y.percent(tick)) for tick in self.y.ticks()]
 
-    @property
-    def target_place(self) -> float | None:
-        """The target's level [percent from the top]."""
-        return None if self.target is None else 100 - self.y.percent(100 * self.target)
-
 
 @dataclass(frozen=True)
 class CurveCharts:
@@ -185,8 +185,7 @@ class CurveCharts:
         """One chart a cost; the first series is drawn last, on top."""
         charts: list[Chart] = []
         for cost in self.costs:
-            amounts = [amount for point in self.points if (amount := point.amount(cost)) is not None]
-            x = CostAxis.around(cost, amounts)
+            x = CostAxis.around(cost, [amount for p in self.points if (amount := p.amount(cost)) is not None])
             drawn = [_draw(series, x, self.y, index % SHAPES) for index, series in enumerate(self.series)]
             charts.append(Chart(x, self.y, tuple(reversed(drawn)), self.target))
         return charts
@@ -208,14 +207,11 @@ class CurveCharts:
     @property
     def numbers(self) -> dict[str, str]:
         """Every point's name and costs, and its success."""
+        points = [(series.name, name, p) for series in self.series for name, run in series.runs.items() for p in run]
         numbers: dict[str, str] = {}
-        for series in self.series:
-            for name, run in series.runs.items():
-                for point in run:
-                    costs = [
-                        format_amount(cost, amount) for cost in COSTS if (amount := point.amount(cost)) is not None
-                    ]
-                    numbers[", ".join(filter(None, [series.name, name, point.name, *costs]))] = str(point.success)
+        for series, name, point in points:
+            costs = [format_amount(cost, amount) for cost in COSTS if (amount := point.amount(cost)) is not None]
+            numbers[", ".join(filter(None, [series, name, point.name, *costs]))] = str(point.success)
         return numbers
 
 
@@ -228,10 +224,10 @@ def _draw(series: Series, x: CostAxis, y: Axis, shape: int) -> DrawnSeries:
     # Only rounds that every seed has: else the mean would jump where a seed ends.
     for points in zip(*runs, strict=False):
         amount, rate = fmean(amount for amount, _ in points), fmean(point.success.rate for _, point in points)
-        words = (
-            f"{series.name}, {points[0][1].name}, {format_amount(x.cost, amount)}: {format_percent(rate)} on average"
+        words = f"{series.name}, {points[0][1].name}, {format_amount(x.cost, amount)}"
+        marks.append(
+            Mark(x.percent(amount), 100 - y.percent(100 * rate), f"{words}: {format_percent(rate)} on average")
         )
-        marks.append(Mark(x.percent(amount), 100 - y.percent(100 * rate), words))
     return DrawnSeries(series, shape, tuple(marks), lines)
 
 
@@ -241,13 +237,6 @@ def _mark(series: Series, amount: float, point: CurvePoint, x: CostAxis, y: Axis
     return Mark(x.percent(amount), 100 - y.percent(100 * point.success.rate), f"{words}: {point.success}", (high, low))
 
 
-def _linear_ticks(low: float, high: float) -> list[float]:
-    step = _round_step((high - low) / (MAX_TICKS - 1))
-    first = math.ceil(low / step - 1e-9)
-    last = math.floor(high / step + 1e-9)
-    return [index * step for index in range(first, last + 1)]
-
-
 def _log_ticks(low: float, high: float) -> list[float]:
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for multiples in ((1, 2, 5), (1, 3), (1,)):
@@ -255,11 +244,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
         if len(ticks) <= MAX_TICKS:
             return ticks
     return ticks[:: math.ceil(len(ticks) / MAX_TICKS)]
-
-
-def _round_step(step: float) -> float:
-    magnitude = 10.0 ** math.floor(math.log10(step))
-    return next(m * magnitude for m in (1, 2, 5, 10) if m * magnitude >= step - 1e-12 * magnitude)
 
 
 def _format_count(value: float) -> str:

@@ -6,6 +6,7 @@ something else under the same name, which is then ignored.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]
 
+_KEYS = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")  # of every episode
 _HZ, _SUCCESS_STEPS = 20, 5  # of files without them
 _MOST_CONDITIONS = 100  # of a suite
 _UNITS = {
@@ -79,14 +81,9 @@ class EpisodeResult:
     def drawn_numbers(self) -> dict[str, float]:
         """Every drawn number by its name and unit, `mass [kg]`: components of a colour, lengths of other vectors."""
         drawn = self.detail.get("drawn")
-        if not isinstance(drawn, Mapping):
-            return {}
-        return {
-            name: value
-            for key, given in drawn.items()
-            for name, value in _numbers(str(key), given, _UNITS.get(str(key)))
-            if math.isfinite(value)
-        }
+        given = drawn.items() if isinstance(drawn, Mapping) else ()
+        numbers = itertools.chain.from_iterable(_numbers(str(key), one, _UNITS.get(str(key))) for key, one in given)
+        return {name: value for name, value in numbers if math.isfinite(value)}
 
     def _moving_thing(self, when: Literal["start", "end"]) -> Place | None:
         places = self.detail.get(when)
@@ -94,22 +91,15 @@ class EpisodeResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as `eval.json` holds it."""
-        own = {
-            "seed": self.seed,
-            "success": self.success,
-            "success_at_end": self.success_at_end,
-            "steps": self.steps,
-            "return": self.ret,
-            "phase_at_end": self.phase_at_end,
-        }
-        return own | {key: value for key, value in self.detail.items() if key not in own}
+        values = (self.seed, self.success, self.success_at_end, self.steps, self.ret, self.phase_at_end)
+        detail = {key: value for key, value in self.detail.items() if key not in _KEYS}
+        return dict(zip(_KEYS, values, strict=True)) | detail
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EpisodeResult:
         """Return the inverse of `to_json`; `ManipError` or `KeyError` where a value is invalid or missing."""
         data = checks.mapping("an episode", data)
-        known = ("seed", "success", "success_at_end", "steps", "return", "phase_at_end")
-        detail = {key: value for key, value in data.items() if key not in known}
+        detail = {key: value for key, value in data.items() if key not in _KEYS}
         if detail.get("steps_to_success") is not None:
             checks.whole("steps_to_success", detail["steps_to_success"], 0, LONGEST_EPISODE)
         if "condition" in detail:
@@ -174,15 +164,9 @@ class EvalSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "horizon": self.horizon,
-            "tolerance": self.tolerance,
-            "control_hz": self.control_hz,
-            "success_steps": self.success_steps,
-            "hold": self.hold,
-            "suite": self.suite,
-            "conditions": [condition.to_json() for condition in self.conditions],
-        }
+        plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
+        conditions = [condition.to_json() for condition in self.conditions]
+        return {key: getattr(self, key) for key in plain} | {"conditions": conditions}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:

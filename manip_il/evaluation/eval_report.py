@@ -99,13 +99,11 @@ class EvalReport(Report):
     @property
     def ranges(self) -> dict[str, str]:
         """Condition -> the numbers it draws and their ranges; empty where none draws any."""
-        conditions = self.result.settings.conditions
-        if not any(condition.ranges for condition in conditions):
-            return {}
-        return {
-            condition.name: ", ".join(f"{name} {_range(*ends)}" for name, ends in condition.ranges.items()) or "nothing"
-            for condition in conditions
+        drawn = {
+            one.name: ", ".join(f"{name} {_range(*ends)}" for name, ends in one.ranges.items())
+            for one in self.result.settings.conditions
         }
+        return {name: words or "nothing" for name, words in drawn.items()} if any(drawn.values()) else {}
 
     @property
     def failed(self) -> int:
@@ -154,13 +152,6 @@ class EvalReport(Report):
     def insignificant(self) -> Table:
         """The other factors."""
         return factor_table([factor for factor in self.factors if not factor.significant])
-
-    @property
-    def insignificant_heading(self) -> str:
-        """Heading of the folded table."""
-        if not self.significant.rows:
-            return "All that varied"
-        return f"{len(self.insignificant.rows)} more that varied, without a difference beyond chance"
 
     @property
     def no_factor(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -69,8 +69,9 @@ def evaluation_verdict(result: EvalResult) -> str:
 
 def evaluation_facts(result: EvalResult, factors: Sequence[Factor]) -> tuple[str, ...]:
     """Return further sentences: main phase, hardest condition, first factor, successes that did not last."""
-    facts = (_phase_fact(result), _condition_fact(result), _factor_fact(factors), _end_fact(result))
-    return tuple(filter(None, facts))
+    lost = sum(episode.success and not episode.success_at_end for episode in result.episodes)
+    ends = f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame." if lost else ""
+    return tuple(filter(None, (_phase_fact(result), _condition_fact(result), _factor_fact(factors), ends)))
 
 
 def _main_phase(result: EvalResult) -> str:
@@ -87,36 +88,31 @@ def _phase_fact(result: EvalResult) -> str:
 
 
 def _condition_fact(result: EvalResult) -> str:
-    hardest = hardest_condition(result)
+    hardest, count = hardest_condition(result), len(result.by_condition)
     if hardest is None or result.success.successes in (0, result.success.n):
         return ""
-    count = len(result.by_condition)
-    if hardest.significant:
-        return (
-            f"Of {count} conditions {hardest.name} is the hardest: {hardest.success} of {hardest.success.n:,} "
-            f"episodes, against all others {format_p(hardest.p_value)} (Fisher's exact test, corrected for the choice)."
-        )
-    return f"No condition of the {count} is shown to be harder than the others."
+    if not hardest.significant:
+        return f"No condition of the {count} is shown to be harder than the others."
+    return (
+        f"Of {count} conditions {hardest.name} is the hardest: {hardest.success} of {hardest.success.n:,} "
+        f"episodes, against all others {format_p(hardest.p_value)} (Fisher's exact test, corrected for the choice)."
+    )
 
 
 def _factor_fact(factors: Sequence[Factor]) -> str:
     if not factors or not factors[0].significant:
         return ""
     first = factors[0]
+    # A number that takes two values alone has two bins.
+    names = THIRDS if len(first.bins) == len(THIRDS) else ("lowest", "highest")
     worst = first.bins[first.worst]
-    best = max(first.bins, key=lambda one: one.success.rate)
-    names = dict(zip(first.bins, first.bin_names, strict=True))
+    best, of_best = max(zip(first.bins, names, strict=True), key=lambda one: one[0].success.rate)
     return (
         f"Failures are associated most with {first.name}. "
-        f"{format_percent(worst.success.rate)} succeed in its {names[worst]} "
-        f"({worst.low:.3g} to {worst.high:.3g}), {format_percent(best.success.rate)} in its {names[best]}, "
+        f"{format_percent(worst.success.rate)} succeed in its {names[first.worst]} "
+        f"({worst.low:.3g} to {worst.high:.3g}), {format_percent(best.success.rate)} in its {of_best}, "
         f"corrected {format_p(first.corrected)}."
     )
-
-
-def _end_fact(result: EvalResult) -> str:
-    lost = sum(episode.success and not episode.success_at_end for episode in result.episodes)
-    return f"{lost:,} of the episodes that succeeded were no longer at the goal in their last frame." if lost else ""
 
 
 def _spaced(phase: str) -> str:
@@ -159,11 +155,6 @@ class Factor:
         """The bin with the lowest success."""
         return min(range(len(self.bins)), key=lambda index: self.bins[index].success.rate)
 
-    @property
-    def bin_names(self) -> tuple[str, ...]:
-        """Names of the bins: a number that takes two values alone has two."""
-        return THIRDS if len(self.bins) == len(THIRDS) else ("lowest", "highest")
-
 
 @dataclass(frozen=True)
 class HardestCondition:
@@ -187,18 +178,18 @@ def find_factors(result: EvalResult) -> tuple[Factor, ...]:
     """
     if result.success.successes in (0, result.success.n):
         return ()
-    columns = {name: column for name, column in _coordinates(result.episodes).items() if _span(column) > SAME_PLACE}
+    places = _coordinates(result.episodes).items()
+    columns = {name: column for name, column in places if np.ptp([value for value, _ in column]) > SAME_PLACE}
     conditions = result.by_condition
     for condition, part in conditions.items():
         prefix = f"{condition}: " if condition and len(conditions) > 1 else ""
         for episode in part.episodes:
             for name, value in episode.drawn_numbers.items():
                 columns.setdefault(prefix + name, []).append((value, episode.success))
-    made = [_factor(name, column, result.confidence) for name, column in columns.items()]
-    factors = [factor for factor in made if factor is not None]
+    made = (_factor(name, column, result.confidence) for name, column in columns.items())
+    factors = sorted((factor for factor in made if factor is not None), key=lambda factor: factor.p_value)
     corrected = holm([factor.p_value for factor in factors])
-    factors = [replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True)]
-    return tuple(sorted(factors, key=lambda factor: factor.p_value))
+    return tuple(replace(factor, corrected=p) for factor, p in zip(factors, corrected, strict=True))
 
 
 def hardest_condition(result: EvalResult) -> HardestCondition | None:
@@ -211,9 +202,9 @@ def hardest_condition(result: EvalResult) -> HardestCondition | None:
         fisher_exact((part.successes, total.successes - part.successes), (part.n, total.n - part.n))
         for part in parts.values()
     ]
-    corrected = dict(zip(parts, holm(p_values), strict=True))
-    worst = min(parts, key=lambda name: parts[name].rate)
-    return HardestCondition(worst, parts[worst], corrected[worst])
+    ranked = zip(parts.items(), holm(p_values), strict=True)
+    (worst, success), p_value = min(ranked, key=lambda one: one[0][1].rate)
+    return HardestCondition(worst, success, p_value)
 
 
 def factor_table(factors: Sequence[Factor]) -> Table:
@@ -236,7 +227,7 @@ def _bin_cell(one: Bin, marked: bool) -> str:
 
 def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[float, bool]]]:
     thing = moving_thing(episodes)
-    columns: dict[str, list[tuple[float, bool]]] = {}
+    columns: defaultdict[str, list[tuple[float, bool]]] = defaultdict(list)
     for episode in episodes:
         start, goal = episode.start, episode.goal
         # An object starts on the table: its height there is its size, which is a drawn number of its own.
@@ -246,14 +237,14 @@ def _coordinates(episodes: Sequence[EpisodeResult]) -> dict[str, list[tuple[floa
         if start is not None and goal is not None:
             values["distance from start to goal [m]"] = math.dist(start, goal)
         for name, value in values.items():
-            columns.setdefault(name, []).append((value, episode.success))
+            columns[name].append((value, episode.success))
     return columns
 
 
 def _factor(name: str, column: Sequence[tuple[float, bool]], confidence: float) -> Factor | None:
     """None for what hardly varies, or for too few episodes."""
     values = np.array([value for value, _ in column])
-    if len(column) < MIN_EPISODES or _span(column) <= 1e-6 * float(np.abs(values).max()):
+    if len(column) < MIN_EPISODES or np.ptp(values) <= 1e-6 * np.abs(values).max():
         return None
     bins = [
         Bin(low, high, Proportion.of([success for value, success in column if low <= value <= high], confidence))
@@ -262,11 +253,6 @@ def _factor(name: str, column: Sequence[tuple[float, bool]], confidence: float) 
     if len(bins) == 1:  # nearly all values are one
         return None
     return Factor(name, tuple(bins), fisher_exact([b.success.successes for b in bins], [b.success.n for b in bins]))
-
-
-def _span(column: Sequence[tuple[float, bool]]) -> float:
-    values = [value for value, _ in column]
-    return max(values) - min(values)
 
 
 def _thirds(values: F64) -> list[tuple[float, float]]:

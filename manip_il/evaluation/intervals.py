@@ -91,7 +91,7 @@ def confidence_sequence(successes: int, n: int, confidence: float = CONFIDENCE) 
         )
         return mixture - log_likelihood < -math.log1p(-confidence)
 
-    rate = successes / n
+    rate = min(max(successes / n, 1e-12), 1 - 1e-12)  # at 0 and 1 there is no logarithm
     low = 0.0 if successes == 0 else _bisect(inside, rate, 0.0)
     high = 1.0 if failures == 0 else _bisect(inside, rate, 1.0)
     return low, high
@@ -115,11 +115,8 @@ def t_quantile(confidence: float, degrees: int) -> float:
         raise UsageError(
             f"t quantile of {confidence} with {degrees} degrees of freedom; expected 0 to 1 and at least 1"
         )
-    low, high = 0.0, math.pi / 2  # of the angle whose tangent is t / sqrt(degrees)
-    for _ in range(60):  # halves the error each time: to the last bit
-        middle = (low + high) / 2
-        low, high = (middle, high) if _t_probability(middle, degrees) < confidence else (low, middle)
-    return math.sqrt(degrees) * math.tan((low + high) / 2)
+    angle = _bisect(lambda angle: _t_probability(angle, degrees) < confidence, 0.0, math.pi / 2)
+    return math.sqrt(degrees) * math.tan(angle)
 
 
 def require_counts(successes: int, n: int) -> None:
@@ -135,8 +132,7 @@ def require_confidence(confidence: float) -> None:
 
 
 def _bisect(inside: Callable[[float], bool], within: float, outside: float) -> float:
-    """Where `inside` ends between a rate that is inside and 0 or 1, which is not evaluated."""
-    within = min(max(within, 1e-12), 1 - 1e-12)  # the rate itself may be 0 or 1, where there is no logarithm
+    """Where `inside` ends between a value that is inside and one that is not; neither is evaluated."""
     for _ in range(60):  # halves the error each time: to the last bit
         middle = (within + outside) / 2
         within, outside = (middle, outside) if inside(middle) else (within, middle)

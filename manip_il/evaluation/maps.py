@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -47,11 +47,6 @@ class View:
         return "from above" if (self.right, self.up) == (0, 1) else "from the side"
 
     @property
-    def axis_names(self) -> tuple[str, str]:
-        """Names of the axes to the right and upwards."""
-        return "xyz"[self.right], "xyz"[self.up]
-
-    @property
     def bar(self) -> float:
         """Length of the bar that shows the scale, round and at most 60 pixels where possible [m]."""
         return max((length for length in _BAR_LENGTHS if length * self.scale <= 60), default=_BAR_LENGTHS[0])
@@ -71,7 +66,6 @@ def fit_view(points: F64, right: int, up: int, height: float) -> View:
 class MapMark:
     """One episode on the map; places in the world frame [m]. end: of object or hand, None where not known."""
 
-    seed: int
     outcome: Outcome
     start: Place
     goal: Place
@@ -79,8 +73,7 @@ class MapMark:
     words: str = ""
 
 
-@dataclass(frozen=True)
-class DrawnMark:
+class DrawnMark(NamedTuple):
     """A mark in one view [px]. end: None where there is none inside the picture."""
 
     mark: MapMark
@@ -126,36 +119,25 @@ class FailureMap:
 
 def failure_map(result: EvalResult) -> FailureMap | None:
     """Return the map of an evaluation; None where no episode has its places."""
-    marks = map_marks(result)
+    found = (_map_mark(episode, "solved" if episode.success else "failed") for episode in result.episodes)
+    marks = tuple(mark for mark in found if mark is not None)
     return FailureMap(marks, result.policy, moving_thing(result.episodes)) if marks else None
 
 
 def paired_maps(comparison: Comparison) -> list[FailureMap]:
-    """Return the maps of both arms; none where no episode has its places."""
-    both = paired_marks(comparison)
-    moving = moving_thing(comparison.left.members[0].result.episodes)
-    maps = [FailureMap(marks, name, moving) for marks, name in zip(both, comparison.names, strict=True)]
-    return maps if all(both) else []
-
-
-def map_marks(result: EvalResult) -> tuple[MapMark, ...]:
-    """Return every episode whose start and goal are known, in the order of the file."""
-    found = (_map_mark(episode, "solved" if episode.success else "failed") for episode in result.episodes)
-    return tuple(mark for mark in found if mark is not None)
-
-
-def paired_marks(comparison: Comparison) -> tuple[tuple[MapMark, ...], tuple[MapMark, ...]]:
-    """Return the left arm's and the right arm's marks, in the order of the test episodes.
+    """Return the maps of both arms, marks in the order of the test episodes; none where no episode has its places.
 
     `failed`: the arm failed where the other did not, with several training seeds in more of them; `shared`: it failed,
     and the other at least as often.
     """
-    left, right = _failures(comparison.left), _failures(comparison.right)
-    return _arm_marks(comparison.left, left, right), _arm_marks(comparison.right, right, left)
+    moving = moving_thing(comparison.left.members[0].result.episodes)
+    failures = [_failures(arm) for arm in comparison.arms]
+    both = [_arm_marks(arm, *counts) for arm, counts in zip(comparison.arms, (failures, failures[::-1]), strict=True)]
+    maps = [FailureMap(marks, name, moving) for marks, name in zip(both, comparison.names, strict=True)]
+    return maps if all(both) else []
 
 
-@dataclass(frozen=True)
-class DrawnPaths:
+class DrawnPaths(NamedTuple):
     """Hand, object and goal in one view [px]: lines (T, 2), the goal (2,)."""
 
     view: View
@@ -169,9 +151,9 @@ def draw_paths(paths: Paths) -> list[DrawnPaths]:
     points = np.vstack([paths.hand, paths.obj, paths.goal[None]])
     spread = np.ptp(points, axis=0)
     views = [fit_view(points, *axes, PATHS_HEIGHT) for axes in ((0, 1), (0 if spread[0] >= spread[1] else 1, 2))]
+    lines = [line[_evenly(len(line), MAX_POINTS)] for line in (paths.hand, paths.obj)]
     return [
-        DrawnPaths(view, view.project(paths.goal[None])[0], *(view.project(_thin(p)) for p in (paths.hand, paths.obj)))
-        for view in views
+        DrawnPaths(view, view.project(paths.goal[None])[0], *(view.project(line) for line in lines)) for view in views
     ]
 
 
@@ -182,7 +164,7 @@ def _map_mark(episode: EpisodeResult, outcome: Outcome) -> MapMark | None:
     words = [f"seed {episode.seed}", episode.condition, "solved" if episode.success else "failed"]
     if not episode.success and episode.phase_at_end:
         words.append(f"ended in {episode.phase_at_end}")
-    return MapMark(episode.seed, outcome, start, goal, episode.end, ", ".join(filter(None, words)))
+    return MapMark(outcome, start, goal, episode.end, ", ".join(filter(None, words)))
 
 
 def _failures(arm: Arm) -> Mapping[int, int]:
@@ -197,20 +179,15 @@ def _arm_marks(arm: Arm, own: Mapping[int, int], others: Mapping[int, int]) -> t
         failures = own[episode.seed]
         outcome: Outcome = "solved" if not failures else "failed" if failures > others[episode.seed] else "shared"
         mark = _map_mark(episode, outcome)
-        if mark is None:
-            continue
-        if count > 1:  # ends differ between training seeds
+        if mark and count > 1:  # ends differ between training seeds
             mark = replace(mark, end=None, words=f"seed {episode.seed}, failed in {failures} of {count} training seeds")
-        marks.append(mark)
+        marks += [mark] if mark else []
     return tuple(marks)
 
 
 def _thinned(marks: Sequence[MapMark]) -> list[MapMark]:
-    kept: list[MapMark] = []
-    for outcome in LAYERS:
-        these = [mark for mark in marks if mark.outcome == outcome]
-        kept += [these[index] for index in _evenly(len(these), MAX_MARKS)]
-    return kept
+    layers = ([mark for mark in marks if mark.outcome == outcome] for outcome in LAYERS)
+    return [these[index] for these in layers for index in _evenly(len(these), MAX_MARKS)]
 
 
 def _draw(mark: MapMark, view: View) -> DrawnMark:
@@ -219,10 +196,6 @@ def _draw(mark: MapMark, view: View) -> DrawnMark:
     inside = edge < end[0] < WIDTH - edge and edge < end[1] < view.height - edge
     drawn_end = tuple(end) if mark.outcome != "solved" and mark.end is not None and inside else None
     return DrawnMark(mark, tuple(start), tuple(goal), drawn_end)
-
-
-def _thin(points: F64) -> F64:
-    return points[_evenly(len(points), MAX_POINTS)]
 
 
 def _evenly(count: int, most: int) -> list[int]:

@@ -83,7 +83,7 @@ class Report:
     @cached_property
     def pictures(self) -> list[tuple[str, list[Film], list[Strip], list[Paths]]]:
         """Pictures by outcome, each outcome under its heading, those of unknown outcome first and without one."""
-        return [
+        found = [
             (
                 heading,
                 [one for one in self.films if one.success is success],
@@ -91,13 +91,8 @@ class Report:
                 [one for one in self.paths if one.success is success],
             )
             for success, heading in _OUTCOMES
-            if any(one.success is success for one in (*self.films, *self.strips, *self.paths))
         ]
-
-    @property
-    def durations(self) -> dict[str, str]:
-        """The timings, as people read them."""
-        return {name: format_seconds(seconds) for name, seconds in self.timings.items()}
+        return [group for group in found if any(group[1:])]
 
     @cached_property
     def curves(self) -> CurveCharts | None:
@@ -179,6 +174,7 @@ def _environment() -> Environment:
         "percent": lambda value: f"{value:.2f}%",
         "px": lambda value: f"{value:.1f}",
         "rate": format_percent,
+        "durations": lambda timings: {name: format_seconds(seconds) for name, seconds in timings.items()},
         "flatten": flatten,
         "strip_columns": strip_columns,
         "draw_paths": draw_paths,

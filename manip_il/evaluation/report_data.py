@@ -46,15 +46,8 @@ class PolicyRow:
         kind: Kind = "dagger",
     ) -> PolicyRow:
         """Return a row from one evaluation, and a second one under a disturbance where there is one."""
-        return cls(
-            name=name,
-            success=result.success,
-            labels=labels,
-            success_at_end=result.success_at_end,
-            steps_to_success=result.steps_to_success,
-            disturbed=disturbed.success if disturbed else None,
-            kind=kind,
-        )
+        again = disturbed.success if disturbed else None
+        return cls(name, result.success, labels, result.success_at_end, result.steps_to_success, again, kind)
 
 
 @dataclass(frozen=True)
@@ -78,7 +71,7 @@ class CurvePoint:
 
     def amount(self, cost: Cost) -> float | None:
         """Return labels, episodes or seconds; None where not known."""
-        return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[cost]
+        return getattr(self, cost)
 
 
 @dataclass(frozen=True)

@@ -97,13 +97,8 @@ class EvalResult:
             "success_at_end_rate": self.success_at_end.rate,
             "until_width": self.until_width,
             "by_condition": {
-                name: {
-                    "success_rate": part.success.rate,
-                    "interval": list(part.success.interval),
-                    "n_episodes": part.success.n,
-                }
-                for name, part in self.by_condition.items()
-                if name
+                name: {"success_rate": part.rate, "interval": list(part.interval), "n_episodes": part.n}
+                for name, part in ((name, part.success) for name, part in self.by_condition.items() if name)
             },
             "policy": self.policy,
             "policy_sha256": self.policy_sha256,
@@ -146,8 +141,6 @@ class EvalResult:
             result = cls.from_json(data)
         except KeyError as error:
             raise ManipError(f"{path}: key {error} is missing; expected an {FILE_NAME}") from error
-        except MismatchError:
-            raise
         except ManipError as error:
             raise ManipError(f"{path}: not an {FILE_NAME}: {error}") from error
         stated = data.get("n_episodes", len(result.episodes))
@@ -184,25 +177,24 @@ def merge_results(parts: Mapping[str, EvalResult]) -> EvalResult:
     for name, other in others:
         known = one.policy_sha256 or other.policy_sha256  # else the names alone say whether the policy is the same
         _require_equal(_EQUAL_IN_PARTS if known else ("policy", *_EQUAL_IN_PARTS), first, one, name, other)
-    owner: dict[int, str] = {}
+    found: dict[int, tuple[str, EpisodeResult]] = {}
     for name, part in parts.items():
         if part.until_width is not None:
             raise ManipError(f"{name} stopped by --until_width; only parts with a fixed number of episodes merge")
         for episode in part.episodes:
-            if episode.seed in owner:
+            if episode.seed in found:
                 raise ManipError(
-                    f"seed {episode.seed} is in {owner[episode.seed]} and in {name}; give every part seeds of its own, "
-                    "by --eval.first= and --eval.n_episodes="
+                    f"seed {episode.seed} is in {found[episode.seed][0]} and in {name}; give every part seeds of its "
+                    "own, by --eval.first= and --eval.n_episodes="
                 )
-            owner[episode.seed] = name
-    episodes = sorted((episode for part in parts.values() for episode in part.episodes), key=lambda one: one.seed)
-    return replace(one, episodes=tuple(episodes))
+            found[episode.seed] = name, episode
+    return replace(one, episodes=tuple(episode for _, (_, episode) in sorted(found.items())))
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
+def write_json(path: Path, content: Mapping[str, Any], indent: int | None = 1) -> None:
     """Write `content` whole or not at all, creating the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+    write_file(path, (json.dumps(content, indent=indent, allow_nan=False, ensure_ascii=False) + "\n").encode())
 
 
 def _require_equal(fields: Sequence[str], left: str, one: EvalResult, right: str, other: EvalResult) -> None:

@@ -35,7 +35,7 @@ class Round:
 
     def amount(self, axis: Cost) -> float:
         """Return the labels, episodes or seconds that the run had used."""
-        return {"labels": self.labels, "episodes": self.episodes, "seconds": self.seconds}[axis]
+        return getattr(self, axis)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -80,14 +80,9 @@ def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
                     validation=Proportion(round(success * count), count),
                 )
             )
-        except KeyError as error:
-            raise ManipError(
-                f"{name}: metrics.jsonl was not written by manip-il dagger (no {error}, round {number})"
-            ) from error
-        except ManipError as error:
-            raise ManipError(
-                f"{name}: metrics.jsonl was not written by manip-il dagger (round {number}: {error})"
-            ) from error
+        except (KeyError, ManipError) as error:
+            why = f"no {error}, round {number}" if isinstance(error, KeyError) else f"round {number}: {error}"
+            raise ManipError(f"{name}: metrics.jsonl was not written by manip-il dagger ({why})") from error
     return tuple(rounds)
 
 
@@ -133,12 +128,6 @@ class Rule:
             raise UsageError(f"--at is {at!r}; expected end, labels, episodes, seconds, or an amount as in labels:5000")
         return cls(checkpoint, axis, amount)
 
-    @property
-    def description(self) -> str:
-        """The rule in words."""
-        which = "last round" if self.checkpoint == "last" else "round that was best on validation"
-        return f"Of every run the {which}, chosen before the test"
-
     def __str__(self) -> str:
         return self.axis if self.amount is None else f"{self.axis}:{self.amount:g}"
 
@@ -163,8 +152,8 @@ def select_round(rule: Rule, rounds: History, limit: float | None, name: str) ->
     """Return the round of one run that `rule` chooses; `UsageError` where none ended within `limit`."""
     axis = rule.axis
     if axis == END or limit is None:
-        within = list(rounds)
-    elif not (within := [one for one in rounds if one.amount(axis) <= limit]):
+        within = rounds
+    elif not (within := tuple(one for one in rounds if one.amount(axis) <= limit)):
         raise UsageError(
             f"--at={rule}: {name} has no round within {format_amount(axis, limit)}; "
             f"its first took {format_amount(axis, rounds[0].amount(axis))}"
@@ -176,10 +165,12 @@ def select_round(rule: Rule, rounds: History, limit: float | None, name: str) ->
 
 def rule_facts(rule: Rule, limit: float | None, chosen: Sequence[Round]) -> list[str]:
     """Return sentences on the rule, and on costs of the chosen rounds that are not the same."""
+    which = "last round" if rule.checkpoint == "last" else "round that was best on validation"
+    words = f"Of every run the {which}, chosen before the test"
     if rule.axis == END or limit is None:
-        return [f"{rule.description}."]
+        return [f"{words}."]
     source = "given" if rule.amount is not None else "the most that every run reached"
-    facts = [f"{rule.description}, within {format_amount(rule.axis, limit)} ({source})."]
+    facts = [f"{words}, within {format_amount(rule.axis, limit)} ({source})."]
     amounts = [one.amount(rule.axis) for one in chosen]
     low, high = min(amounts), max(amounts)
     if high > UNEQUAL * low:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def evaluate(
         raise UsageError(f"until_width is {until_width}; expected between 0 and 1, such as 0.02 for 2 points")
     results: dict[int, EpisodeResult] = {}
     known = done or {}
-    for part in _parts(seeds, until_width):
+    for part in itertools.batched(seeds, len(seeds) or 1 if until_width is None else CHECK_EVERY):
         results |= {seed: known[seed] for seed in part if seed in known}
         for episode in engine.run(job, [seed for seed in part if seed not in known]):
             results[episode.seed] = episode_result(job, episode)
@@ -79,13 +80,16 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     states = episode.columns[schema.SIM_STATE]
     start, end = (positions(job.env.robot, job.env.task, states[row]) for row in (0, -1))
     drawn = draw(job.conditions or (NOMINAL,), episode.seed)
+    phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
+    if phase == 0 and episode.success_at_end:  # nobody asks the expert about a state in which the task is solved
+        phase = -1
     return EpisodeResult(
         seed=episode.seed,
         success=episode.success,
         success_at_end=episode.success_at_end,
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
-        phase_at_end=_last_phase(job, episode),
+        phase_at_end=phases(get_task(job.env.task))[phase],
         detail={
             "steps_to_success": first,
             "condition": drawn.condition,
@@ -95,16 +99,3 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
             "end": {name: at for name, at in end.items() if name != "goal"},
         },
     )
-
-
-def _last_phase(job: RolloutJob, episode: Episode) -> str:
-    """What the expert calls the last state; nobody asks it about one in which the task is solved."""
-    names = phases(get_task(job.env.task))
-    phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
-    return names[-1] if phase == 0 and episode.success_at_end else names[phase]
-
-
-def _parts(seeds: Sequence[int], until_width: float | None) -> Iterator[Sequence[int]]:
-    """All seeds at once, or as many as are run between two checks of the interval."""
-    size = len(seeds) if until_width is None else CHECK_EVERY
-    return (seeds[i : i + size] for i in range(0, len(seeds), max(1, size)))

@@ -177,12 +177,11 @@ def fisher_exact(successes: Sequence[int], sizes: Sequence[int]) -> float:
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return every p corrected for how many there are: Holm (1979), Scand. J. Statist. 6, 65-70."""
-    corrected = [1.0] * len(p_values)
-    largest = 0.0
-    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda i: p_values[i])):
-        largest = max(largest, (len(p_values) - rank) * p_values[index])
-        corrected[index] = min(1.0, largest)
-    return corrected
+    ranks = np.argsort(p_values, kind="stable")
+    scaled = np.array(p_values)[ranks] * np.arange(len(p_values), 0, -1)
+    corrected = np.empty(len(p_values))
+    corrected[ranks] = np.minimum(1.0, np.maximum.accumulate(scaled))
+    return corrected.tolist()
 
 
 def format_p(p: float) -> str:

@@ -107,8 +107,7 @@ class Study:
             "training_seeds": [
                 {"seed": member.training_seed}
                 | member.to_json()
-                | {"largest_dip": largest_dip(member.history)}
-                | {"first_at_target": at.to_json() if at else None}
+                | {"largest_dip": largest_dip(member.history), "first_at_target": at.to_json() if at else None}
                 | {"rounds": [one.to_json() for one in member.history]}
                 for member, at in zip(arm.members, self.reached(arm), strict=True)
             ],
@@ -129,10 +128,7 @@ class Study:
         if all(reached):
             return _plain(cost, fmean(one.amount(cost) for one in reached if one))
         each = zip(arm.members, reached, strict=True)
-        return ", ".join(
-            _plain(cost, one.amount(cost)) if one else f"> {_plain(cost, member.history[-1].amount(cost))}"
-            for member, one in each
-        )
+        return ", ".join(("" if at else "> ") + _plain(cost, (at or m.history[-1]).amount(cost)) for m, at in each)
 
     def _fewer(self, arm: Arm) -> str:
         """Labels of the baseline over this arm's, to the target; a lower bound where the baseline missed it."""
@@ -141,12 +137,9 @@ class Study:
         ours = [one.labels for one in self.reached(arm) if one]
         if len(ours) < len(arm.members):
             return "not reached"
-        baseline = next(one for one in self.arms if one.name == self.baseline)
+        baseline = self.comparisons[arm.name].left
         reached = self.reached(baseline)
-        theirs = [
-            one.labels if one else member.history[-1].labels
-            for member, one in zip(baseline.members, reached, strict=True)
-        ]
+        theirs = [(at or member.history[-1]).labels for member, at in zip(baseline.members, reached, strict=True)]
         return f"{'' if all(reached) else '> '}{sum(theirs) / sum(ours):.1f}"
 
 

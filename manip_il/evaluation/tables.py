@@ -52,10 +52,9 @@ class Table:
     def markdown(self) -> str:
         """Return the table as GitHub renders it, numbers to the right."""
         rule = ("---", *("--:" for _ in self.columns[1:]))
-        lines = [
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in (self.columns, *self.rows)
-        ]
-        return "\n".join([lines[0], "|" + "|".join(rule) + "|", *lines[1:]]) + "\n"
+        rows = (self.columns, *self.rows)
+        head, *lines = ("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
+        return "\n".join([head, "|" + "|".join(rule) + "|", *lines]) + "\n"
 
     def aligned_lines(self) -> list[str]:
         """Return columns as wide as their widest cell, a rule under the head; all but the first set right."""
@@ -87,18 +86,12 @@ def policy_table(rows: Sequence[PolicyRow]) -> Table:
     """Return a row a policy: labels, success, success at the end, steps to success, success under the disturbance."""
     success = f"success [{100 * rows[0].success.confidence:g} % interval]"
     columns = ("policy", "expert labels", success, "success at end", "steps to success", "success, disturbed")
-    cells = tuple(
-        (
-            row.name,
-            "" if row.labels is None else f"{row.labels:,}",
-            str(row.success),
-            str(row.success_at_end or ""),
-            "" if row.steps_to_success is None else f"{row.steps_to_success:.1f}",
-            str(row.disturbed or ""),
-        )
-        for row in rows
-    )
-    return Table(columns, cells, tuple(row.kind for row in rows))
+    cells: list[tuple[str, ...]] = []
+    for row in rows:
+        labels = "" if row.labels is None else f"{row.labels:,}"
+        at_end, steps = str(row.success_at_end or ""), _steps(row.steps_to_success)
+        cells.append((row.name, labels, str(row.success), at_end, steps, str(row.disturbed or "")))
+    return Table(columns, tuple(cells), tuple(row.kind for row in rows))
 
 
 def evaluation_table(result: EvalResult) -> Table:
@@ -108,16 +101,14 @@ def evaluation_table(result: EvalResult) -> Table:
     if len(result.by_condition) > 1:
         parts += [(f"  {name or NO_CONDITION}", part) for name, part in result.by_condition.items()]
     rows = tuple(
-        (
-            name,
-            f"{part.success.n:,}",
-            str(part.success),
-            str(part.success_at_end),
-            "" if part.steps_to_success is None else f"{part.steps_to_success:.1f}",
-        )
-        for name, part in parts
+        (name, f"{one.success.n:,}", str(one.success), str(one.success_at_end), _steps(one.steps_to_success))
+        for name, one in parts
     )
     return Table((*columns, "success at end", "steps to success"), rows)
+
+
+def _steps(steps: float | None) -> str:
+    return "" if steps is None else f"{steps:.1f}"
 
 
 def evaluation_lines(result: EvalResult) -> list[str]:

@@ -15,10 +15,9 @@ from manip_il.evaluation.compare_report import compare_report
 from manip_il.evaluation.eval_report import eval_report
 from manip_il.evaluation.film import encode_picture
 from manip_il.evaluation.intervals import Proportion
-from manip_il.evaluation.maps import map_marks, paired_marks
+from manip_il.evaluation.maps import FailureMap, failure_map, paired_maps
 from manip_il.evaluation.report import Report, RunReport
 from manip_il.evaluation.report_data import CurvePoint, LearningCurve, PolicyRow, Strip
-from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.study_report import study_report
 
 from .browser import HEIGHT, Opened, chromium, opened
@@ -27,12 +26,7 @@ from .test_study import STUDY
 
 pytestmark = pytest.mark.slow
 
-WINDOWS: tuple[tuple[int, Literal["light", "dark"]], ...] = (
-    (1280, "light"),
-    (1280, "dark"),
-    (390, "light"),
-    (390, "dark"),
-)
+
 CURVE = LearningCurve(
     tuple(CurvePoint(400 * i, Proportion(9 * i, 40), f"round {i}", 20 * i, 60.0 * i) for i in (1, 2, 3, 4))
 )
@@ -63,15 +57,10 @@ class Case:
 
 
 def eval_case() -> Case:
-    outcomes = (True, False, False, True)
-    films = tuple(small_film(number, success) for number, success in enumerate(outcomes))
+    films = tuple(small_film(number, success) for number, success in enumerate((True, False, False, True)))
     report = eval_report(RESULT, "manip-il eval --policy.path=runs/a", {"a": {"b": 1}}, films, curve=CURVE)
-    ordered = [film for film in films if not film.success] + [film for film in films if film.success]
+    ordered = sorted(films, key=lambda film: bool(film.success))
     return Case(report, tuple(film.success for film in ordered), tuple(film.caption for film in ordered))
-
-
-def compare_case() -> Case:
-    return Case(compare_report(COMPARISON, "manip-il compare a b"))
 
 
 def quickstart_case() -> Case:
@@ -90,11 +79,12 @@ def quickstart_case() -> Case:
     return Case(report, (None,) * 3, tuple(film.caption for film in films))
 
 
-def study_case() -> Case:
-    return Case(study_report(STUDY, "Study", "manip-il study x.yaml"))
-
-
-CASES = {"eval": eval_case, "compare": compare_case, "quickstart": quickstart_case, "study": study_case}
+CASES = {
+    "eval": eval_case,
+    "compare": lambda: Case(compare_report(COMPARISON, "manip-il compare a b")),
+    "quickstart": quickstart_case,
+    "study": lambda: Case(study_report(STUDY, "Study", "manip-il study x.yaml")),
+}
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +105,8 @@ def file(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("width", "scheme"), WINDOWS)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
 def test_it_opens_quietly_and_fits_the_window(
     browser: Browser, case: Case, file: Path, width: int, scheme: Literal["light", "dark"]
 ):
@@ -125,9 +116,7 @@ def test_it_opens_quietly_and_fits_the_window(
         assert wide <= room == width
         assert too_wide(seen) == []
         assert first_words(seen) == case.report.verdict
-        paper, ink = seen.evaluate(
-            "[getComputedStyle(document.body).backgroundColor, getComputedStyle(document.body).color]"
-        )
+        paper, ink = seen.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
         assert (brightness(paper) > brightness(ink)) == (scheme == "light")
         assert (seen.console, seen.requests) == ([], [])
 
@@ -173,21 +162,19 @@ def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path:
     eval_case().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", width) as seen:
         for index in range(2):
-            assert marks_in(seen, index) == counted(RESULT)
+            assert marks_in(seen, index) == counted(failure_map(RESULT))
 
 
 def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
-    compare_case().report.write(tmp_path / "report.html")
+    CASES["compare"]().report.write(tmp_path / "report.html")
     with opened(browser, tmp_path / "report.html", 1280) as seen:
-        for arm, marks in enumerate(paired_marks(COMPARISON)):
-            expected = {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
-            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == expected
+        for arm, map_of_arm in enumerate(paired_maps(COMPARISON)):
+            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == counted(map_of_arm)
         assert marks_in(seen, 0)["failed"] > 0 == marks_in(seen, 2)["failed"]
 
 
-def counted(result: EvalResult) -> dict[str, int]:
-    marks = map_marks(result)
-    return {kind: sum(mark.outcome == kind for mark in marks) for kind in ("failed", "shared", "solved")}
+def counted(given: FailureMap) -> dict[str, int]:
+    return {kind: sum(mark.outcome == kind for mark in given.marks) for kind in ("failed", "shared", "solved")}
 
 
 def marks_in(seen: Opened, index: int) -> dict[str, int]:

@@ -226,8 +226,7 @@ def certified(request, tmp_path_factory) -> Certificate:
 @pytest.mark.slow
 def test_the_certificate_of_pick_and_place_does_not_fall(certified: Certificate):
     [learner] = certified.of("learner")
-    rows = {"start": certified.of("start")[0], "state": certified.states, "action": certified.actions}
-    rows["learner"] = learner
+    rows = {one.group: one for one in (certified.of("start")[0], certified.states, certified.actions, learner)}
     rates = {group: row.success.rate for group, row in rows.items()}
     assert {group: rate for group, rate in rates.items() if rate < FLOORS[group]} == {}
     assert min(len(row.cases) for row in rows.values()) >= CASES // 2

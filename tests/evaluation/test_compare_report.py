@@ -86,23 +86,18 @@ def test_equal_sides_are_not_told_apart():
 
 
 def test_both_fingerprints_are_there_where_they_differ():
-    other = replace(
-        SELDOM.right.members[0], result=replace(made_eval(fails=lambda *_: False), fingerprint={"mujoco": "9"})
-    )
+    result = replace(made_eval(fails=lambda *_: False), fingerprint={"mujoco": "9"})
+    other = replace(SELDOM.right.members[0], result=result)
     text = page_of_comparison(Comparison(SELDOM.left, Arm("runs/dagger", (other,)))).text
     assert "runs/dagger.mujoco 9" in text
     assert "runs/cloning.mujoco 3.11.0" in text
 
 
 def test_whatever_comes_from_outside_is_escaped():
+    result = made_eval(EVIL, conditions=(EVIL, "b"))
     arms = [
-        Arm(
-            f"{EVIL}{side}",
-            tuple(
-                replace(m, name=f"{EVIL}{side}", result=made_eval(EVIL, conditions=(EVIL, "b"))) for m in arm.members
-            ),
-        )
-        for side, arm in (("l", SELDOM.left), ("r", SELDOM.right))
+        Arm(name, tuple(replace(member, name=name, result=result) for member in arm.members))
+        for name, arm in zip((f"{EVIL}l", f"{EVIL}r"), SELDOM.arms, strict=True)
     ]
     report = compare_report(Comparison(*arms), EVIL, (EVIL,), {EVIL: EVIL})
     assert page_of(report).text.count('alert("x")') >= 20

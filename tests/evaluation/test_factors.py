@@ -30,9 +30,8 @@ def test_a_failure_in_the_middle_alone_is_seen_too():
 
 
 def test_by_chance_alone_nothing_is_shown():
-    assert not any(
-        factor.significant for factor in find_factors(made_eval(n=240, fails=lambda number, _: number % 7 == 0))
-    )
+    factors = find_factors(made_eval(n=240, fails=lambda number, _: number % 7 == 0))
+    assert not any(factor.significant for factor in factors)
 
 
 def test_a_drawn_number_counts_within_its_condition_and_only_where_it_varied():

@@ -14,7 +14,7 @@ from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UsageError
 from manip_il.evaluation import runner
-from manip_il.evaluation.results import EpisodeResult, EvalResult
+from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import episode_result, evaluate
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
@@ -139,42 +139,39 @@ def coins(monkeypatch):
     return make
 
 
+COIN = RolloutJob(ENV, "random", label="last")
+
+
 def result(seed: int, success: bool) -> EpisodeResult:
     return EpisodeResult(seed, success, success, 10, float(success))
 
 
 def test_until_width_stops_at_the_first_look_that_is_narrow_enough(coins):
     engine = coins([seed % 50 != 7 for seed in range(10_000)])
-    job = RolloutJob(ENV, "random", label="last")
-    found = evaluate(engine, job, range(10_000), "coin", until_width=0.05)
+    found = evaluate(engine, COIN, range(10_000), "coin", until_width=0.05)
     low, high = found.success.interval
     assert high - low <= 0.05
     assert len(found.episodes) % runner.CHECK_EVERY == 0
-    shorter = EvalResult(
-        "coin", "fetch", "pick_place", {}, found.episodes[: -runner.CHECK_EVERY], found.settings, until_width=0.05
-    )
+    shorter = replace(found, episodes=found.episodes[: -runner.CHECK_EVERY])
     assert shorter.success.interval[1] - shorter.success.interval[0] > 0.05
     assert [episode.seed for episode in found.episodes] == list(range(len(found.episodes)))
     assert max(map(max, engine.asked)) == len(found.episodes) - 1  # nothing beyond it was run
 
 
 def test_until_width_gives_up_at_the_last_seed(coins):
-    found = evaluate(
-        coins([True] * 150), RolloutJob(ENV, "random", label="last"), range(150), "coin", until_width=0.001
-    )
+    found = evaluate(coins([True] * 150), COIN, range(150), "coin", until_width=0.001)
     assert len(found.episodes) == 150
     assert found.to_json()["interval_method"].startswith("confidence sequence")
 
 
 def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
     outcomes = [seed % 9 != 0 for seed in range(1_000)]
-    job = RolloutJob(ENV, "random", label="last")
     for width in (None, 0.1):
-        whole = evaluate(coins(outcomes), job, range(1_000), "coin", until_width=width)
+        whole = evaluate(coins(outcomes), COIN, range(1_000), "coin", until_width=width)
         engine = coins(outcomes)
         done = {seed: result(seed, outcomes[seed]) for seed in range(0, 1_000, 3)}
         seen: list[EpisodeResult] = []
-        resumed = evaluate(engine, job, range(1_000), "coin", seen.append, done=done, until_width=width)
+        resumed = evaluate(engine, COIN, range(1_000), "coin", seen.append, done=done, until_width=width)
         assert resumed == whole
         assert not {one.seed for one in seen} & set(done)
         assert sorted(one.seed for one in seen) == sorted(seed for asked in engine.asked for seed in asked)
@@ -183,4 +180,4 @@ def test_what_is_done_is_not_run_again_and_changes_nothing(coins):
 @pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
 def test_a_width_that_cannot_be_is_refused(width, coins):
     with pytest.raises(UsageError, match="expected between 0 and 1"):
-        evaluate(coins([True]), RolloutJob(ENV, "random", label="last"), range(1), "coin", until_width=width)
+        evaluate(coins([True]), COIN, range(1), "coin", until_width=width)
