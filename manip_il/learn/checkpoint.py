@@ -24,7 +24,7 @@ import os
 import shutil
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,20 +102,16 @@ class CheckpointMeta:
 
         look: `recorded_look` of the dataset.
         """
-        pictured = observation != "state"
-        return cls(
-            robot=spec.robot,
-            task=spec.task,
-            fps=spec.fps,
-            joint_names=tuple(spec.joint_names),
-            environment_state_names=tuple(spec.environment_state_names),
-            action_meaning=spec.action_meaning,
+        meta = cls(
+            **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
-            cameras=tuple(spec.cameras) if pictured else (),
-            image_size=spec.image_size if pictured else (0, 0),
-            look=dict(look) if pictured and look is not None else None,
+        )
+        if observation == "state":
+            return meta
+        return replace(
+            meta, cameras=spec.cameras, image_size=spec.image_size, look=None if look is None else dict(look)
         )
 
 
@@ -132,13 +128,13 @@ def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
         for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
             if name in values:  # a checkpoint from before there were pictures has no cameras
                 values[name] = tuple(checks.array(name, values[name], _MOST_NAMES))
-        known = [one.name for one in fields(CheckpointMeta)]
+        known = {one.name: one for one in fields(CheckpointMeta)}
         for name in values:
             if name not in known:
                 raise ManipError(f"unexpected {checks.shorten(name)}")
-        for one in fields(CheckpointMeta):
-            if one.name not in values and one.default is MISSING and one.default_factory is MISSING:
-                raise ManipError(f"no {one.name}")
+        for name, one in known.items():
+            if name not in values and one.default is one.default_factory is MISSING:
+                raise ManipError(f"no {name}")
         return CheckpointMeta(**values)
     except ManipError as error:
         raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
@@ -191,9 +187,8 @@ def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) ->
     before = checks.mapping(f"{checkpoint}: options", saved.get("options", {}))
     for name, ours in options.items():
         if before.get(name) != ours:
-            raise MismatchError(
-                f"training option {name}", f"checkpoint {checkpoint}", before.get(name), "this run", ours
-            )
+            what = f"training option {name}"
+            raise MismatchError(what, f"checkpoint {checkpoint}", before.get(name), "this run", ours)
 
 
 @contextmanager

@@ -104,9 +104,8 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
     policy, function, metadata = _load(path, policy_sha256)
     example = _tensors(_observations(policy, function, rows=2))
     content = io.BytesIO()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore"):
         # The exporter that torch prefers needs two packages more, and gives the same graph.
-        warnings.simplefilter("ignore")
         torch.onnx.export(
             _InOrder(function),
             tuple(example.values()),
@@ -135,8 +134,7 @@ def export_torchscript(path: Path, policy_sha256: str) -> Exported:
     """
     policy, function, metadata = _load(path, policy_sha256)
     content = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch has a younger format, which needs the whole of torch to read
+    with warnings.catch_warnings(action="ignore"):  # torch has a younger format, to be read by the whole of torch alone
         example = _tensors(_observations(policy, function, rows=2))
         traced = torch.jit.trace(function, (example,), check_trace=False)
         torch.jit.save(traced, content, _extra_files={EXTRA_FILE: json.dumps(metadata)})
@@ -161,14 +159,11 @@ def file_metadata(
 ) -> dict[str, Any]:
     """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
     meta, n = policy.meta, policy.interface.action
-    outputs = [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))]
+    shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
     entries: dict[str, Any] = {
-        "robot": meta.robot if meta else None,
-        "task": meta.task if meta else None,
-        "control_rate_hz": meta.fps if meta else None,
-        "action_meaning": meta.action_meaning if meta else None,
+        **{key: getattr(meta, name, None) for key, name in shared},
         "inputs": [_input(policy, key, meta) for key in inputs],
-        "outputs": outputs,
+        "outputs": [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))],
         "policy_type": config["type"],
         "policy_loss": config.get("loss"),
         "policy_sha256": sha256,
@@ -191,9 +186,8 @@ def _input(policy: LearnedPolicy, key: str, meta: CheckpointMeta | None) -> dict
 def _numbers(key: str, size: int, names: Sequence[str] | None, units: Sequence[str | None] | None) -> dict[str, Any]:
     if names and len(names) != size:
         raise MismatchError(f"numbers in {key}", META_FILE, len(names), CONFIG, size)
-    entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
-    entry |= {"names": list(names)} if names else {}
-    return entry | ({"units": list(units)} if units else {})
+    meanings = {name: list(each) for name, each in (("names", names), ("units", units)) if each}
+    return {"name": key, "dtype": "float32", "shape": ["batch", size], **meanings}
 
 
 def _joint_units(n: int) -> list[str]:

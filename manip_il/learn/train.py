@@ -133,27 +133,21 @@ class Trainer:
             self.policy.parameters(), lr=self.peak_lr, weight_decay=WEIGHT_DECAY, fused=True
         )
         if checkpoint is not None:
-            self._restore(checkpoint)
+            with readable_state(checkpoint):
+                self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
+                load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
+            self.step = read_step(checkpoint)["step"]
         elif config.init_from is not None:
             warm_start(network, config.init_from)
-        self._encode(rows, train, held_out)
-        drawn = weights[train] if weights is not None else None
-        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
-
-    def _restore(self, checkpoint: Path) -> None:
-        with readable_state(checkpoint):
-            self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
-            load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
-        self.step = read_step(checkpoint)["step"]
-
-    def _encode(self, rows: Rows, train: NDArray[np.int64], held_out: NDArray[np.int64]) -> None:
         device = self.policy.config.device
         inputs, targets = torch.from_numpy(rows.inputs).to(device), torch.from_numpy(rows.targets).to(device)
         # One tensor [x | y], so that a batch is one gather of whole rows.
-        encoded = torch.cat([self.policy.model.encode(inputs), self.policy.model.encode_targets(targets)], dim=1)
+        encoded = torch.cat([network.encode(inputs), network.encode_targets(targets)], dim=1)
         self.width = inputs.shape[1]
         self.data, self.held_out = encoded[train], encoded[held_out]
         self.held_out_inputs, self.held_out_targets = inputs[held_out], targets[held_out]
+        drawn = weights[train] if weights is not None else None
+        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
