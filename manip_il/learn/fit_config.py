@@ -37,12 +37,9 @@ class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 
     policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). observation: `state`,
-    `images` or `both`, what the policy sees. lr: peak learning rate. optimizer, scheduler: in place of the policy's
-    own. eval_split: share of the episodes held out. image_augment: random crops and colour jitter. image_cache_gb: how
-    large the cache of decoded pictures may grow; a dataset that does not fit goes through LeRobot's loader with
-    num_workers processes. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times
-    slower where none is. save_freq, log_freq: in steps. trust: whether models that the policy or its checkpoint names
-    may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder whose weights to start from.
+    `images` or `both`. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times slower
+    where none is. trust: whether models that the policy or its checkpoint names may be loaded. seed: of weights and
+    batches. init_from: a `pretrained_model` folder whose weights to start from.
 
     Raises `UsageError` for a number out of range or an option that is not for the mlp, `UnknownName` for a policy or an
     option of it that is not there.

@@ -12,7 +12,6 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +26,18 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
+from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
 from manip_il.learn.card import write_card
 from manip_il.learn.checkpoint import (
-    META_FILE,
     PRETRAINED_MODEL,
-    STEP_FILE,
-    TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
     last_checkpoint,
     read_step,
     readable_state,
     unpublished,
-    write_json,
+    write_own_files,
 )
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, set_features
@@ -84,9 +80,7 @@ class PolicyTrainer:
         self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look)
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
-        checkpoint = last_checkpoint(output_dir)
-        if checkpoint is not None and not resume:
-            raise FolderExistsError(output_dir)
+        checkpoint = last_checkpoint(output_dir, resume=resume)
         roots = [root] if isinstance(root, Path) else list(root)
         self.dataset = read_metadata(*roots)
         set_features(self.lerobot.policy, self.dataset, observation)
@@ -205,8 +199,7 @@ class PolicyTrainer:
             with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, self.pipeline, policy, *state, *processors)
-                write_json(new / PRETRAINED_MODEL / META_FILE, asdict(self.meta))
-                write_json(new / TRAINING_STATE / STEP_FILE, read_step(new) | own)
+                write_own_files(new, self.meta, read_step(new) | own)
                 write_card(new / PRETRAINED_MODEL, self.pipeline, self.meta, self.dataset, record)
         self.accelerator.wait_for_everyone()
 

@@ -219,11 +219,10 @@ class _Perceptron:
 
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:
     """The network's shape in an mlp's `config.json`."""
-    for field in fields(Shape):
-        if field.name not in config:
-            raise ManipError(f"{path} has no {field.name}; it is not an mlp's")
     try:
         return Shape(**{field.name: config[field.name] for field in fields(Shape)})
+    except KeyError as error:
+        raise ManipError(f"{path} has no {error.args[0]}; it is not an mlp's") from error
     except ManipError as error:
         raise ManipError(f"{path}: {error}") from error
 

@@ -65,11 +65,6 @@ class Interface:
     action: int
 
     @property
-    def observation(self) -> str:
-        """One of `OBSERVATIONS`."""
-        return observation_of(self.columns)
-
-    @property
     def columns(self) -> tuple[str, ...]:
         """All inputs by LeRobot's names."""
         return (*self.numbers, *(IMAGES + camera for camera in self.pictures))

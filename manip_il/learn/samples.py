@@ -131,18 +131,14 @@ class MemorySource:
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,)."""
         batch: Batch = {}
-        for key, column in self.columns.items():
-            batch |= self._gather(key, samples, lambda rows, column=column: column[torch.from_numpy(rows)])
-        for key, frames in self.frames.items():
-            batch |= self._gather(key, samples, lambda rows, frames=frames: torch.from_numpy(frames[rows]))
+        for key, values in {**self.columns, **self.frames}.items():
+            rows, padded = self.windows.rows(samples, key) if key in self.windows.deltas else (samples, None)
+            numbers = isinstance(values, torch.Tensor)
+            batch[key] = values[torch.from_numpy(rows)] if numbers else torch.from_numpy(values[rows])
+            if padded is not None:
+                batch[f"{key}_is_pad"] = torch.from_numpy(padded)
         batch[TASK] = [self.tasks[int(i)] for i in batch[TASK_INDEX]]
         return batch
-
-    def _gather(self, key: str, samples: I64, read) -> Batch:
-        if key not in self.windows.deltas:
-            return {key: read(samples)}
-        rows, padded = self.windows.rows(samples, key)
-        return {key: read(rows), f"{key}_is_pad": torch.from_numpy(padded)}
 
 
 @dataclass(frozen=True)

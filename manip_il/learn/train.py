@@ -14,7 +14,6 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,10 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import FolderExistsError, NotFiniteError
+from manip_il.errors import NotFiniteError
 from manip_il.learn.batches import order_of
 from manip_il.learn.checkpoint import (
-    META_FILE,
     PRETRAINED_MODEL,
-    STEP_FILE,
     TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
@@ -41,7 +38,7 @@ from manip_il.learn.checkpoint import (
     read_step,
     readable_state,
     unpublished,
-    write_json,
+    write_own_files,
 )
 from manip_il.learn.columns import ARM, GRIPPER, Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
@@ -82,9 +79,7 @@ def fit(
     run that is resumed on other data or options.
     """
     output_dir = Path(output_dir)
-    checkpoint = last_checkpoint(output_dir)
-    if checkpoint is not None and not resume:
-        raise FolderExistsError(output_dir)
+    checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
     rows = learning_rows(table)
     drawn = weights[valid_frames(table)] if weights is not None else None
@@ -197,10 +192,9 @@ class Trainer:
             self.policy.save_pretrained(folder)
             for processor in make_pre_post_processors(self.policy.config):
                 processor.save_pretrained(folder)
-            write_json(folder / META_FILE, asdict(meta))
             state.mkdir()
             save_optimizer_state(self.optimizer, state)
-            write_json(state / STEP_FILE, {"step": self.step, **resume_key})
+            write_own_files(new, meta, {"step": self.step, **resume_key})
         for other in final.parent.iterdir():
             if not other.is_symlink() and other.name != final.name:
                 shutil.rmtree(other, ignore_errors=True)
