@@ -108,7 +108,7 @@ def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
     policy.act(states[:2], environments[:2], None, [4, 5])
     inner = policy._policy
     assert isinstance(inner, EpisodePolicy)
-    one, two = (memory.policy for memory in inner._memories.values())
+    one, two = (memory for memory, _ in inner._memories.values())
     assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
     name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_queues"
     name = name if hasattr(one, name) else "_action_queue"
