@@ -6,9 +6,9 @@ Pictures may be cropped and their colours changed by chance while learning.
 from __future__ import annotations
 
 import math
-import queue
-import threading
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any
@@ -20,9 +20,13 @@ from torch import Tensor
 
 from manip_il.errors import MismatchError, UsageError
 
-_END = object()
 _AT_ONCE = 16  # pictures: what is made of them on the way stays near the processor
 _GREY = (0.299, 0.587, 0.114)  # of red, green and blue: ITU-R BT.601
+
+
+def generator_of(*key: int) -> torch.Generator:
+    """Return a generator on the CPU whose draws are a function of the key alone."""
+    return torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
 
 
 class ShuffledRows:
@@ -38,19 +42,12 @@ class ShuffledRows:
     def batch(self, step: int) -> torch.Tensor:
         """Return row numbers of the batch of `step`, (batch_size,)."""
         start, end = step * self.batch_size, (step + 1) * self.batch_size
-        pieces = []
-        while start < end:
-            epoch, place = divmod(start, self.rows)
-            piece = self._permutation(epoch)[place : place + end - start]
-            pieces.append(piece)
-            start += len(piece)
-        return pieces[0] if len(pieces) == 1 else torch.cat(pieces)
+        epochs = [(epoch, epoch * self.rows) for epoch in range(start // self.rows, -(-end // self.rows))]
+        return torch.cat([self._permutation(epoch)[max(start - first, 0) : end - first] for epoch, first in epochs])
 
     def _permutation(self, epoch: int) -> torch.Tensor:
         if epoch != self._epoch:
-            seed = int(np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0] >> 1)
-            generator = torch.Generator().manual_seed(seed)
-            self._epoch, self._order = epoch, torch.randperm(self.rows, generator=generator)
+            self._epoch, self._order = epoch, torch.randperm(self.rows, generator=generator_of(self.seed, epoch))
         return self._order
 
 
@@ -74,42 +71,20 @@ def order_of(rows: int, weights: NDArray[np.float64] | None, batch_size: int, se
 
 
 @contextmanager
-def prefetched[T](items: Iterator[T], depth: int = 2) -> Iterator[Iterator[T]]:
+def prefetched[T](items: Iterator[T], depth: int = 3) -> Iterator[Iterator[T]]:
     """Give the same items in order, up to `depth` of them made ahead by a thread, whose errors are raised here."""
-    ready: queue.Queue[object] = queue.Queue(maxsize=depth)
-    stop = threading.Event()
-
-    def put(item: object) -> bool:
-        while not stop.is_set():
-            try:
-                ready.put(item, timeout=0.1)
-            except queue.Full:
-                continue
-            return True
-        return False
-
-    def work() -> None:
-        try:
-            for item in items:
-                if not put(item):
-                    return
-            put(_END)
-        except BaseException as error:
-            put(error)
+    thread = ThreadPoolExecutor(1, "prefetch")
+    ahead = deque(thread.submit(next, items, None) for _ in range(depth))  # None is the end: no item is None
 
     def take() -> Iterator[T]:
-        while (item := ready.get()) is not _END:
-            if isinstance(item, BaseException):
-                raise item
-            yield item  # type: ignore[misc]
+        while (item := ahead.popleft().result()) is not None:
+            ahead.append(thread.submit(next, items, None))
+            yield item
 
-    thread = threading.Thread(target=work, daemon=True, name="prefetch")
-    thread.start()
     try:
         yield take()
     finally:
-        stop.set()
-        thread.join()
+        thread.shutdown(cancel_futures=True)
 
 
 def to_float(pictures: Tensor) -> Tensor:
@@ -155,9 +130,12 @@ class Augment:
             return to_float(pictures)
         flat = pictures.flatten(0, -4)
         changed = torch.empty(flat.shape, dtype=torch.float32, device=flat.device)
-        moves, factors = self._draw(len(pictures), math.prod(pictures.shape[1:-3]), generator)
-        numbers = factors.to(flat.device)
-        parts = (each.split(_AT_ONCE) for each in (changed, flat, moves, numbers))
+        moves = torch.randint(0, 2 * self.shift + 1, (len(pictures), 2), generator=generator)
+        amounts = torch.tensor([self.saturation, self.contrast, self.brightness])
+        factors = 1 + amounts * (2 * torch.rand(len(pictures), 3, generator=generator) - 1)
+        times = math.prod(pictures.shape[1:-3])
+        drawn = moves.repeat_interleave(times, 0), factors.repeat_interleave(times, 0).to(flat.device)
+        parts = (each.split(_AT_ONCE) for each in (changed, flat, *drawn))
         for target, source, move, factor in zip(*parts, strict=True):
             _crop(source, move, self.shift, target)
             if self.brightness or self.contrast or self.saturation:
@@ -165,13 +143,6 @@ class Augment:
             else:
                 target.div_(255)
         return changed.view(pictures.shape)
-
-    def _draw(self, samples: int, times: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Where crops start, (B T, 2), and factors of saturation, contrast and brightness, (B T, 3)."""
-        moves = torch.randint(0, 2 * self.shift + 1, (samples, 2), generator=generator)
-        amounts = torch.tensor([self.saturation, self.contrast, self.brightness])
-        factors = 1 + amounts * (2 * torch.rand(samples, 3, generator=generator) - 1)
-        return moves.repeat_interleave(times, 0), factors.repeat_interleave(times, 0)
 
 
 def _crop(pictures: Tensor, moves: Tensor, shift: int, target: Tensor) -> None:

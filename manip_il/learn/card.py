@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -23,7 +24,7 @@ def write_card(
 
     dataset: LeRobot's metadata of what was learnt from; metrics: the last record of the fit, may be empty.
     """
-    policy = pipeline.policy
+    policy, optimizer = pipeline.policy, pipeline.optimizer
     assert policy is not None
     data = ModelCardData(
         license=policy.license or "apache-2.0",
@@ -33,14 +34,6 @@ def write_card(
         model_name=f"{policy.type}_{meta.robot}_{meta.task}",
         datasets=dataset.repo_id,
     )
-    text = f"---\n{data.to_yaml()}\n---\n\n{_body(pipeline, meta, dataset, metrics)}"
-    ModelCard(text).save(folder / CARD_FILE)
-
-
-def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, metrics: Mapping[str, Any]) -> str:
-    policy = pipeline.policy
-    assert policy is not None
-    optimizer = pipeline.optimizer
     inputs = policy.input_features or {}
     names = ", ".join(f"`{key}`" for key in inputs)
     rows = [
@@ -54,7 +47,9 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
         ("made by", f"manip_il {version('manip_il')}"),
     ]
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)
-    return (
+    gymnasium_id = string.capwords(f"{meta.robot}_{meta.task}", "_").replace("_", "") + "-v0"  # PandaPickPlace-v0
+    text = (
+        f"---\n{data.to_yaml()}\n---\n\n"
         f"# {policy.type} for {meta.robot} {meta.task}\n\n"
         "Cloned from an inverse-kinematics expert in MuJoCo; there were no human demonstrations.\n\n"
         f"| | |\n|---|---|\n{table}\n\n"
@@ -63,10 +58,6 @@ def _body(pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, met
         "The same with LeRobot:\n\n"
         "```sh\nlerobot-eval --policy.path=FOLDER_OF_THIS_FILE \\\n"
         "  --env.discover_packages_path=manip_il.lerobot_plugin \\\n"
-        f"  --env.type=manip_il --env.task={_task_id(meta)} --eval.n_episodes=50\n```\n"
+        f"  --env.type=manip_il --env.task={gymnasium_id} --eval.n_episodes=50\n```\n"
     )
-
-
-def _task_id(meta: CheckpointMeta) -> str:
-    """The gymnasium id, `PandaPickPlace-v0`."""
-    return "".join(word.capitalize() for word in f"{meta.robot}_{meta.task}".split("_")) + "-v0"
+    ModelCard(text).save(folder / CARD_FILE)

@@ -24,14 +24,14 @@ import os
 import shutil
 from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from manip_il import checks
 from manip_il.data.atomic import umask, writing
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import FolderExistsError, ManipError, MismatchError
 
 META_FILE = "manip_il.json"
 PRETRAINED_MODEL = "pretrained_model"
@@ -80,8 +80,7 @@ class CheckpointMeta:
         for name in ("joint_names", "environment_state_names", "cameras"):
             for word in checks.array(name, getattr(self, name), _MOST_NAMES):
                 checks.text(f"one of {name}", word, _LONGEST_WORDS)
-        size = checks.array("image_size", self.image_size, 2)
-        if len(size) != 2:
+        if len(size := checks.array("image_size", self.image_size, 2)) != 2:
             raise ManipError(f"image_size is {size}; expected height and width")
         for side in size:
             checks.whole("a side of image_size", side, 0, _LONGEST_SIDE)
@@ -102,20 +101,16 @@ class CheckpointMeta:
 
         look: `recorded_look` of the dataset.
         """
-        pictured = observation != "state"
-        return cls(
-            robot=spec.robot,
-            task=spec.task,
-            fps=spec.fps,
-            joint_names=tuple(spec.joint_names),
-            environment_state_names=tuple(spec.environment_state_names),
-            action_meaning=spec.action_meaning,
+        meta = cls(
+            **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
-            cameras=tuple(spec.cameras) if pictured else (),
-            image_size=spec.image_size if pictured else (0, 0),
-            look=dict(look) if pictured and look is not None else None,
+        )
+        if observation == "state":
+            return meta
+        return replace(
+            meta, cameras=spec.cameras, image_size=spec.image_size, look=None if look is None else dict(look)
         )
 
 
@@ -132,13 +127,13 @@ def read_meta(pretrained_model: Path) -> CheckpointMeta | None:
         for name in ("joint_names", "environment_state_names", "cameras", "image_size"):
             if name in values:  # a checkpoint from before there were pictures has no cameras
                 values[name] = tuple(checks.array(name, values[name], _MOST_NAMES))
-        known = [one.name for one in fields(CheckpointMeta)]
+        known = {one.name: one for one in fields(CheckpointMeta)}
         for name in values:
             if name not in known:
                 raise ManipError(f"unexpected {checks.shorten(name)}")
-        for one in fields(CheckpointMeta):
-            if one.name not in values and one.default is MISSING and one.default_factory is MISSING:
-                raise ManipError(f"no {one.name}")
+        for name, one in known.items():
+            if name not in values and one.default is one.default_factory is MISSING:
+                raise ManipError(f"no {name}")
         return CheckpointMeta(**values)
     except ManipError as error:
         raise ManipError(f"{path} cannot be read ({error}); train again, or restore the file") from error
@@ -167,10 +162,17 @@ def recorded_look(provenance: Mapping[str, Any], fingerprint: Mapping[str, Any])
     return dict(rendered.get("look", {}))
 
 
-def last_checkpoint(output_dir: Path) -> Path | None:
-    """Return the folder `checkpoints/last` under `output_dir`, or None where there is none."""
-    last = Path(output_dir) / "checkpoints" / _LAST
-    return last if (last / PRETRAINED_MODEL).is_dir() else None
+def last_checkpoint(output_dir: Path, *, resume: bool) -> Path | None:
+    """Return the folder `checkpoints/last` to go on from, or None where there is none.
+
+    Raises `FolderExistsError` where there is one, unless `resume`.
+    """
+    last = output_dir / "checkpoints" / _LAST
+    if not (last / PRETRAINED_MODEL).is_dir():
+        return None
+    if not resume:
+        raise FolderExistsError(output_dir)
+    return last
 
 
 def read_step(checkpoint: Path) -> dict[str, Any]:
@@ -191,9 +193,8 @@ def check_same_run(checkpoint: Path, digest: str, options: Mapping[str, Any]) ->
     before = checks.mapping(f"{checkpoint}: options", saved.get("options", {}))
     for name, ours in options.items():
         if before.get(name) != ours:
-            raise MismatchError(
-                f"training option {name}", f"checkpoint {checkpoint}", before.get(name), "this run", ours
-            )
+            what = f"training option {name}"
+            raise MismatchError(what, f"checkpoint {checkpoint}", before.get(name), "this run", ours)
 
 
 @contextmanager
@@ -225,9 +226,8 @@ def unpublished(final: Path) -> Generator[Path]:
             temporary.mkdir()
             yield temporary
             publish(temporary, final)
-    except BaseException:
+    finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise
 
 
 def publish(temporary: Path, final: Path) -> None:
@@ -240,6 +240,12 @@ def publish(temporary: Path, final: Path) -> None:
     link.unlink(missing_ok=True)
     link.symlink_to(final.name)
     os.replace(link, final.parent / _LAST)  # in one rename
+
+
+def write_own_files(checkpoint: Path, meta: CheckpointMeta, step: Mapping[str, Any]) -> None:
+    """Write what LeRobot's checkpoints have not: the meta, and the step with the resume key."""
+    write_json(checkpoint / PRETRAINED_MODEL / META_FILE, asdict(meta))
+    write_json(checkpoint / TRAINING_STATE / STEP_FILE, step)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

@@ -28,9 +28,6 @@ class Rows:
     targets: NDArray[np.float32]
     episodes: I64
 
-    def __len__(self) -> int:
-        return len(self.inputs)
-
 
 def check_table(table: Table, spec: RobotTaskSpec) -> None:
     """Raise unless `table` has the learning columns, with `spec`'s sizes, one length and finite values."""

@@ -25,7 +25,7 @@ from manip_il.checks import mapping, shorten
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
-from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.learn.checkpoint import META_FILE
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import CONFIG, read_config
@@ -104,9 +104,8 @@ def export_onnx(path: Path, policy_sha256: str) -> Exported:
     policy, function, metadata = _load(path, policy_sha256)
     example = _tensors(_observations(policy, function, rows=2))
     content = io.BytesIO()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore"):
         # The exporter that torch prefers needs two packages more, and gives the same graph.
-        warnings.simplefilter("ignore")
         torch.onnx.export(
             _InOrder(function),
             tuple(example.values()),
@@ -135,8 +134,7 @@ def export_torchscript(path: Path, policy_sha256: str) -> Exported:
     """
     policy, function, metadata = _load(path, policy_sha256)
     content = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch has a younger format, which needs the whole of torch to read
+    with warnings.catch_warnings(action="ignore"):  # torch has a younger format, to be read by the whole of torch alone
         example = _tensors(_observations(policy, function, rows=2))
         traced = torch.jit.trace(function, (example,), check_trace=False)
         torch.jit.save(traced, content, _extra_files={EXTRA_FILE: json.dumps(metadata)})
@@ -160,15 +158,11 @@ def file_metadata(
     policy: LearnedPolicy, config: Mapping[str, Any], inputs: Sequence[str], sha256: str
 ) -> dict[str, Any]:
     """Return a file's metadata: the policy, its robot and task, inputs and outputs; unknown entries are left out."""
-    meta, n = policy.meta, policy.interface.action
-    outputs = [_numbers(ACTION, n, meta.joint_names if meta else None, _joint_units(n))]
+    shared = ("robot", "robot"), ("task", "task"), ("control_rate_hz", "fps"), ("action_meaning", "action_meaning")
     entries: dict[str, Any] = {
-        "robot": meta.robot if meta else None,
-        "task": meta.task if meta else None,
-        "control_rate_hz": meta.fps if meta else None,
-        "action_meaning": meta.action_meaning if meta else None,
-        "inputs": [_input(policy, key, meta) for key in inputs],
-        "outputs": outputs,
+        **{key: getattr(policy.meta, name, None) for key, name in shared},
+        "inputs": [_entry(policy, key) for key in inputs],
+        "outputs": [_entry(policy, ACTION)],
         "policy_type": config["type"],
         "policy_loss": config.get("loss"),
         "policy_sha256": sha256,
@@ -176,34 +170,23 @@ def file_metadata(
     return {key: value for key, value in entries.items() if value is not None}
 
 
-def _input(policy: LearnedPolicy, key: str, meta: CheckpointMeta | None) -> dict[str, Any]:
+def _entry(policy: LearnedPolicy, key: str) -> dict[str, Any]:
+    """The name, type and shape of an input or output, and what its numbers mean, where that is known."""
+    interface, meta = policy.interface, policy.meta
     if key.startswith(IMAGES):
-        height, width = policy.interface.pictures[key.removeprefix(IMAGES)]
-        shape = ["batch", height, width, 3]
+        shape = ["batch", *interface.pictures[key.removeprefix(IMAGES)], 3]
         return {"name": key, "dtype": "uint8", "shape": shape, "names": ["red", "green", "blue"], "units": "0 to 255"}
-    size = policy.interface.numbers[key]
-    if key == STATE:
-        return _numbers(key, size, meta.joint_names if meta else None, _joint_units(size))
-    names = meta.environment_state_names if meta else None
-    return _numbers(key, size, names, [_unit(name) for name in names] if names else None)
-
-
-def _numbers(key: str, size: int, names: Sequence[str] | None, units: Sequence[str | None] | None) -> dict[str, Any]:
+    size = interface.action if key == ACTION else interface.numbers[key]
+    names: list[str] = []
+    if meta:
+        names = list(meta.environment_state_names if key == ENVIRONMENT_STATE else meta.joint_names)
     if names and len(names) != size:
         raise MismatchError(f"numbers in {key}", META_FILE, len(names), CONFIG, size)
-    entry = {"name": key, "dtype": "float32", "shape": ["batch", size]}
-    entry |= {"names": list(names)} if names else {}
-    return entry | ({"units": list(units)} if units else {})
-
-
-def _joint_units(n: int) -> list[str]:
-    """Units of joint state and action: the arm's joints, then the gripper's opening."""
-    return ["rad"] * (n - 1) + ["m"]
-
-
-def _unit(name: str) -> str | None:
-    """Unit of a number of the environment state, by its name; None where that does not say."""
-    return "1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2])
+    units = ["rad"] * (size - 1) + ["m"]  # the arm's joints, then the gripper's opening
+    if key == ENVIRONMENT_STATE:
+        units = ["1" if _UNITLESS.fullmatch(name) else _UNITS.get(name.rpartition(".")[2]) for name in names]
+    meanings = {name: values for name, values in (("names", names), ("units", units)) if values}
+    return {"name": key, "dtype": "float32", "shape": ["batch", size], **meanings}
 
 
 def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction, dict[str, Any]]:

@@ -37,12 +37,9 @@ class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 
     policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). observation: `state`,
-    `images` or `both`, what the policy sees. lr: peak learning rate. optimizer, scheduler: in place of the policy's
-    own. eval_split: share of the episodes held out. image_augment: random crops and colour jitter. image_cache_gb: how
-    large the cache of decoded pictures may grow; a dataset that does not fit goes through LeRobot's loader with
-    num_workers processes. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times
-    slower where none is. save_freq, log_freq: in steps. trust: whether models that the policy or its checkpoint names
-    may be loaded. seed: of weights and batches. init_from: a `pretrained_model` folder whose weights to start from.
+    `images` or `both`. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times slower
+    where none is. trust: whether models that the policy or its checkpoint names may be loaded. seed: of weights and
+    batches. init_from: a `pretrained_model` folder whose weights to start from.
 
     Raises `UsageError` for a number out of range or an option that is not for the mlp, `UnknownName` for a policy or an
     option of it that is not there.
@@ -84,16 +81,12 @@ class FitConfig:
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
         check_names(self.policy)
-        if self.is_mlp:
-            self._check_mlp()
-
-    def _check_mlp(self) -> None:
-        if self.observation not in (None, "state"):
+        if self.is_mlp and self.observation not in (None, "state"):
             raise UsageError(
                 f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
             )
         for name in ("optimizer", "scheduler"):
-            if getattr(self, name):
+            if self.is_mlp and getattr(self, name):
                 raise UsageError(f"--{name} is not for --policy.type=mlp, which has its own loop and schedule")
 
     @property
@@ -153,25 +146,25 @@ class FitConfig:
 @cache
 def policy_files() -> Mapping[str, Path]:
     """Return `--policy.type` -> file of its configuration, for every policy of LeRobot's and of this project."""
-    found = (Path(root) / "policies" for root in _lerobot_folders())
-    files = [file for root in (*found, Path(__file__).parent) for file in root.glob("*/configuration_*.py")]
+    roots = (_lerobot() / "policies", Path(__file__).parent)
+    files = [file for root in roots for file in root.glob("*/configuration_*.py")]
     return {kind: file for file in sorted(files) for kind in _REGISTERED.findall(file.read_text(encoding="utf-8"))}
 
 
 def policy_options(kind: str) -> tuple[str, ...]:
     """Return the names of a policy type's options, sorted; none where its configuration is of another form."""
-    own, classes = (_classes(policy_files()[one]) for one in ("mlp", kind))
+    base = _lerobot() / "configs" / "policies.py"
+    files = (base, policy_files()[MLP], policy_files()[kind])  # the cnn's options are the mlp's, and some
+    classes = {name: one for file in files for name, one in _classes(file).items()}
     name = next((name for name, one in classes.items() if kind in _registered(one)), "")
-    classes = own | classes  # the cnn's options are the mlp's, and some
     names: set[str] = set()
-    while name != _BASE:
-        if name not in classes:
-            return ()
+    while name in classes:
         names |= set(_fields(classes[name]))
+        if name == _BASE:
+            return tuple(sorted(names - {*NOT_OURS}))
         bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name)]
         name = bases[0] if len(bases) == 1 else ""
-    base = next((_classes(Path(root) / "configs" / "policies.py") for root in _lerobot_folders()), {}).get(_BASE)
-    return () if base is None else tuple(sorted({*names, *_fields(base)} - {*NOT_OURS}))
+    return ()
 
 
 def check_names(settings: Mapping[str, Any]) -> None:
@@ -188,10 +181,12 @@ def check_names(settings: Mapping[str, Any]) -> None:
             raise UnknownName(f"option of --policy.type={kind}:", name, known, hint)
 
 
-def _lerobot_folders() -> list[str]:
-    """Folders of LeRobot's package, found without importing it."""
+def _lerobot() -> Path:
+    """The folder of LeRobot's package, found without importing it."""
     spec = find_spec("lerobot")
-    return list(spec.submodule_search_locations or []) if spec is not None else []
+    assert spec is not None
+    assert spec.submodule_search_locations
+    return Path(spec.submodule_search_locations[0])
 
 
 @cache

@@ -10,8 +10,8 @@ import hashlib
 import itertools
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +26,18 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.errors import FolderExistsError, NotFiniteError, UsageError
-from manip_il.learn.batches import order_of, pictures_to_float, prefetched
+from manip_il.errors import NotFiniteError, UsageError
+from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
 from manip_il.learn.card import write_card
 from manip_il.learn.checkpoint import (
-    META_FILE,
     PRETRAINED_MODEL,
-    STEP_FILE,
-    TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
     last_checkpoint,
     read_step,
     readable_state,
     unpublished,
-    write_json,
+    write_own_files,
 )
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, set_features
@@ -83,16 +80,16 @@ class PolicyTrainer:
         self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look)
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
-        checkpoint = last_checkpoint(output_dir)
-        if checkpoint is not None and not resume:
-            raise FolderExistsError(output_dir)
+        checkpoint = last_checkpoint(output_dir, resume=resume)
         roots = [root] if isinstance(root, Path) else list(root)
         self.dataset = read_metadata(*roots)
         set_features(self.lerobot.policy, self.dataset, observation)
         self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
             self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
-        self.digest = _digest(self.samples.digest, weights)
+        self.digest = self.samples.digest
+        if weights is not None:
+            self.digest = hashlib.sha256(self.digest.encode() + weights.tobytes()).hexdigest()
         if checkpoint is not None:
             check_same_run(checkpoint, self.digest, self.options)
         self.pipeline = self.lerobot.pipeline(self.dataset.repo_id, str(roots[-1]), output_dir)
@@ -129,7 +126,9 @@ class PolicyTrainer:
         on_step: called after every step, with the metrics where there are some, else with {}; an exception from it ends
         the fit, `KeyboardInterrupt` after a checkpoint. Raises `NotFiniteError` for a loss that is not finite.
         """
-        with threads(self.config.threads), self._open_metrics() as writers:
+        main = self.accelerator.is_main_process
+        metrics = metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
+        with threads(self.config.threads), metrics if main else contextlib.nullcontext(list[Writer]()) as writers:
             for record in self.run():
                 for write in writers if record else []:
                     write(record)
@@ -148,20 +147,31 @@ class PolicyTrainer:
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
-        log = _Log(self.batch_size * self.accelerator.num_processes)
+        samples_per_step = self.batch_size * self.accelerator.num_processes
+        since, started, waited, sums = self.step, time.perf_counter(), 0.0, defaultdict[str, float](float)
         batches = self.samples.source.batches(self._rows_of(step) for step in itertools.count(self.step))
         self.policy.train()
         with prefetched(itertools.islice(batches, self.steps - self.step)) as ready:
             while self.step < self.steps:
-                started = time.perf_counter()
+                asked = time.perf_counter()
                 batch = next(ready)
-                waited = time.perf_counter() - started
-                log.add(self._update(batch), waited)
+                waited += time.perf_counter() - asked
+                for name, value in self._update(batch).items():
+                    sums[name] += value
                 self.step += 1
                 if self.step % self.config.log_freq and self.step != self.steps:
                     yield {}
                     continue
-                yield {"step": self.step, **log.take(), "lr": self._lr()} | self.validate()
+                steps, seconds = self.step - since, max(time.perf_counter() - started, 1e-9)
+                record = {
+                    "step": self.step,
+                    **{name: total / steps for name, total in sums.items()},
+                    "samples_per_s": round(steps * samples_per_step / seconds, 1),
+                    "data_share": round(waited / seconds, 4),
+                    "lr": self._lr(),
+                }
+                since, started, waited, sums = self.step, time.perf_counter(), 0.0, defaultdict[str, float](float)
+                yield record | self.validate()
 
     def validate(self) -> dict[str, float]:
         """Return mean loss on samples of the held-out episodes, without touching the training's random state."""
@@ -189,16 +199,9 @@ class PolicyTrainer:
             with unpublished(get_step_checkpoint_dir(self.output_dir, self.steps, self.step)) as new:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, self.pipeline, policy, *state, *processors)
-                write_json(new / PRETRAINED_MODEL / META_FILE, asdict(self.meta))
-                write_json(new / TRAINING_STATE / STEP_FILE, read_step(new) | own)
+                write_own_files(new, self.meta, read_step(new) | own)
                 write_card(new / PRETRAINED_MODEL, self.pipeline, self.meta, self.dataset, record)
         self.accelerator.wait_for_everyone()
-
-    def _open_metrics(self) -> contextlib.AbstractContextManager[list[Writer]]:
-        """Open what metrics are written to, in the main process alone."""
-        if not self.accelerator.is_main_process:
-            return contextlib.nullcontext([])
-        return metric_writers(self.output_dir, self.step, self.config.tensorboard, self.pipeline)
 
     def _update(self, batch: Batch) -> dict[str, float]:
         batch = self.preprocessor(self._augmented(batch))
@@ -208,7 +211,8 @@ class PolicyTrainer:
         if not math.isfinite(value):
             raise NotFiniteError(f"the loss is {value} at step {self.step}; lower the learning rate ({self._lr():g})")
         self.accelerator.backward(loss)
-        norm = self.accelerator.clip_grad_norm_(self.policy.parameters(), self._clip())
+        clip = self.lerobot.optimizer().grad_clip_norm
+        norm = self.accelerator.clip_grad_norm_(self.policy.parameters(), clip if clip > 0 else math.inf)
         self.optimizer.step()
         self.optimizer.zero_grad()
         if self.scheduler is not None:
@@ -229,8 +233,7 @@ class PolicyTrainer:
         augment = self.lerobot.augment
         if augment is None or batch[cameras[0]].dtype != torch.uint8:
             return pictures_to_float(batch, cameras)
-        key = [self.config.seed, self.step, self.accelerator.process_index]
-        generator = torch.Generator().manual_seed(int(np.random.SeedSequence(key).generate_state(1, np.uint64)[0] >> 1))
+        generator = generator_of(self.config.seed, self.step, self.accelerator.process_index)
         return batch | {camera: augment(batch[camera], generator) for camera in cameras}
 
     def _rows_of(self, step: int) -> I64:
@@ -241,43 +244,6 @@ class PolicyTrainer:
 
     def _lr(self) -> float:
         return float(self.optimizer.param_groups[0]["lr"])
-
-    def _clip(self) -> float:
-        norm = self.lerobot.optimizer().grad_clip_norm
-        return norm if norm > 0 else math.inf
-
-
-def _digest(samples: str, weights: F64 | None) -> str:
-    return samples if weights is None else hashlib.sha256(samples.encode() + weights.tobytes()).hexdigest()
-
-
-class _Log:
-    """Means since the last record."""
-
-    def __init__(self, batch_size: int):
-        self._batch_size = batch_size
-        self._start()
-
-    def _start(self) -> None:
-        self._sums: dict[str, float] = {}
-        self._steps, self._waited, self._started = 0, 0.0, time.perf_counter()
-
-    def add(self, numbers: Mapping[str, float], waited: float) -> None:
-        for name, value in numbers.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        self._steps += 1
-        self._waited += waited
-
-    def take(self) -> dict[str, float]:
-        """Return the means, the samples a second, and the share of the time that was spent waiting for data."""
-        seconds = max(time.perf_counter() - self._started, 1e-9)
-        means = {name: total / self._steps for name, total in self._sums.items()}
-        rates = {
-            "samples_per_s": round(self._steps * self._batch_size / seconds, 1),
-            "data_share": round(self._waited / seconds, 4),
-        }
-        self._start()
-        return means | rates
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:

@@ -71,7 +71,7 @@ def policy_config(settings: Mapping[str, Any], *, trust: bool = False) -> PreTra
     kind = settings.pop("type", MLP)
     cls, source = policy_class(kind), f"--policy.type={kind}"
     require_trust({**settings, "type": kind}, source, trust)
-    return _policy(cls, _fitting(cls, settings, settings), source)
+    return _policy(cls, settings, settings, source)
 
 
 def _from_checkpoint(path: Path, settings: dict[str, Any], trust: bool) -> PreTrainedConfig:
@@ -87,25 +87,24 @@ def _from_checkpoint(path: Path, settings: dict[str, Any], trust: bool) -> PreTr
     kept = {key: value for key, value in saved.items() if key not in unused}
     if "pretrained_backbone_weights" in saved:
         kept["pretrained_backbone_weights"] = None
-    config = _policy(cls, _fitting(cls, kept | settings, settings), source)
+    config = _policy(cls, kept | settings, settings, source)
     config.pretrained_path = path
     return config
 
 
-def _fitting(cls: type[Any], options: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options with no more `n_action_steps` than a plan has, unless the user gave that number."""
+def _policy(
+    cls: type[PreTrainedConfig], options: Mapping[str, Any], given: Mapping[str, Any], source: str
+) -> PreTrainedConfig:
+    """The configuration with no more `n_action_steps` than a plan has, unless the user gave that number."""
     defaults = {field.name: field.default for field in dataclasses.fields(cls)}
-    values = defaults | dict(options)
+    values, options = defaults | dict(options), dict(options)
     wanted = values.get("n_action_steps")
     plan = next((values[name] for name in ("chunk_size", "action_horizon", "horizon") if name in defaults), None)
-    if "n_action_steps" in given or not isinstance(wanted, int) or not isinstance(plan, int):
-        return dict(options)
-    if "horizon" in defaults:  # a plan that begins with the first observation
-        plan -= max(0, values["n_obs_steps"] - 1) if isinstance(values["n_obs_steps"], int) else 0
-    return {**options, "n_action_steps": plan} if 1 <= plan < wanted else dict(options)
-
-
-def _policy(cls: type[PreTrainedConfig], options: Mapping[str, Any], source: str) -> PreTrainedConfig:
+    if "n_action_steps" not in given and isinstance(wanted, int) and isinstance(plan, int):
+        if "horizon" in defaults:  # a plan that begins with the first observation
+            plan -= max(0, values["n_obs_steps"] - 1) if isinstance(values["n_obs_steps"], int) else 0
+        if 1 <= plan < wanted:
+            options["n_action_steps"] = plan
     config = typing.cast(PreTrainedConfig, _decode(cls, options, source))
     config.push_to_hub = False  # LeRobot's default is to upload; here nothing leaves the machine unasked
     return config

@@ -12,7 +12,6 @@ import copy
 import io
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.error import URLError
@@ -46,12 +45,6 @@ _LONGEST = 300  # characters of another program's message
 _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all of the data is noise, not scale
 
 
-@dataclass(slots=True)
-class _Memory:
-    policy: PreTrainedPolicy
-    step: int = 0
-
-
 class EpisodePolicy:
     """A LeRobot policy with its processors and one memory an episode.
 
@@ -69,7 +62,7 @@ class EpisodePolicy:
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
-        self._memories: dict[int, _Memory] = {}
+        self._memories: dict[int, tuple[PreTrainedPolicy, Iterator[int]]] = {}  # and the number of each step
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
@@ -90,18 +83,14 @@ class EpisodePolicy:
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
         if episode not in self._memories:
-            self._memories[episode] = _Memory(copy.deepcopy(self.module, dict(self._shared)))
-        memory = self._memories[episode]
-        with _drawing(episode, memory.step, self._device):
+            self._memories[episode] = copy.deepcopy(self.module, dict(self._shared)), itertools.count()
+        policy, steps = self._memories[episode]
+        with _drawing(episode, next(steps), self._device):
             seen = self._before({**row, "task": [self._task]})
-            with self._precision():
-                action = memory.policy.select_action(seen)
-            memory.step += 1
+            # mixed precision where the policy was trained so, as lerobot-eval has it
+            with torch.autocast(self._device.type) if policy.config.use_amp else contextlib.nullcontext():
+                action = policy.select_action(seen)
             return self._after(action)
-
-    def _precision(self) -> contextlib.AbstractContextManager[Any]:
-        """Mixed, where the policy was trained so, as lerobot-eval has it."""
-        return torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext()
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
@@ -149,13 +138,12 @@ def _load(path: Path, settings: Mapping[str, Any], device: str) -> tuple[PreTrai
 
 def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
     """The parts that copies share, as a memo of `deepcopy`: weights, buffers, torch's own layers, the configuration."""
-    shared: dict[int, Any] = {id(policy.config): policy.config}
-    for tensor in itertools.chain(policy.parameters(), policy.buffers()):
-        shared[id(tensor)] = tensor
-    for module in policy.modules():
-        if all(type(part).__module__.startswith(("torch.", "torchvision.")) for part in module.modules()):
-            shared[id(module)] = module
-    return shared
+    layers = (
+        module
+        for module in policy.modules()
+        if all(type(part).__module__.startswith(("torch.", "torchvision.")) for part in module.modules())
+    )
+    return {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers(), *layers)}
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ and the tensors made of them are counted while they are made: no more than belon
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, override
@@ -52,8 +52,7 @@ def _check(what: str, value: Any, most: int) -> None:
     elif isinstance(value, str):
         checks.text(what, value)
     elif isinstance(value, list | dict):
-        inside: Iterable[Any] = value.values() if isinstance(value, dict) else value
-        for one in inside:
+        for one in value.values() if isinstance(value, dict) else value:
             _check(what, one, most)
 
 
@@ -72,14 +71,11 @@ class Budget(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if not any(isinstance(arg, Tensor) for arg in args):  # it makes one of nothing
             sizes = [arg for arg in args if isinstance(arg, list | tuple)]
-            self._left -= _A_TENSOR + (math.prod(sizes[0]) if sizes and _is_size(sizes[0]) else 0)
+            whole = sizes and all(isinstance(value, int) for value in sizes[0])
+            self._left -= _A_TENSOR + (math.prod(sizes[0]) if whole else 0)
             if self._left < 0:
                 raise ManipError(f"its options describe a much larger network than its weights ({self._weights.name})")
         return func(*args, **(kwargs or {}))
-
-
-def _is_size(values: Any) -> bool:
-    return all(isinstance(value, int) for value in values)
 
 
 def _stored(weights: Path) -> int:

@@ -17,7 +17,6 @@ from manip_il.data.atomic import write_file, writing
 from manip_il.errors import ManipError, UsageError
 
 METRICS_FILE, TENSORBOARD_FOLDER = "metrics.jsonl", "tensorboard"
-_LARGEST_STEP = 10**12
 Record = Mapping[str, Any]  # `step` and numbers
 Writer = Callable[[Record], None]
 
@@ -44,17 +43,13 @@ def metric_writers(output_dir: Path, step: int, curves: bool, pipeline: TrainPip
 @contextmanager
 def json_lines(path: Path, step: int) -> Iterator[Writer]:
     """Give a function that adds a line, null where a number is not finite; lines after `step` are dropped first."""
-    kept = []
-    if path.is_file() and step > 0:
-        for line in path.read_text(errors="replace").splitlines():
-            with_step = _step_of(line)
-            if with_step is not None and with_step <= step:
-                kept.append(line + "\n")
-    write_file(path, "".join(kept).encode())
+    lines = path.read_text(errors="replace").splitlines() if step > 0 and path.is_file() else []
+    write_file(path, "".join(f"{line}\n" for line in lines if _is_until(step, line)).encode())
 
     def write(record: Record) -> None:
         with writing(path), path.open("ab") as file:
-            file.write((json.dumps(_finite(record), allow_nan=False) + "\n").encode())
+            finite = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
+            file.write((json.dumps(finite, allow_nan=False) + "\n").encode())
 
     yield write
 
@@ -89,13 +84,10 @@ def weights_and_biases(config: TrainPipelineConfig) -> Iterator[Writer]:
     yield lambda record: logger.log_dict({k: v for k, v in record.items() if k != "step"}, record["step"])
 
 
-def _finite(record: Record) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
-
-
-def _step_of(line: str) -> int | None:
-    """The step of a line; None for one that was cut short by a kill, or holds none."""
+def _is_until(step: int, line: str) -> bool:
+    """Whether a line is of a step up to this one; no line that was cut short by a kill is, or that holds none."""
     try:
-        return checks.whole("step", json.loads(line)["step"], 0, _LARGEST_STEP)
+        checks.whole("step", json.loads(line)["step"], 0, step)
     except (ManipError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+        return False
+    return True

@@ -119,7 +119,10 @@ class MLPNetwork(nn.Module):
         super().__init__()
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins)
-        self.layers = _perceptron(inputs, self.head.size, shape)
+        layers: list[nn.Module] = []
+        for width in (inputs, *[shape.width] * (shape.depth - 1)):
+            layers += [nn.Linear(width, shape.width), _ACTIVATIONS[shape.activation]()]
+        self.layers = nn.Sequential(*layers, nn.Linear(shape.width, self.head.size))
         for name, tensor in vars(Statistics.identity(inputs, n)).items():
             self.register_buffer(name, tensor)
 
@@ -199,13 +202,6 @@ def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
     return torch.cat([function(*blocks) for blocks in zip(*(one.split(ROWS) for one in padded), strict=True)])[:rows]
 
 
-def _perceptron(inputs: int, outputs: int, shape: Shape) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i in range(shape.depth):
-        layers += [nn.Linear(inputs if i == 0 else shape.width, shape.width), _ACTIVATIONS[shape.activation]()]
-    return nn.Sequential(*layers, nn.Linear(shape.width, outputs))
-
-
 @torch.no_grad()
 def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     """Copy the weights from `pretrained_model`; `network` then acts as that one did, within rounding.
@@ -221,8 +217,7 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     except (SafetensorError, OSError) as error:
         raise ManipError(f"cannot read {path} to start from its weights: {' '.join(str(error).split())}") from error
     saved = {name.removeprefix("model."): tensor for name, tensor in saved.items()}
-    mean, scale = network.input_mean.clone(), network.input_scale.clone()
-    low, high = network.target_low.clone(), network.target_high.clone()
+    kept = {name: getattr(network, name).clone() for name in ("input_mean", "input_scale", "target_low", "target_high")}
     for name, ours in network.state_dict().items():
         theirs = saved[name].shape if name in saved else None
         if theirs != ours.shape:
@@ -231,11 +226,8 @@ def warm_start(network: MLPNetwork, pretrained_model: Path) -> None:
     # x_old = (u - mean_old) scale_old and x = (u - mean) scale, so x_old = x scale_old / scale + offset
     first = network.layers[0]
     assert isinstance(first, torch.nn.Linear)
-    offset = (mean - network.input_mean) * network.input_scale
-    ratio = torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale))
+    offset, scale = (kept["input_mean"] - network.input_mean) * network.input_scale, kept["input_scale"]
     first.bias.add_(first.weight @ offset)
-    first.weight.mul_(ratio)
-    network.input_mean.copy_(mean)
-    network.input_scale.copy_(scale)
-    network.target_low.copy_(low)
-    network.target_high.copy_(high)
+    first.weight.mul_(torch.where(scale > 0, network.input_scale / scale, torch.zeros_like(scale)))
+    for name, tensor in kept.items():
+        getattr(network, name).copy_(tensor)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from manip_il.learn.network import MLPNetwork, Shape
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, Interface, interface_of, read_config
 from manip_il.mdp import F32, F64, Images
 
+if TYPE_CHECKING:  # it imports LeRobot, which takes seconds
+    from manip_il.learn.lerobot_policy import EpisodePolicy
+
 Batch = dict[str, torch.Tensor]
 LIKELIHOODS = ("mixture", "categorical")  # losses whose spread depends on the state
 NO_LIKELIHOOD = (
@@ -30,30 +33,13 @@ NO_LIKELIHOOD = (
 )
 
 
-class BatchPolicy(Protocol):
-    """A policy that turns a batch into actions and keeps a memory of each episode where it needs one."""
-
-    @property
-    def module(self) -> torch.nn.Module:
-        """The network: an `MLPNetwork` of the mlp, LeRobot's policy of any other type."""
-        ...
-
-    def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
-        """Return one action (n,) a row; `episodes` says whose row each is. Other episodes have ended."""
-        ...
-
-    def forget(self, episodes: Iterable[int]) -> None:
-        """Drop the memory of these episodes."""
-        ...
-
-
 class LearnedPolicy:
     """Actions from a LeRobot checkpoint, for many episodes at once.
 
     meta: what the policy was trained for, None for a checkpoint of lerobot-train. interface: what it sees and gives.
     """
 
-    def __init__(self, policy: BatchPolicy, interface: Interface, meta: CheckpointMeta | None = None):
+    def __init__(self, policy: EpisodePolicy | _Perceptron, interface: Interface, meta: CheckpointMeta | None = None):
         self.interface, self.meta = interface, meta
         self._policy = policy
 
@@ -107,8 +93,7 @@ class LearnedPolicy:
             return np.empty((0, self.interface.action))
         with threads(1):
             actions = self._policy.select(batch, episodes).cpu().numpy().astype(np.float64)
-        if actions.shape != (rows, self.interface.action):
-            expected = (rows, self.interface.action)
+        if actions.shape != (expected := (rows, self.interface.action)):
             raise MismatchError("shape of the actions", CONFIG, expected, "the policy", actions.shape)
         _require_finite_rows("the policy's action", actions)
         return actions
@@ -234,11 +219,10 @@ class _Perceptron:
 
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:
     """The network's shape in an mlp's `config.json`."""
-    for field in fields(Shape):
-        if field.name not in config:
-            raise ManipError(f"{path} has no {field.name}; it is not an mlp's")
     try:
         return Shape(**{field.name: config[field.name] for field in fields(Shape)})
+    except KeyError as error:
+        raise ManipError(f"{path} has no {error.args[0]}; it is not an mlp's") from error
     except ManipError as error:
         raise ManipError(f"{path}: {error}") from error
 

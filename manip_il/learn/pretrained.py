@@ -2,14 +2,14 @@
 
 LeRobot's language and vision policies load tokenizers, encoders and whole models that the checkpoint names, some with
 `trust_remote_code`, which runs Python from the named repository. Policies that are built from their own configuration
-and weights alone are listed in `PLAIN`, with the steps of their processors; all others need `--trust=true`.
+and weights alone are listed in `PLAIN`, the steps of their processors in `_STEPS`; all others need `--trust=true`.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,9 +33,7 @@ _STEPS: dict[str, frozenset[str]] = {  # LeRobot's default processors: step -> t
     "normalizer_processor": _NORMALISER,
     "unnormalizer_processor": _NORMALISER,
 }
-PLAIN: dict[str, dict[str, frozenset[str]]] = {  # policies that load nothing by name -> their processors' steps
-    name: _STEPS for name in ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")
-}
+PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load nothing by name
 _NAMES: dict[str, tuple[str, ...]] = {  # other policies of LeRobot 0.6.1 -> the options that name what they load
     "eo1": ("vlm_base",),
     "evo1": ("vlm_model_name",),
@@ -65,11 +63,6 @@ class Interface:
     numbers: dict[str, int]
     pictures: dict[str, tuple[int, int]]
     action: int
-
-    @property
-    def observation(self) -> str:
-        """One of `OBSERVATIONS`."""
-        return observation_of(self.columns)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -210,9 +203,8 @@ def require_trust(settings: Mapping[str, Any], source: str, trust: bool, folder:
     """
     kind = settings["type"]
     wanted = _models(kind, settings)
-    for name in PROCESSORS if folder is not None else ():
-        assert folder is not None
-        wanted += _steps(name, processor_steps(folder / name), PLAIN.get(kind, _STEPS))
+    if folder is not None:
+        wanted += [one for name in PROCESSORS for one in _other_steps(folder / name)]
     if wanted and not trust:
         raise ManipError(
             f"{source} is a policy of type {kind!r} that would load {'; '.join(wanted)}: this fetches files and may "
@@ -228,16 +220,14 @@ def _models(kind: str, settings: Mapping[str, Any]) -> list[str]:
     return [] if kind in PLAIN else [f"models that LeRobot's {kind!r} names itself"]
 
 
-def _steps(file: str, steps: Sequence[Mapping[str, Any]], allowed: Mapping[str, frozenset[str]]) -> list[str]:
-    """The steps of a processor's file that are not allowed, or have options that are not."""
-    found: list[str] = []
-    for step in steps:
+def _other_steps(path: Path) -> Iterator[str]:
+    """The steps of a processor's file that are not LeRobot's default, or have options that those have not."""
+    for step in processor_steps(path):
         name, options = step["registry_name"], step["config"]
-        if name not in allowed:
-            found.append(_list_options(f"the step {checks.shorten(name)} of {file}", options))
-        elif extra := {key: options[key] for key in options if key not in allowed[name]}:
-            found.append(_list_options(f"the step {name!r} of {file} with options of its own", extra))
-    return found
+        if name not in _STEPS:
+            yield _list_options(f"the step {checks.shorten(name)} of {path.name}", options)
+        elif extra := {key: options[key] for key in options if key not in _STEPS[name]}:
+            yield _list_options(f"the step {name!r} of {path.name} with options of its own", extra)
 
 
 def _list_options(what: str, options: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, override
+from typing import Any
 
 import numpy as np
 import torch
@@ -131,18 +131,14 @@ class MemorySource:
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,)."""
         batch: Batch = {}
-        for key, column in self.columns.items():
-            batch |= self._gather(key, samples, lambda rows, column=column: column[torch.from_numpy(rows)])
-        for key, frames in self.frames.items():
-            batch |= self._gather(key, samples, lambda rows, frames=frames: torch.from_numpy(frames[rows]))
+        for key, values in {**self.columns, **self.frames}.items():
+            rows, padded = self.windows.rows(samples, key) if key in self.windows.deltas else (samples, None)
+            numbers = isinstance(values, torch.Tensor)
+            batch[key] = values[torch.from_numpy(rows)] if numbers else torch.from_numpy(values[rows])
+            if padded is not None:
+                batch[f"{key}_is_pad"] = torch.from_numpy(padded)
         batch[TASK] = [self.tasks[int(i)] for i in batch[TASK_INDEX]]
         return batch
-
-    def _gather(self, key: str, samples: I64, read) -> Batch:
-        if key not in self.windows.deltas:
-            return {key: read(samples)}
-        rows, padded = self.windows.rows(samples, key)
-        return {key: read(rows), f"{key}_is_pad": torch.from_numpy(padded)}
 
 
 @dataclass(frozen=True)
@@ -159,21 +155,12 @@ class LibrarySource:
         """Return one batch for every array of sample numbers, (B,), in that order; pictures are float32 or uint8."""
         loader = torch.utils.data.DataLoader(
             self.dataset,
-            batch_sampler=_Batches(samples),
+            batch_sampler=(one.tolist() for one in samples),
             num_workers=self.workers,
             multiprocessing_context="spawn" if self.workers else None,  # decoders do not survive a fork
             generator=torch.Generator(),  # else it draws from the global one, and a resumed run would differ
         )
         return iter(loader)
-
-
-class _Batches(torch.utils.data.Sampler[list[int]]):
-    def __init__(self, samples: Iterable[I64]):
-        self._samples = samples
-
-    @override
-    def __iter__(self) -> Iterator[list[int]]:
-        return (one.tolist() for one in self._samples)
 
 
 @dataclass(frozen=True)
@@ -216,19 +203,15 @@ def load_samples(
         _LOG.warning(
             "the pictures of %s take more than %g GB: LeRobot's loader decodes them on the fly", names, limit / 1e9
         )
-        source = _library_source(roots, meta, windows, config.num_workers)
+        ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
+        read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
+        source = LibrarySource(torch.utils.data.ConcatDataset(read), config.num_workers)
     else:
         columns = {key: torch.from_numpy(np.array(table[key])) for key in (*numbers, *_ALWAYS)}
         source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
     return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
-
-
-def _library_source(roots: Sequence[Path], meta: Any, windows: Windows, workers: int) -> LibrarySource:
-    ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
-    read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
-    return LibrarySource(torch.utils.data.ConcatDataset(read), workers)
 
 
 def _frames(

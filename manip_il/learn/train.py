@@ -14,7 +14,6 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,10 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
-from manip_il.errors import FolderExistsError, NotFiniteError
+from manip_il.errors import NotFiniteError
 from manip_il.learn.batches import order_of
 from manip_il.learn.checkpoint import (
-    META_FILE,
     PRETRAINED_MODEL,
-    STEP_FILE,
     TRAINING_STATE,
     CheckpointMeta,
     check_same_run,
@@ -41,7 +38,7 @@ from manip_il.learn.checkpoint import (
     read_step,
     readable_state,
     unpublished,
-    write_json,
+    write_own_files,
 )
 from manip_il.learn.columns import ARM, GRIPPER, Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
@@ -82,9 +79,7 @@ def fit(
     run that is resumed on other data or options.
     """
     output_dir = Path(output_dir)
-    checkpoint = last_checkpoint(output_dir)
-    if checkpoint is not None and not resume:
-        raise FolderExistsError(output_dir)
+    checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
     rows = learning_rows(table)
     drawn = weights[valid_frames(table)] if weights is not None else None
@@ -133,27 +128,21 @@ class Trainer:
             self.policy.parameters(), lr=self.peak_lr, weight_decay=WEIGHT_DECAY, fused=True
         )
         if checkpoint is not None:
-            self._restore(checkpoint)
+            with readable_state(checkpoint):
+                self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
+                load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
+            self.step = read_step(checkpoint)["step"]
         elif config.init_from is not None:
             warm_start(network, config.init_from)
-        self._encode(rows, train, held_out)
-        drawn = weights[train] if weights is not None else None
-        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
-
-    def _restore(self, checkpoint: Path) -> None:
-        with readable_state(checkpoint):
-            self.policy.load_state_dict(load_file(checkpoint / PRETRAINED_MODEL / "model.safetensors"))
-            load_optimizer_state(self.optimizer, checkpoint / TRAINING_STATE)
-        self.step = read_step(checkpoint)["step"]
-
-    def _encode(self, rows: Rows, train: NDArray[np.int64], held_out: NDArray[np.int64]) -> None:
         device = self.policy.config.device
         inputs, targets = torch.from_numpy(rows.inputs).to(device), torch.from_numpy(rows.targets).to(device)
         # One tensor [x | y], so that a batch is one gather of whole rows.
-        encoded = torch.cat([self.policy.model.encode(inputs), self.policy.model.encode_targets(targets)], dim=1)
+        encoded = torch.cat([network.encode(inputs), network.encode_targets(targets)], dim=1)
         self.width = inputs.shape[1]
         self.data, self.held_out = encoded[train], encoded[held_out]
         self.held_out_inputs, self.held_out_targets = inputs[held_out], targets[held_out]
+        drawn = weights[train] if weights is not None else None
+        self.order = order_of(len(train), drawn, self.batch_size, config.seed)
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""
@@ -203,10 +192,9 @@ class Trainer:
             self.policy.save_pretrained(folder)
             for processor in make_pre_post_processors(self.policy.config):
                 processor.save_pretrained(folder)
-            write_json(folder / META_FILE, asdict(meta))
             state.mkdir()
             save_optimizer_state(self.optimizer, state)
-            write_json(state / STEP_FILE, {"step": self.step, **resume_key})
+            write_own_files(new, meta, {"step": self.step, **resume_key})
         for other in final.parent.iterdir():
             if not other.is_symlink() and other.name != final.name:
                 shutil.rmtree(other, ignore_errors=True)

@@ -14,6 +14,7 @@ from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.lerobot_policy import EpisodePolicy
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.pretrained import observation_of
 
 from .tiny_policies import edit_config, observations, refused, write_checkpoint
 
@@ -107,7 +108,7 @@ def test_the_past_is_an_episodes_own_and_the_weights_are_not(checkpoint):
     policy.act(states[:2], environments[:2], None, [4, 5])
     inner = policy._policy
     assert isinstance(inner, EpisodePolicy)
-    one, two = (memory.policy for memory in inner._memories.values())
+    one, two = (memory for memory, _ in inner._memories.values())
     assert all(a is b for a, b in zip(one.parameters(), two.parameters(), strict=True))
     name = "temporal_ensembler" if hasattr(one, "temporal_ensembler") else "_queues"
     name = name if hasattr(one, name) else "_action_queue"
@@ -187,7 +188,8 @@ def test_a_graphics_card_that_is_not_there_is_refused(act):
 def test_pictures_must_be_those_of_the_checkpoint(pictured, tmp_path):
     meta = CheckpointMeta.of(pictured, observation="images", look={})
     policy = LearnedPolicy.load(write_checkpoint(tmp_path / "policy", "act", pictured, "images", meta=meta))
-    assert (policy.interface.observation, policy.cameras, policy.meta) == ("images", ("front", "wrist"), meta)
+    assert observation_of(policy.interface.columns) == "images"
+    assert (policy.cameras, policy.meta) == (("front", "wrist"), meta)
     states, environments = (column[:2] for column in observations(STEPS, 0))
     picture = np.zeros((2, 32, 48, 3), np.uint8)
     dark = policy.act(states, environments, {"front": picture, "wrist": picture}, [0, 1])

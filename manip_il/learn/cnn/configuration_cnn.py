@@ -42,18 +42,15 @@ class CNNConfig(MLPConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         try:
-            self._check()
+            layers = checks.array("channels", self.channels, MOST_LAYERS)
+            self.channels = tuple(checks.whole("channels", layer, 1, LARGEST) for layer in layers)
+            if len(self.channels) < 2:
+                raise ManipError(f"channels is {list(self.channels)}; expected at least two layers")
+            checks.whole("keypoints", self.keypoints, 1, LARGEST)
+            checks.whole("privileged_size", self.privileged_size, 0, LARGEST)  # 0: off
+            checks.number("aux_weight", self.aux_weight, 0.0)
         except ManipError as error:
             raise UsageError(f"policy.{error}") from error
-
-    def _check(self) -> None:
-        layers = checks.array("channels", self.channels, MOST_LAYERS)
-        self.channels = tuple(checks.whole("channels", layer, 1, LARGEST) for layer in layers)
-        if len(self.channels) < 2:
-            raise ManipError(f"channels is {list(self.channels)}; expected at least two layers")
-        checks.whole("keypoints", self.keypoints, 1, LARGEST)
-        checks.whole("privileged_size", self.privileged_size, 0, LARGEST)  # 0: off
-        checks.number("aux_weight", self.aux_weight, 0.0)
 
     @override
     def validate_features(self) -> None:

@@ -137,10 +137,8 @@ class CNNPolicy(MLPPolicy):
     @override
     def _learn_columns(self, columns: Table, loss: str) -> None:
         super()._learn_columns(columns, loss)
-        if self.aux_weight > 0 and ENVIRONMENT_STATE in columns and ENVIRONMENT_STATE not in self.inputs:
-            self._learn_privileged(columns)
-
-    def _learn_privileged(self, columns: Table) -> None:
+        if self.aux_weight <= 0 or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
+            return
         values, index = columns[ENVIRONMENT_STATE], torch.from_numpy(columns[INDEX])
         size = values.shape[1]
         if self.privileged is None:

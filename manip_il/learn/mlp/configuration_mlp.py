@@ -13,10 +13,6 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.network import Shape
 
 
-def _identity_mapping() -> dict[str, NormalizationMode]:
-    return {kind: NormalizationMode.IDENTITY for kind in ("STATE", "ENV", "VISUAL", "ACTION")}
-
-
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
 class MLPConfig(PreTrainedConfig):
@@ -42,7 +38,11 @@ class MLPConfig(PreTrainedConfig):
 
     device: str | None = "cpu"
     push_to_hub: bool = False  # type: ignore[assignment]
-    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_identity_mapping)
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(("STATE", "ENV", "VISUAL", "ACTION"), NormalizationMode.IDENTITY)
+    )
+
+    observation_delta_indices = action_delta_indices = reward_delta_indices = None  # type: ignore[assignment]
 
     # Read by lerobot-train alone; `manip_il.learn.train` has its own.
     optimizer_lr: float = 1e-3
@@ -79,18 +79,3 @@ class MLPConfig(PreTrainedConfig):
     @override
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
-
-    @property
-    @override
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    @override
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    @override
-    def reward_delta_indices(self) -> None:
-        return None
