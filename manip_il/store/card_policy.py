@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,35 +26,26 @@ _REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _FIT = {"steps": "{} steps", "batch_size": "batches of {}", "lr": "learning rate {}", "seed": "seed {}"}
 
 
-@dataclass(frozen=True)
 class Policy:
-    """JSON files of a policy's folder; each is `{}` if it is missing."""
+    """JSON files of a policy's folder, each `{}` if it is missing, and the names in them, empty if none has one.
 
-    config: Mapping[str, Any]
-    meta: Mapping[str, Any]
-    training: Mapping[str, Any]
-    evaluation: Mapping[str, Any]
-    was_chosen_by: bool  # whether the evaluation is one that the policy was chosen by
+    type: LeRobot's name of its kind. dataset: LeRobot's `repo_id` of what it was trained on. was_chosen_by: whether the
+    evaluation is one that the policy was chosen by.
+    """
 
-    @property
-    def type(self) -> str:
-        """LeRobot's name of the policy's kind."""
-        return str(self.config.get("type", "policy"))
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot; empty if no file names it."""
-        return str(self.meta.get("robot") or self.evaluation.get("robot") or "")
-
-    @property
-    def task(self) -> str:
-        """Name of the task; empty if no file names it."""
-        return str(self.meta.get("task") or self.evaluation.get("task") or "")
-
-    @property
-    def dataset(self) -> str:
-        """LeRobot's `repo_id` of the dataset that it was trained on; empty if no file names it."""
-        return str((self.training.get("dataset") or {}).get("repo_id") or "")
+    def __init__(self, root: Path):
+        """Read the policy in a folder, or in the run that the folder is. Raises `ManipError` if there is none."""
+        inside = policy_folder(path.relative_to(root).as_posix() for place in _PLACES for path in root.glob(place))
+        if inside is None:
+            text = f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder"
+            raise ManipError(text)
+        folder = root / inside
+        self.evaluation, self.was_chosen_by = _evaluation(root, folder)
+        files = ("config", "manip_il", "train_config")
+        self.config, self.meta, self.training = (_read(folder / f"{name}.json") for name in files)
+        self.type = str(self.config.get("type", "policy"))
+        self.robot, self.task = (str(self.meta.get(key) or self.evaluation.get(key) or "") for key in ("robot", "task"))
+        self.dataset = str((self.training.get("dataset") or {}).get("repo_id") or "")
 
 
 def policy_fields(root: Path, place: str) -> tuple[ModelCardData, dict[str, Any]]:
@@ -63,7 +53,7 @@ def policy_fields(root: Path, place: str) -> tuple[ModelCardData, dict[str, Any]
 
     Raises `ManipError` for a folder without a policy, and Python's own errors for JSON files with unexpected values.
     """
-    policy = read_policy(root)
+    policy = Policy(root)
     title = f"{policy.type} for {policy.robot} {policy.task}" if policy.robot else policy.type
     # Options name the robot and the task only if the policy's own folder does not.
     missing = [
@@ -79,17 +69,6 @@ def policy_fields(root: Path, place: str) -> tuple[ModelCardData, dict[str, Any]
         "environment": _environment(policy),
         "fingerprint": (policy.meta.get("fingerprint") or {}).items(),
     }
-
-
-def read_policy(root: Path) -> Policy:
-    """Return the policy in a folder, or in the run that the folder is. Raises `ManipError` if there is none."""
-    inside = policy_folder(path.relative_to(root).as_posix() for place in _PLACES for path in root.glob(place))
-    if inside is None:
-        raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
-    folder = root / inside
-    evaluation, was_chosen_by = _evaluation(root, folder)
-    config, meta, training = (_read(folder / f"{name}.json") for name in ("config", "manip_il", "train_config"))
-    return Policy(config, meta, training, evaluation, was_chosen_by)
 
 
 def _metadata(policy: Policy, title: str) -> ModelCardData:
