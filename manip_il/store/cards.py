@@ -64,9 +64,8 @@ def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
     files = {PICTURE: picture} if picture else {}
     if not is_kept:
         data, fields = dataset_fields(root, place)
-        fields["command"] = command(journals_of(root) / "config.yaml") or command(
-            root.absolute().parent / "config.yaml"
-        )
+        above = root.absolute().parent / "config.yaml"
+        fields["command"] = command(journals_of(root) / "config.yaml") or command(above)
         fields["picture"] = PICTURE if picture else None
         files[CARD] = _render(DatasetCard, "card_dataset", data, fields)
     return files
