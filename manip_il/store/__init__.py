@@ -32,20 +32,9 @@ version; otherwise `ConflictError` tells the user to push again.
     SFTP     a lock file, made only where there is none and touched every 3 s; one not touched for 15 s is removed
     folder   the kernel's lock on the manifest, which a killed process cannot keep; without locks the user is warned
 
-The files, from the commands downwards:
-
-    push, pull                      the two procedures, for any remote
-    remote                          URLs, and the protocol `Remote` that every remote implements
-    manifest                        the list of files of one version, and which paths it may hold
-    disk, errors                    local files and downloads; errors, retries and the least speed
-    hub, hub_repo, hub_session,     the Hub: push and pull, one repository's API, errors in our words,
-      hub_http                        and the HTTP client with its limits
-    object_store                    `Remote` on top of any store of plain files (`Blobs`)
-    s3_store, s3_upload, s3_client  `Blobs` on S3; large files in parts; the HTTP session and its errors
-    sftp_store, sftp_connection     `Blobs` over SFTP with its lock; the connection and its pipelined reads
-    file_store                      `Blobs` in a folder
-    cards, card_policy, card_dataset
-                                    README.md and picture for the Hub, from the templates card_*.md.jinja
+`push` and `pull` are the two procedures, for any `remote.Remote`. One is the Hub (`hub`, on top of `hub_repo`,
+`hub_session` and `hub_http`); the other is `object_store`, on top of any store of plain files (`Blobs`): `s3_store`,
+`sftp_store`, `file_store`. `cards` and `card_dataset` make what the Hub shows of a folder.
 
 Importing this package does nothing; each remote's library is imported when a URL of its kind is opened.
 """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -126,14 +125,6 @@ def _provenance(one: Mapping[str, Any], name: str = "") -> Iterator[str]:
     yield (f"`{name}`: " if name not in ("", "dataset") else "") + ", ".join(words)
 
 
-@dataclass(frozen=True)
-class Paths:
-    """Positions of the object and goal in some episodes. objects: each (T, 3); goals: each (3,) [m]."""
-
-    objects: tuple[NDArray[Any], ...]
-    goals: tuple[NDArray[Any], ...]
-
-
 def draw_picture(root: Path) -> bytes | None:
     """Return a PNG; None for a dataset without cameras and without an object and a goal among its columns."""
     keys = camera_keys(root)
@@ -143,22 +134,19 @@ def draw_picture(root: Path) -> bytes | None:
     return _png(_drawing(paths)) if paths else None
 
 
-def read_paths(root: Path) -> Paths | None:
-    """Return positions of the object and goal of each episode; None if no columns hold them."""
+def read_paths(root: Path) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+    """Return the object's path, (T, 3), and the goal, (3,), of the first episodes [m]; none if no columns hold them."""
     try:
         names = read_spec(root).environment_state_names
     except ManipError:
-        return None  # another program's dataset
+        return []  # another program's dataset
     if not {f"{thing}.{axis}" for thing in ("object", "goal") for axis in "xyz"} <= set(names):
-        return None
+        return []
     table = read_table(root, [s.ENVIRONMENT_STATE, layout.EPISODE_INDEX])
     index, values = table[layout.EPISODE_INDEX], table[s.ENVIRONMENT_STATE]
-    if not len(index):
-        return None
-    columns = {thing: [names.index(f"{thing}.{axis}") for axis in "xyz"] for thing in ("object", "goal")}
+    columns, goal = ([names.index(f"{thing}.{axis}") for axis in "xyz"] for thing in ("object", "goal"))
     episodes = [values[index == episode] for episode in np.unique(index)[:EPISODES]]
-    goals = tuple(rows[0, columns["goal"]] for rows in episodes)
-    return Paths(tuple(rows[:, columns["object"]] for rows in episodes), goals)
+    return [(rows[:, columns], rows[0, goal]) for rows in episodes]
 
 
 def _frames(root: Path, keys: Sequence[str]) -> Image.Image:
@@ -179,64 +167,45 @@ def _frames(root: Path, keys: Sequence[str]) -> Image.Image:
     return strip
 
 
-def _drawing(paths: Paths) -> Image.Image:
+def _drawing(paths: Sequence[tuple[NDArray[Any], NDArray[Any]]]) -> Image.Image:
     """Draw paths from above and from the side, to one scale, with a legend."""
-    everything = np.concatenate([*paths.objects, np.stack(paths.goals)])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    lines = [np.vstack(one) for one in paths]  # each with its goal at the end
+    low, high = np.concatenate(lines).min(axis=0), np.concatenate(lines).max(axis=0)
     scale = (_PANEL - 2 * _EDGE) / max(float((high - low).max()), 0.05)  # [pixels/m]
     canvas = Image.new("RGB", (2 * _PANEL * _FINE, (_PANEL + _EDGE) * _FINE), "white")
     pen = ImageDraw.Draw(canvas)
-    for number, (across, up, title) in enumerate(((0, 1, "from above: x, y"), (0, 2, "from the side: x, z"))):
-        middle = (low + high) / 2
-        origin = np.array([(number + 0.5) * _PANEL, _PANEL / 2])
-
-        def place(points: NDArray[Any], axes: Any = (across, up), middle: Any = middle, origin: Any = origin) -> Any:
-            shift = (points[..., list(axes)] - middle[list(axes)]) * scale * (1, -1)
-            return (origin + shift) * _FINE
-
-        _panel(pen, number, title)
-        for rows, goal in zip(paths.objects, paths.goals, strict=True):
-            pen.line([tuple(one) for one in place(rows)], fill=_PATH, width=_FINE)
-            _square(pen, place(rows[0]))
-            _ring(pen, place(goal))
-        if number == 0:
-            _ruler(pen, scale)
-    _legend(pen, len(paths.objects))
+    for left, axes, title in ((0, [0, 1], "from above: x, y"), (_PANEL, [0, 2], "from the side: x, z")):
+        box = [(left + 6) * _FINE, 6 * _FINE, (left + _PANEL - 6) * _FINE, (_PANEL - 6) * _FINE]
+        pen.rectangle(box, outline=_FAINT, width=_FINE)
+        _text(pen, left + 12, 9, title)
+        origin = np.array([left + _PANEL / 2, _PANEL / 2])
+        for one in lines:
+            shift = (one[:, axes] - ((low + high) / 2)[axes]) * scale * (1, -1)
+            *path, end = (origin + shift) * _FINE
+            pen.line([tuple(at) for at in path], fill=_PATH, width=_FINE)
+            _mark(pen, path[0], end)
+        if left == 0:
+            ruler, y = 16 + 0.1 * scale, _PANEL - 16  # of 0.1 m
+            pen.line([16 * _FINE, y * _FINE, ruler * _FINE, y * _FINE], fill=_INK, width=_FINE)
+            _text(pen, ruler + 6, y - 8, "0.1 m")
+    _legend(pen, len(paths))
     return canvas.resize((canvas.width // _FINE, canvas.height // _FINE), Image.Resampling.LANCZOS)
-
-
-def _panel(pen: ImageDraw.ImageDraw, number: int, title: str) -> None:
-    left = number * _PANEL
-    box = [(left + 6) * _FINE, 6 * _FINE, (left + _PANEL - 6) * _FINE, (_PANEL - 6) * _FINE]
-    pen.rectangle(box, outline=_FAINT, width=_FINE)
-    _text(pen, left + 12, 9, title)
-
-
-def _ruler(pen: ImageDraw.ImageDraw, scale: float) -> None:
-    """Draw a line of 0.1 m."""
-    y, left = _PANEL - 16, 16
-    pen.line([left * _FINE, y * _FINE, (left + 0.1 * scale) * _FINE, y * _FINE], fill=_INK, width=_FINE)
-    _text(pen, left + 0.1 * scale + 6, y - 8, "0.1 m")
 
 
 def _legend(pen: ImageDraw.ImageDraw, episodes: int) -> None:
     y = _PANEL + 12
-    _square(pen, np.array([18, y]) * _FINE)
+    _mark(pen, np.array([18, y]) * _FINE, np.array([178, y]) * _FINE)
     _text(pen, 28, y - 8, "object at the start")
-    _ring(pen, np.array([178, y]) * _FINE)
     _text(pen, 188, y - 8, "goal")
     pen.line([250 * _FINE, y * _FINE, 274 * _FINE, y * _FINE], fill=_PATH, width=_FINE)
     _text(pen, 282, y - 8, f"the object's path, {episodes} episode{'s' if episodes > 1 else ''}")
 
 
-def _square(pen: ImageDraw.ImageDraw, at: Any) -> None:
-    x, y, half = float(at[0]), float(at[1]), 3.5 * _FINE
-    pen.rectangle([x - half, y - half, x + half, y + half], fill=_START)
-
-
-def _ring(pen: ImageDraw.ImageDraw, at: Any) -> None:
-    x, y, half = float(at[0]), float(at[1]), 4.5 * _FINE
-    pen.ellipse([x - half, y - half, x + half, y + half], outline=_GOAL, width=2 * _FINE)
+def _mark(pen: ImageDraw.ImageDraw, start: NDArray[Any], goal: NDArray[Any]) -> None:
+    """Draw a square at the start and a ring at the goal [pixels]."""
+    square, ring = 3.5 * _FINE, 4.5 * _FINE
+    pen.rectangle([*(start - square), *(start + square)], fill=_START)
+    pen.ellipse([*(goal - ring), *(goal + ring)], outline=_GOAL, width=2 * _FINE)
 
 
 def _text(pen: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:

@@ -10,11 +10,14 @@ import os
 from collections.abc import Buffer, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from manip_il.store.errors import HashError, NoSpaceError, RemoteError, TransientError
 from manip_il.store.manifest import FileEntry
 from manip_il.store.remote import Advance
+
+if TYPE_CHECKING:
+    from _hashlib import HASH  # what hashlib's constructors return
 
 CHUNK = 2**20  # of what is copied or hashed at a time [bytes]
 _START = 2  # SYNC_FILE_RANGE_WRITE
@@ -22,27 +25,11 @@ _WORTH_A_THREAD = 2**17  # of a chunk that is hashed beside the writing [bytes]
 _WORTH_A_SYNC = 2**25  # that the kernel is asked at once to bring to the disk [bytes]
 
 
-class Hasher(Protocol):
-    """Digest of `hashlib`."""
-
-    def update(self, data: Buffer, /) -> None:
-        """Feed bytes."""
-        ...
-
-    def hexdigest(self) -> str:
-        """Return the hash of all that was fed."""
-        ...
-
-
-def hash_file(path: Path | str, digest: Hasher) -> int:
+def hash_file(path: Path, digest: HASH) -> int:
     """Feed a file's bytes to `digest`; return their number."""
-    with open(path, "rb", buffering=0) as file:
-        total = 0
-        room = memoryview(bytearray(min(CHUNK, os.fstat(file.fileno()).st_size + 1)))
-        while count := file.readinto(room):
-            digest.update(room[:count])
-            total += count
-    return total
+    with path.open("rb", buffering=0) as file:
+        hashlib.file_digest(file, lambda: digest)
+        return file.tell()
 
 
 def copy_file(source: Path, target: str) -> str:
@@ -50,13 +37,9 @@ def copy_file(source: Path, target: str) -> str:
     with source.open("rb", buffering=0) as old, open(target, "x+b", buffering=0) as new:
         if os.fstat(old.fileno()).st_size > CHUNK:
             return _copy_large(old.fileno(), new.fileno())
-        while data := old.read(CHUNK):
-            write_all(new, data)
+        write_all(new, old.read())
         new.seek(0)
-        digest = hashlib.sha256()
-        while data := new.read(CHUNK):
-            digest.update(data)
-    return digest.hexdigest()
+        return hashlib.file_digest(new, "sha256").hexdigest()
 
 
 def _copy_large(old: int, new: int) -> str:
@@ -152,22 +135,18 @@ class Download:
         self._hashed = self._helper.submit(self._digest.update, chunk) if is_large else None
         if not is_large:
             self._digest.update(chunk)
-        self._write_out(chunk)
-        self._position += len(chunk)
-        self._count()
-
-    def _write_out(self, chunk: memoryview) -> None:
         try:
             write_all(self._file, chunk)
-            end = self._position + len(chunk)
-            if end - self._syncing >= _WORTH_A_SYNC:
-                self._helper.submit(start_writing, self._file.fileno(), self._syncing, end - self._syncing)
-                self._syncing = end
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 text = "the disk is full; make room and pull again: what has been transferred is kept"
                 raise NoSpaceError(text) from None
             raise RemoteError(f"cannot write {self._entry.path}: {error.strerror}; check that disk") from None
+        self._position += len(chunk)
+        if (size := self._position - self._syncing) >= _WORTH_A_SYNC:
+            self._helper.submit(start_writing, self._file.fileno(), self._syncing, size)
+            self._syncing = self._position
+        self._count()
 
     def _count(self) -> None:
         if self._position > self._counted:
@@ -184,11 +163,13 @@ def is_whole(entry: FileEntry, path: Path) -> bool:
     return digest.hexdigest() == (entry.sha256 or entry.git_sha1)
 
 
-def _digest_for(entry: FileEntry) -> Hasher:
-    """Make a digest of the hash by which an entry is known."""
-    if entry.sha256:
-        return hashlib.sha256()
-    return hashlib.sha1(b"blob %d\0" % entry.size, usedforsecurity=False)  # git's
+def _digest_for(entry: FileEntry) -> HASH:
+    return hashlib.sha256() if entry.sha256 else git_digest(entry.size)
+
+
+def git_digest(size: int) -> HASH:
+    """Begin git's id of a file of `size` bytes (`git hash-object`)."""
+    return hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
 
 
 _LIBC = ctypes.CDLL(None, use_errno=True)

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from manip_il.data.atomic import PARTIAL, exclusive, write_file
 from manip_il.errors import FolderBusyError, UsageError
-from manip_il.store.disk import copy_file, hash_file, sync_disk
+from manip_il.store.disk import copy_file, sync_disk
 from manip_il.store.errors import AuthError, NoSpaceError, NotFoundError, RemoteError, TransientError
 from manip_il.store.manifest import LONGEST_TEXT
-from manip_il.store.object_store import OBJECTS, STALE, Stored, in_threads
+from manip_il.store.object_store import OBJECTS, STALE, Stored, wrong_when_read
 from manip_il.store.remote import MANIFEST_FILE, Advance, RemoteUrl, Sink
 
 CHUNK = 2**20  # of what is copied at a time [bytes]
@@ -125,9 +125,7 @@ class FileBlobs:
 
     def wrong(self, sizes: Mapping[str, int]) -> set[str]:
         """Return those that are missing or have other bytes."""
-        with self._translated(f"read {self.name}"):
-            digests = in_threads(self.threads, lambda key: _digest(self._path(key)), sizes)
-        return {key for key, digest in digests.items() if digest != key}
+        return wrong_when_read(self, sizes)
 
     def remove(self, keys: Iterable[str], token: str) -> None:
         """Remove objects, and what killed pushes left, unless another push has been."""
@@ -191,12 +189,3 @@ class FileBlobs:
             if error.errno in (errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EINTR):
                 raise TransientError(f"cannot {what}: {error.strerror}") from None
             raise RemoteError(f"cannot {what}: {error.strerror or error}; check that folder") from None
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    try:
-        hash_file(path, digest)
-    except FileNotFoundError:
-        return ""
-    return digest.hexdigest()

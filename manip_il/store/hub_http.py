@@ -40,62 +40,41 @@ class _Listing:
     until: float
 
 
-class _Limits:
-    """Hooks of the client, which apply while somebody is inside `limited`."""
+def _check_request(request: httpx.Request) -> None:
+    """Check and change a request, a redirected one too."""
+    endpoint = next(reversed(_endpoints), None)
+    if endpoint is None:
+        return
+    if not _same_origin(request.url, httpx.URL(endpoint)):
+        request.headers.pop("Authorization", None)
+    request.headers["Accept-Encoding"] = "identity"  # so that a size is the size of the content
+    if (listing := _listing.get()) is not None:
+        listing.pages -= 1
+        if listing.pages < 0 or time.monotonic() > listing.until:
+            text = f"more than {MOST_PAGES:,} pages" if listing.pages < 0 else f"more than {LONGEST_LISTING:.0f} s"
+            raise RemoteError(f"{_name(request.url)} has a list of {text}; is it a Hub?")
+    given = request.extensions.get("timeout") or {}
+    if all(value is None for value in given.values()):
+        limits = {"connect": CONNECT, "read": PATIENCE, "write": PATIENCE, "pool": PATIENCE}
+        request.extensions = {**request.extensions, "timeout": limits}
+    for counter in _counters:
+        if request.method == "PUT" and isinstance(request.stream, httpx.SyncByteStream):
+            request.stream = _Filtered(request.stream, partial(counter.count, str(request.url)))
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._users = 0
-        self._origin: httpx.URL | None = None
-        self._listing: ContextVar[_Listing | None] = ContextVar("listing", default=None)
-        self.counters: list[_Counter] = []
 
-    @contextlib.contextmanager
-    def apply(self, endpoint: str, *, listing: bool) -> Generator[None]:
-        with self._lock:
-            self._users, self._origin = self._users + 1, httpx.URL(endpoint)
-        left = _Listing(MOST_PAGES, time.monotonic() + LONGEST_LISTING) if listing else None
-        before = self._listing.set(left)
-        try:
-            yield
-        finally:
-            self._listing.reset(before)
-            with self._lock:
-                self._users -= 1
-
-    def before(self, request: httpx.Request) -> None:
-        """Check and change a request, a redirected one too."""
-        if not self._users:
-            return
-        if self._origin is None or not _same_origin(request.url, self._origin):
-            request.headers.pop("Authorization", None)
-        request.headers["Accept-Encoding"] = "identity"  # so that a size is the size of the content
-        if (listing := self._listing.get()) is not None:
-            listing.pages -= 1
-            if listing.pages < 0 or time.monotonic() > listing.until:
-                text = f"more than {MOST_PAGES:,} pages" if listing.pages < 0 else f"more than {LONGEST_LISTING:.0f} s"
-                raise RemoteError(f"{_name(request.url)} has a list of {text}; is it a Hub?")
-        given = request.extensions.get("timeout") or {}
-        if all(value is None for value in given.values()):
-            limits = {"connect": CONNECT, "read": PATIENCE, "write": PATIENCE, "pool": PATIENCE}
-            request.extensions = {**request.extensions, "timeout": limits}
-        for counter in self.counters:
-            if request.method == "PUT" and isinstance(request.stream, httpx.SyncByteStream):
-                request.stream = _Filtered(request.stream, partial(counter.count, str(request.url)))
-
-    def after(self, response: httpx.Response) -> None:
-        """Check an answer, before its body is read."""
-        if not self._users:
-            return
-        name = _name(response.request.url)
-        if (encoding := response.headers.get("Content-Encoding", "identity")) != "identity":
-            raise RemoteError(f"{name} answered in the encoding {encoding!r:.40}, expected plain bytes; is it a Hub?")
-        if response.status_code in TEMPORARY and (seconds := _requested_wait(response)) > PATIENCE:
-            text = f"{name} answered {response.status_code} and the server asks to wait {seconds:.0f} s"
-            raise RemoteError(f"{text}: try again then")
-        is_file = response.request.extensions.get(FILE) and response.status_code in (200, 206)
-        if not is_file and isinstance(response.stream, httpx.SyncByteStream):
-            response.stream = _Filtered(response.stream, partial(_check_answer, name))
+def _check_response(response: httpx.Response) -> None:
+    """Check an answer, before its body is read."""
+    if not _endpoints:
+        return
+    name = _name(response.request.url)
+    if (encoding := response.headers.get("Content-Encoding", "identity")) != "identity":
+        raise RemoteError(f"{name} answered in the encoding {encoding!r:.40}, expected plain bytes; is it a Hub?")
+    if response.status_code in TEMPORARY and (seconds := _requested_wait(response)) > PATIENCE:
+        text = f"{name} answered {response.status_code} and the server asks to wait {seconds:.0f} s"
+        raise RemoteError(f"{text}: try again then")
+    is_file = response.request.extensions.get(FILE) and response.status_code in (200, 206)
+    if not is_file and isinstance(response.stream, httpx.SyncByteStream):
+        response.stream = _Filtered(response.stream, partial(_check_answer, name))
 
 
 class _Filtered(httpx.SyncByteStream):
@@ -147,7 +126,9 @@ class _Counter:
             self._progress(count)
 
 
-_LIMITS = _Limits()
+_endpoints: list[str] = []  # of those who are inside `limited`: the hooks apply while there are any
+_listing: ContextVar[_Listing | None] = ContextVar("listing", default=None)
+_counters: list[_Counter] = []
 _installed = False
 
 
@@ -158,8 +139,13 @@ def limited(endpoint: str, *, listing: bool = False) -> Generator[None]:
     if not _installed:  # once: every change of the factory closes the connections that are open
         set_client_factory(_make_client)
         _installed = True
-    with _LIMITS.apply(endpoint, listing=listing):
+    before = _listing.set(_Listing(MOST_PAGES, time.monotonic() + LONGEST_LISTING) if listing else None)
+    _endpoints.append(endpoint)
+    try:
         yield
+    finally:
+        _endpoints.remove(endpoint)
+        _listing.reset(before)
 
 
 @contextlib.contextmanager
@@ -169,19 +155,19 @@ def counted(total: int, progress: Advance) -> Generator[None]:
     huggingface_hub reports no file before it is done. What goes by xet (on the public Hub) counts at the end.
     """
     counter = _Counter(total, progress)
-    _LIMITS.counters.append(counter)
+    _counters.append(counter)
     try:
         yield
         counter.advance(counter.left)
     finally:
-        _LIMITS.counters.remove(counter)
+        _counters.remove(counter)
 
 
 def _make_client() -> httpx.Client:
     """Make huggingface_hub's own client, with our hooks and the least speed."""
     client = default_client_factory()
-    client.event_hooks["request"].append(_LIMITS.before)
-    client.event_hooks["response"].append(_LIMITS.after)
+    client.event_hooks["request"].append(_check_request)
+    client.event_hooks["response"].append(_check_response)
     transports: list[Any] = [client._transport, *client._mounts.values()]  # pyright: ignore[reportPrivateUsage]
     for pool in {id(one): one._pool for one in transports if one is not None}.values():
         pool._network_backend = _PacedBackend(pool._network_backend)  # httpx has no option for it
@@ -229,11 +215,7 @@ class _PacedStream(httpcore.NetworkStream):
 
 
 def _same_origin(left: httpx.URL, right: httpx.URL) -> bool:
-    return (left.scheme, left.host, _port(left)) == (right.scheme, right.host, _port(right))
-
-
-def _port(url: httpx.URL) -> int | None:
-    return url.port or {"http": 80, "https": 443}.get(url.scheme)
+    return (left.scheme, left.host, left.port) == (right.scheme, right.host, right.port)  # httpx drops usual ports
 
 
 def _name(url: httpx.URL) -> str:

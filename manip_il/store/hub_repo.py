@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Literal
 from urllib.parse import quote
 
 from huggingface_hub import (
@@ -25,6 +25,7 @@ from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundErro
 from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
 
 from manip_il import checks
+from manip_il.store.disk import git_digest, hash_file
 from manip_il.store.errors import HashError, ManifestError, RemoteError, Retry, TransientError
 from manip_il.store.hub_http import CONNECT, FILE
 from manip_il.store.hub_session import host, hub_session
@@ -243,7 +244,9 @@ class Tree:
             return False
         if file.lfs:
             return file.lfs.sha256 == hashlib.sha256(listed).hexdigest()
-        return file.blob_id == _git_sha1(io.BytesIO(listed), len(listed))
+        digest = git_digest(len(listed))
+        digest.update(listed)
+        return file.blob_id == digest.hexdigest()
 
     def differences(self, manifest: Manifest) -> list[str]:
         """Return the paths of files that the commit lacks, has with other bytes, or has beyond the manifest."""
@@ -257,18 +260,11 @@ def with_git_hashes(manifest: Manifest, local: Mapping[str, Path]) -> Manifest:
     def hashed(entry: FileEntry) -> FileEntry:
         if entry.size >= SMALL:
             return entry
-        with local[entry.path].open("rb") as file:
-            return replace(entry, git_sha1=_git_sha1(file, entry.size))
+        digest = git_digest(entry.size)
+        hash_file(local[entry.path], digest)
+        return replace(entry, git_sha1=digest.hexdigest())
 
     return replace(manifest, files=tuple(map(hashed, manifest.files)), replaced=())
-
-
-def _git_sha1(file: BinaryIO, size: int) -> str:
-    """Return git's id of a file of `size` bytes (`git hash-object`)."""
-    digest = hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
-    while chunk := file.read(2**20):
-        digest.update(chunk)
-    return digest.hexdigest()
 
 
 def _checked(file: RepoFile) -> RepoFile:

@@ -220,10 +220,7 @@ def _reason(path: str) -> str:
             return "a name in it means something else on other systems"
         if len(part.encode()) > LONGEST_NAME:
             return f"a name in it is longer than {LONGEST_NAME} bytes"
-    return _code_reason(fold(path))
-
-
-def _code_reason(folded: str) -> str:
+    folded = fold(path)
     if folded.endswith(_PICKLES):
         return "a pickle runs code when it is read; weights are kept as .safetensors"
     if folded.endswith(_CODE):

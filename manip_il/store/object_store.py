@@ -92,20 +92,13 @@ class ObjectRemote:
     blobs: Blobs
     retry: Retry = field(default_factory=Retry)
 
-    @property
-    def threads(self) -> int:
-        """Largest number of threads that may fetch at the same time."""
-        return self.blobs.threads
+    def __post_init__(self) -> None:
+        self.name, self.threads = self.blobs.name, self.blobs.threads
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about this store, as far as they are known by now."""
         return self.blobs.warnings
-
-    @property
-    def name(self) -> str:
-        """URL without a password."""
-        return self.blobs.name
 
     def read(self) -> Snapshot | None:
         """Return the version that is there; None if there is none."""
@@ -163,8 +156,21 @@ class ObjectRemote:
         """Put objects; return those that the store has verified."""
 
         def one(key: str) -> bool:
-            counter = _Counter(progress)
-            return self.retry(lambda: self.blobs.put(key, sources[key], sizes[key], counter.restart()))
+            most = 0  # bytes in one try: what is sent again counts once
+
+            def put() -> bool:
+                sent = 0
+
+                def advance(count: int) -> None:
+                    nonlocal sent, most
+                    sent += count
+                    if sent > most:
+                        progress(sent - most)
+                        most = sent
+
+                return self.blobs.put(key, sources[key], sizes[key], advance)
+
+            return self.retry(put)
 
         largest_first = sorted(sizes, key=lambda key: -sizes[key])  # else the last one runs alone
         done = in_threads(self.blobs.threads, one, largest_first)
@@ -220,23 +226,6 @@ class ObjectRemote:
                 self.blobs.remove(sorted(doomed - needed), token)
         except RemoteError as error:  # readers see the new version already: the push has worked
             self.blobs.warnings += (f"old files could not be removed ({error}); the next push tries again",)
-
-
-class _Counter:
-    """Count of one object's bytes: each once, however often it is sent."""
-
-    def __init__(self, progress: Advance):
-        self._progress, self._most, self._now = progress, 0, 0
-
-    def restart(self) -> Advance:
-        self._now = 0
-        return self._advance
-
-    def _advance(self, count: int) -> None:
-        self._now += count
-        if self._now > self._most:
-            self._progress(self._now - self._most)
-            self._most = self._now
 
 
 def in_threads[K, R](threads: int, work: Callable[[K], R], keys: Iterable[K]) -> dict[K, R]:

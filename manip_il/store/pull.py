@@ -16,8 +16,8 @@ from manip_il.store.disk import Download, is_whole, sync_disk
 from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
 from manip_il.store.manifest import FileEntry, Manifest
 from manip_il.store.object_store import in_threads
-from manip_il.store.push import CHECKPOINTS, HASHERS, JOURNALS, LAST, Progress, newest, without_root_copies
-from manip_il.store.remote import Advance, Remote, RemoteUrl, Snapshot
+from manip_il.store.push import CHECKPOINTS, HASHERS, JOURNALS, LAST, Progress, journals_of, newest, without_root_copies
+from manip_il.store.remote import Remote, RemoteUrl, Snapshot
 
 RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
 
@@ -53,9 +53,8 @@ def pull(
         return Pulled(snapshot.manifest)
     with atomic.exclusive(staging):
         for _ in range(RESTARTS):
-            stage = _Stage(remote, snapshot, staging, retry or Retry())
             try:
-                kept = stage.fill(progress)
+                kept = _fill(staging, remote, snapshot, retry or Retry(), progress)
                 break
             except NotFoundError:
                 now = _read(url, remote)
@@ -64,71 +63,67 @@ def pull(
                 snapshot = now  # pushed to twice meanwhile: files that are the same stay
         else:
             raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
-        _move_to(stage.tree, target, snapshot.manifest, overwrite)
+        _move_to(staging / "tree", target, snapshot.manifest, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
     return Pulled(snapshot.manifest, kept)
 
 
-class _Stage:
-    """The folder beside the target. parts: unfinished files, by hash. tree: verified files, as they will be."""
+def _fill(staging: Path, remote: Remote, snapshot: Snapshot, retry: Retry, progress: Progress) -> int:
+    """Fetch and verify every file; return the number of bytes that were there already.
 
-    def __init__(self, remote: Remote, snapshot: Snapshot, folder: Path, retry: Retry):
-        self._remote, self._snapshot, self._folder, self._retry = remote, snapshot, folder, retry
-        self.tree, self._parts = folder / "tree", folder / "parts"
+    In `staging`, `parts` holds unfinished files, by hash, and `tree` verified ones, as they will be.
+    """
+    manifest, tree, parts = snapshot.manifest, staging / "tree", staging / "parts"
+    if staging.is_symlink():
+        staging.unlink()
+    for folder in (tree, parts):
+        folder.mkdir(parents=True, exist_ok=True)
+    missing = _missing(tree, manifest)
+    for path in parts.iterdir():
+        if path.name not in missing or path.is_symlink():
+            path.unlink()
+    wanted = sum(entries[0].size * len(entries) for entries in missing.values())
+    had = sum(path.stat().st_size for path in parts.iterdir())
+    _check_space(staging, wanted - had)
+    whole = manifest.size - wanted
 
-    def fill(self, progress: Progress) -> int:
-        """Fetch and verify every file; return the number of bytes that were there already."""
-        manifest = self._snapshot.manifest
-        if self._folder.is_symlink():
-            self._folder.unlink()
-        for folder in (self.tree, self._parts):
-            folder.mkdir(parents=True, exist_ok=True)
-        missing = self._missing()
-        for path in self._parts.iterdir():
-            if path.name not in missing or path.is_symlink():
-                path.unlink()
-        wanted = sum(entries[0].size * len(entries) for entries in missing.values())
-        had = sum(path.stat().st_size for path in self._parts.iterdir())
-        _check_space(self._folder, wanted - had)
-        whole = manifest.size - wanted
-        with progress(manifest.size, "pull") as advance:
-            advance(whole)
-            # The largest first, else the last one runs alone.
-            order = sorted(missing, key=lambda key: -missing[key][0].size)
-            in_threads(self._remote.threads, lambda key: self._fetch(missing[key], advance), order)
-        sync_disk(self._folder)
-        return whole + had
-
-    def _missing(self) -> dict[str, list[FileEntry]]:
-        """Return the entries, by hash, that the tree lacks; remove what else it holds."""
-        by_path = self._snapshot.manifest.by_path
-        there = {path.relative_to(self.tree).as_posix(): path for path in _leaves(self.tree)}
-        known = [path for path in there if path in by_path]
-        whole = in_threads(HASHERS, lambda path: is_whole(by_path[path], there[path]), known)
-        for path, place in there.items():
-            if not whole.get(path):
-                place.unlink()
-        for folder in sorted((path for path in self.tree.rglob("*") if path.is_dir()), reverse=True):
-            if not any(folder.iterdir()):  # else a file of the new version may want the name
-                folder.rmdir()
-        missing: dict[str, list[FileEntry]] = defaultdict(list)
-        for entry in self._snapshot.manifest.files:
-            if not whole.get(entry.path):
-                missing[entry.key].append(entry)
-        return missing
-
-    def _fetch(self, entries: list[FileEntry], advance: Advance) -> None:
+    def fetch(key: str) -> None:
         """Fetch one file's bytes to all places that have them."""
-        first, *others = entries
-        part = self._parts / first.key
+        (first, *others), part = missing[key], parts / key
         download = Download(first, part, advance)
-        self._retry(lambda: download.attempt(lambda to, offset: self._remote.fetch(self._snapshot, first, to, offset)))
-        for entry in entries:
-            (self.tree / entry.path).parent.mkdir(parents=True, exist_ok=True)
+        retry(lambda: download.attempt(lambda to, offset: remote.fetch(snapshot, first, to, offset)))
+        for entry in missing[key]:
+            (tree / entry.path).parent.mkdir(parents=True, exist_ok=True)
         for entry in others:
-            shutil.copyfile(part, self.tree / entry.path)
+            shutil.copyfile(part, tree / entry.path)
             advance(entry.size)
-        part.replace(self.tree / first.path)
+        part.replace(tree / first.path)
+
+    with progress(manifest.size, "pull") as advance:
+        advance(whole)
+        # The largest first, else the last one runs alone.
+        in_threads(remote.threads, fetch, sorted(missing, key=lambda key: -missing[key][0].size))
+    sync_disk(staging)
+    return whole + had
+
+
+def _missing(tree: Path, manifest: Manifest) -> dict[str, list[FileEntry]]:
+    """Return the entries, by hash, that the tree lacks; remove what else it holds."""
+    by_path = manifest.by_path
+    there = {path.relative_to(tree).as_posix(): path for path in _leaves(tree)}
+    known = [path for path in there if path in by_path]
+    whole = in_threads(HASHERS, lambda path: is_whole(by_path[path], there[path]), known)
+    for path, place in there.items():
+        if not whole.get(path):
+            place.unlink()
+    for folder in sorted((path for path in tree.rglob("*") if path.is_dir()), reverse=True):
+        if not any(folder.iterdir()):  # else a file of the new version may want the name
+            folder.rmdir()
+    missing: dict[str, list[FileEntry]] = defaultdict(list)
+    for entry in manifest.files:
+        if not whole.get(entry.path):
+            missing[entry.key].append(entry)
+    return missing
 
 
 def _read(url: RemoteUrl, remote: Remote) -> Snapshot:
@@ -148,7 +143,7 @@ def _check_target(target: Path, manifest: Manifest, overwrite: bool) -> None:
         raise UsageError(f"{target} is not a folder; name a new one to pull to")
     if target.exists() and any(target.iterdir()) and not overwrite:
         raise FolderExistsError(target)
-    beside = _journals(target)
+    beside = journals_of(target)
     if _has_journals(manifest) and beside.exists() and not overwrite and not _holds(beside, manifest):
         raise FolderExistsError(beside)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -168,7 +163,7 @@ def _move_to(tree: Path, target: Path, manifest: Manifest, overwrite: bool) -> N
         if name and not (checkpoints / LAST).exists():
             (checkpoints / LAST).symlink_to(name)
     if _has_journals(manifest):
-        beside = _journals(target)
+        beside = journals_of(target)
         if _holds(beside, manifest):  # of a try that was killed right here
             shutil.rmtree(tree / JOURNALS)
         else:
@@ -182,10 +177,6 @@ def _rename(folder: Path, target: Path, overwrite: bool) -> None:
         atomic._exchange(folder, target)  # pyright: ignore[reportPrivateUsage]
     else:
         atomic._rename(folder, target)  # pyright: ignore[reportPrivateUsage]
-
-
-def _journals(target: Path) -> Path:
-    return target.with_name(f"{target.name}.{JOURNALS}")
 
 
 def _has_journals(manifest: Manifest) -> bool:

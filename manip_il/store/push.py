@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manip_il.data.lerobot_layout import INFO
-from manip_il.doctor.examine import examine_folder, has_errors
+from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import NotWhole, Severity
 from manip_il.errors import UsageError
 from manip_il.store.disk import hash_file, is_whole
@@ -64,11 +64,11 @@ def push(
     """
     kind = check_source(source, url)
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
-        is_hub = url.scheme == "hf"  # other stores keep the folder byte for byte, without a card
-        cards = _write_cards(source, kind, url, Path(folder)) if is_hub else {}
-        scanned = scan(source, kind, journals=journals, extra=cards)
-        if is_hub:
-            scanned = with_root_copies(scanned)
+        if url.scheme == "hf":
+            cards = _write_cards(source, kind, url, Path(folder))
+            scanned = with_root_copies(scan(source, kind, journals=journals, extra=cards))
+        else:  # other stores keep the folder byte for byte, without a card
+            scanned = scan(source, kind, journals=journals)
         before = remote.read()
         plan = make_plan(scanned, before, remote.name)
         if dry_run:
@@ -84,9 +84,8 @@ def check_source(source: Path, url: RemoteUrl) -> Kind:
         right = RemoteUrl("hf", url.place, kind)
         raise UsageError(f"{source} is a {kind}, {url} is for a {url.kind}; push it to {right}")
     for dataset in _datasets(source):
-        findings = examine_folder(dataset)
-        if has_errors(findings):
-            first = next(finding for finding in findings if finding.severity is Severity.ERROR)
+        first = next((finding for finding in examine_folder(dataset) if finding.severity is Severity.ERROR), None)
+        if first is not None:
             text = f"{dataset} is damaged and was not pushed: {' '.join(str(first).split())}"
             raise NotWhole(f"{text}; see all with manip-il doctor {dataset}, and repair it with --repair=true")
     return kind
@@ -151,7 +150,7 @@ def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, 
     """
     local = _files_below(root, journals)
     if journals and kind == "dataset":
-        beside = root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
+        beside = journals_of(root)
         if beside.is_dir():
             local |= {f"{JOURNALS}/{name}": path for name, path in _files_below(beside, journals).items()}
     local |= extra or {}
@@ -168,6 +167,11 @@ def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, 
     with ThreadPoolExecutor(HASHERS) as pool:
         entries = tuple(pool.map(hashed, sorted(local.items())))
     return Scanned(Manifest(kind, entries), local)
+
+
+def journals_of(root: Path) -> Path:
+    """Return the folder of a dataset's journals, beside it."""
+    return root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
 
 
 def _files_below(folder: Path, journals: bool) -> dict[str, Path]:

@@ -6,7 +6,7 @@ Every answer has a largest size and a longest time, and no redirect leads to ano
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from types import SimpleNamespace
 from typing import Any, cast, override
 
@@ -35,16 +35,11 @@ GONE = "NoSuchUpload"  # another push has completed or aborted it
 _FULL = {"XMinioStorageFull", "QuotaExceeded", "InsufficientStorage", "EntityTooLarge", "NotEnoughSpace"}
 _BUSY = {
     *("SlowDown", "RequestTimeout", "Throttling", "ThrottlingException", "InternalError", "ServiceUnavailable"),
-    *(
-        GONE,
-        "InvalidPart",
-        "BadDigest",
-        "IncompleteBody",
-        "XAmzContentSHA256Mismatch",
-        "ConditionalRequestConflict",
-        "OperationAborted",
-    ),
+    *("InvalidPart", "BadDigest", "IncompleteBody", "XAmzContentSHA256Mismatch"),
+    *(GONE, "ConditionalRequestConflict", "OperationAborted"),
 }
+# Botocore, aiohttp and urllib3 have classes of their own for a connection that was cut.
+_CUT = {"HTTPClientError", "ConnectionError", "ClientError", "IncompleteReadError", "ClientPayloadError"}
 _KEYS = {"InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "InvalidToken", "TokenRefreshRequired"}
 
 
@@ -85,18 +80,21 @@ class BoundedSession(AIOHTTPSession):
         return session
 
 
-async def read_paced(body: Any, size: int, pace: Pace) -> bytes:
-    """Read at most `size` bytes more of an object, at no less than the least speed."""
-    loop = asyncio.get_running_loop()
-    started = loop.time()
-    data: bytes = await body.read(size)
-    pace.add(loop.time() - started, len(data))
-    return data
+async def read_paced(body: Any, name: str, size: int) -> AsyncIterator[bytes]:
+    """Yield at most `size` bytes of an answer at a time, at no less than the least speed. name: for messages."""
+    loop, pace = asyncio.get_running_loop(), Pace(name)
+    while True:
+        started = loop.time()
+        data: bytes = await body.read(size)
+        pace.add(loop.time() - started, len(data))
+        if not data:
+            return
+        yield data
 
 
 async def _read(raw: aiohttp.ClientResponse, name: str) -> bytes:
-    pace, data = Pace(name), bytearray()
-    while piece := await read_paced(raw.content, _CHUNK, pace):
+    data = bytearray()
+    async for piece in read_paced(raw.content, name, _CHUNK):
         data += piece
         if len(data) > LARGEST_ANSWER:
             raw.close()
@@ -116,13 +114,12 @@ async def _refuse_other_origin(
 
 def code_of(error: BaseException) -> str:
     """Return S3's code of an error, or an HTTP status as text; empty if no server answered."""
-    response = _response(error)
-    return str(cast("Mapping[str, Any]", response.get("Error", {})).get("Code", ""))
+    return str(_answer(error, "Error").get("Code", ""))
 
 
 def status_of(error: BaseException) -> int:
     """Return the HTTP status of the answer; 0 if no server answered."""
-    return int(_metadata(error).get("HTTPStatusCode", 0) or 0)
+    return int(_answer(error, "ResponseMetadata").get("HTTPStatusCode", 0) or 0)
 
 
 def translate(error: Exception, what: str, bucket: str) -> RemoteError:
@@ -137,7 +134,7 @@ def translate(error: Exception, what: str, bucket: str) -> RemoteError:
     if code in _FULL or status == 507:
         return NoSpaceError(f"cannot {what}: the store is full ({code or status}); make room there and try again")
     if code in _BUSY or status in (408, 409, 429) or status >= 500:
-        headers = cast("Mapping[str, str]", _metadata(error).get("HTTPHeaders", {}))
+        headers: Mapping[str, str] = _answer(error, "ResponseMetadata").get("HTTPHeaders", {})
         return TransientError(f"cannot {what}: {code or status}", retry_after(headers.get("retry-after")))
     if code in ("NoSuchKey", "404", "NotFound") or status == 404:
         return NotFoundError(f"cannot {what}: nothing is there; check the name")
@@ -145,29 +142,15 @@ def translate(error: Exception, what: str, bucket: str) -> RemoteError:
         text = "this key has no permission for it; ask the bucket's owner, or use a key that has it"
         return AuthError(f"cannot {what}: {text}")
     if name == "EndpointConnectionError" and "Could not connect" in str(error):
-        return TransientError(f"cannot {what}: no answer from {_endpoint(error)}; check AWS_ENDPOINT_URL")
-    if status == 0 and (isinstance(error, OSError | TimeoutError | EOFError) or _is_cut(error)):
+        endpoint = str(getattr(error, "kwargs", {}).get("endpoint_url", "the endpoint")).split("?")[0]
+        return TransientError(f"cannot {what}: no answer from {endpoint}; check AWS_ENDPOINT_URL")
+    is_cut = any(base.__name__ in _CUT for base in type(error).__mro__)
+    if status == 0 and (is_cut or isinstance(error, OSError | EOFError)):
         return TransientError(f"cannot {what}: the connection was lost ({name})")
     return RemoteError(f"cannot {what}: {code or name}: {' '.join(str(error).split())[:300]}")
 
 
-def _endpoint(error: Exception) -> str:
-    keywords = cast("Mapping[str, Any]", getattr(error, "kwargs", {}))
-    return str(keywords.get("endpoint_url", "the endpoint")).split("?")[0]
-
-
-def _is_cut(error: Exception) -> bool:
-    """Return whether it is an error of a connection: botocore, aiohttp and urllib3 have classes of their own."""
-    names = {base.__name__ for base in type(error).__mro__}
-    return bool(
-        names & {"HTTPClientError", "ConnectionError", "ClientError", "IncompleteReadError", "ClientPayloadError"}
-    )
-
-
-def _metadata(error: BaseException) -> Mapping[str, Any]:
-    return cast("Mapping[str, Any]", _response(error).get("ResponseMetadata", {}))
-
-
-def _response(error: BaseException) -> Mapping[str, Any]:
+def _answer(error: BaseException, part: str) -> Mapping[str, Any]:
+    """Return a part of the answer that botocore made an error of; empty if no server answered."""
     response = getattr(error, "response", None)
-    return cast("Mapping[str, Any]", response) if isinstance(response, dict) else {}
+    return cast("Mapping[str, Any]", response).get(part, {}) if isinstance(response, dict) else {}

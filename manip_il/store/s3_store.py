@@ -9,6 +9,7 @@ import re
 import secrets
 from collections.abc import Awaitable, Callable, Generator, Iterable, Mapping
 from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from s3fs import S3FileSystem
 
 from manip_il.errors import UsageError
 from manip_il.store import s3_client
-from manip_il.store.errors import AuthError, NotFoundError, Pace, RemoteError, TransientError
+from manip_il.store.errors import AuthError, NotFoundError, RemoteError, TransientError
 from manip_il.store.manifest import LONGEST_TEXT
 from manip_il.store.object_store import OBJECTS, STALE, Stored, in_threads, wrong_when_read
 from manip_il.store.remote import MANIFEST_FILE, Advance, RemoteUrl, Sink
@@ -103,8 +104,7 @@ class S3Blobs:
                 if offset and answer["ResponseMetadata"]["HTTPStatusCode"] != 206:
                     text = f"{self.name}: the store supports no byte ranges; remove the .pulling folder and pull again"
                     raise RemoteError(text)
-                pace = Pace(self.name)
-                while chunk := await read_paced(body, CHUNK, pace):
+                async for chunk in read_paced(body, self.name, CHUNK):
                     target.write(chunk)
             finally:
                 body.close()
@@ -237,9 +237,10 @@ class S3Blobs:
     async def _get_manifest(self, client: Any) -> tuple[bytes, str]:
         answer = await client.get_object(**self._at(MANIFEST_FILE))
         data = bytearray()
-        pace = Pace(self.name)
-        while len(data) <= LONGEST_TEXT and (piece := await read_paced(answer["Body"], CHUNK, pace)):
+        async for piece in read_paced(answer["Body"], self.name, CHUNK):
             data += piece
+            if len(data) > LONGEST_TEXT:
+                break
         return bytes(data), str(answer["ETag"])
 
     def _at(self, name: str) -> dict[str, str]:
@@ -269,8 +270,6 @@ def _is_refused(error: Exception) -> bool:
 
 def _age(modified: datetime, answer: Mapping[str, Any]) -> float:
     """Return the time since `modified` [s], by the store's own clock if it sends it."""
-    from email.utils import parsedate_to_datetime
-
     try:
         now = parsedate_to_datetime(answer["ResponseMetadata"]["HTTPHeaders"]["date"])
     except (KeyError, ValueError):

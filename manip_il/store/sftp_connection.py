@@ -141,8 +141,7 @@ class Connection:
             return NotFoundError(f"{what}: the folder is not there; check the name")
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return NoSpaceError(f"{what}: the disk is full; make room and try again")
-        refused = isinstance(error, NoValidConnectionsError)
-        if refused:
+        if isinstance(error, NoValidConnectionsError):
             return TransientError(f"{what}: no answer from {host}, port {self._url.port or 22}")
         if isinstance(error, ConnectionError | TimeoutError | EOFError | paramiko.SSHException) or (
             isinstance(error, OSError) and (error.errno in _CUT or "closed" in str(error).lower())

@@ -58,8 +58,8 @@ def test_the_picture_is_a_png_that_the_card_shows_by_a_relative_link():
 
 def test_the_drawn_paths_begin_and_end_where_the_cubes_do():
     paths = read_paths(SAMPLE)
-    assert len(paths.objects) == len(paths.goals) == 10
-    for rows, goal in zip(paths.objects, paths.goals, strict=True):
+    assert len(paths) == 10
+    for rows, goal in paths:
         assert np.linalg.norm(rows[-1] - goal) < 0.03  # every sample episode succeeds [m]
 
 
