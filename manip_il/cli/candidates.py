@@ -1,4 +1,4 @@
-"""What is compared: an evaluation, a policy, a DAgger run, or a folder with one of these for each training seed."""
+"""Candidates of a comparison: an evaluation, a policy, a DAgger run, or a folder of these by training seed."""
 
 from __future__ import annotations
 

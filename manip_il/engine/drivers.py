@@ -1,4 +1,4 @@
-"""Who drives a rollout: the expert, a learner, a mixture of both, or chance; and when the expert is queried.
+"""Drivers of a rollout: the expert, a learner, a mixture of both, or chance; and when the expert is queried.
 
 Query rules are written `kind:parameter`, as in `every`, `one`, `probability:0.1`, `safety:0.5`. Differences between
 actions are measured in longest steps (see `action_gap`), so that a bound means the same for every robot.

@@ -1,4 +1,4 @@
-"""What datasets, checkpoints and evaluations say of an environment and of the policy in it."""
+"""Descriptions of an environment, and of the policy in it, for datasets, checkpoints and evaluations."""
 
 from __future__ import annotations
 

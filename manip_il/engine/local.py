@@ -231,7 +231,7 @@ def _groups(proc: Path, cgroups: Path) -> Iterator[Path]:
 
 
 def _group_memory(group: Path) -> int | None:
-    """What a control group leaves [bytes]: its limit less what it holds, without the files that it only caches."""
+    """Return the memory that a control group leaves [bytes]: its limit less use; cached files do not count."""
     for limit_file, usage_file, prefix in (
         ("memory.max", "memory.current", ""),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),

@@ -132,7 +132,7 @@ def require_confidence(confidence: float) -> None:
 
 
 def _bisect(inside: Callable[[float], bool], within: float, outside: float) -> float:
-    """Where `inside` ends between a value that is inside and one that is not; neither is evaluated."""
+    """Find where `inside` ends between a value that is inside and one that is not; neither is evaluated."""
     for _ in range(60):  # halves the error each time: to the last bit
         middle = (within + outside) / 2
         within, outside = (middle, outside) if inside(middle) else (within, middle)

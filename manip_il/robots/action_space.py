@@ -1,4 +1,4 @@
-"""What an action of a robot means, number by number."""
+"""Meaning of a robot's action, number by number."""
 
 from __future__ import annotations
 

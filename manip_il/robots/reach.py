@@ -157,7 +157,7 @@ class _Body:
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
-    """How far from a pose with the hand down inverse kinematics ends, from home [m], and where the joints are then.
+    """Return how far from hand-down inverse kinematics ends, from home [m], and the joints there, (arm,) [rad].
 
     An angle counts as a length.
     """

@@ -1,4 +1,4 @@
-"""What happens to the world during an episode: knocks, noise on actions, and one perturbation at a given step.
+"""Events of an episode: knocks, noise on actions, and one perturbation at a given step.
 
 Functions that change the world do it in place, and draw from the generator that they are given.
 """

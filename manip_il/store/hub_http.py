@@ -34,7 +34,7 @@ _PIECE = 16 * 1024  # of a request that is sent between two looks at the clock [
 
 @dataclass
 class _Listing:
-    """What is left of one list: pages, and the time of its end."""
+    """Budget of one list: pages left, and the time of its end."""
 
     pages: int
     until: float
