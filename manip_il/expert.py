@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.ladder import angle_between
+from manip_il.tasks.grasp import angle_between
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Target
 
@@ -32,7 +32,7 @@ class Expert:
     def __init__(self, scene: Scene):
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
-        self._grasped, rungs = get_task(scene.task).grasped, get_task(scene.task).rungs
+        self._objects, rungs = get_task(scene.task).objects, get_task(scene.task).rungs
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
     def label(self, state: State) -> Label:
@@ -52,7 +52,7 @@ class Expert:
 
     def _unsound(self) -> str:
         world = self._world
-        for name in self._grasped:
+        for name in self._objects:
             position = world.pose(name).position.tolist()
             if position[2] < FALLEN:
                 return f"{name} off the table"

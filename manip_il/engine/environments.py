@@ -91,13 +91,13 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
 def positions(robot: str, task: str, sim_state: NDArray[np.float64]) -> dict[str, list[float]]:
     """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects and, where there is one, `goal`.
 
-    The first object that is grasped is called `object`.
+    The first of the task's objects is called `object`.
     """
     world, state = _world(robot, task), State.from_vector(sim_state)
     world.restore(state.physics, state.variation)
     found = {"hand": world.ee.position} | ({"goal": world.goal} if world.has_goal else {})
     for name in world.scene.objects:
-        found["object" if name in get_task(task).grasped[:1] else name] = world.pose(name).position
+        found["object" if name in get_task(task).objects[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 

@@ -17,13 +17,16 @@ class EnvConfig:
     robot: str = option("panda", "panda or fetch")
     task: str = option("pick_place", "reach, lift or pick_place")
     control_hz: int = option(20, "control steps a second")
-    tolerance: float = option(0.02, "distance to the goal that counts as success [m]")
-    success_steps: int = option(5, "consecutive control steps within the tolerance that count as success")
-    horizon: int = option(100, "control steps in an episode")
+    tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
+    success_steps: int = option(
+        0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
+    )
+    horizon: int = option(0, "control steps in an episode; 0: the task's own")
 
     def __post_init__(self) -> None:
         from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
 
+        self._take_limits()
         if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
             raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
         if not 0 < self.tolerance < 1:
@@ -32,6 +35,16 @@ class EnvConfig:
             raise UsageError(f"horizon is {self.horizon}; expected at most {LONGEST_EPISODE} control steps")
         if self.success_steps < 1 or self.horizon < self.success_steps:
             raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
+
+    def _take_limits(self) -> None:
+        """Take from the task what is not given."""
+        if self.tolerance and self.success_steps and self.horizon:
+            return
+        from manip_il.tasks.table import get_task  # here, as help needs no simulator
+
+        limits = get_task(self.task).limits
+        for name in ("tolerance", "success_steps", "horizon"):
+            object.__setattr__(self, name, getattr(self, name) or getattr(limits, name))
 
     @property
     def physics_steps(self) -> int:

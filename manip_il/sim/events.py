@@ -69,15 +69,15 @@ def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> bool:
-    """Move the first object that is grasped sideways by a drawn distance [m], at rest, to where the arm reaches it.
+    """Move the first of the task's objects sideways by a drawn distance [m], at rest, to where the arm reaches it.
 
     height: how far up it is moved [m]; above 0 it is turned at random, too, and falls. Draws in which it would stand
     inside something else are drawn again; returns whether there was an object and such a place.
     """
-    grasped = get_task(world.scene.task).grasped
-    if not grasped:
+    objects = get_task(world.scene.task).objects
+    if not objects:
         return False
-    name = grasped[0]
+    name = objects[0]
     one = world.scene.objects[name]
     start, half = world.data.qpos[one.q : one.q + 7].copy(), world.extents(name)[2] / 2
     for _ in range(_MAX_DRAWS):
@@ -141,7 +141,7 @@ KINDS: dict[str, Kind] = {
 
 def kinds_for(task: Task) -> dict[str, Kind]:
     """Return the entries of `KINDS` that mean something in a task: without an object, nor does the gripper matter."""
-    return {name: kind for name, kind in KINDS.items() if task.grasped or not kind.needs_object}
+    return {name: kind for name, kind in KINDS.items() if task.objects or not kind.needs_object}
 
 
 class Perturbation(Condition):

@@ -195,6 +195,10 @@ class World:
             self._extents[name] = tuple(variations.extents(kind, size).tolist())
         return self._extents[name]
 
+    def kind(self, name: str) -> int:
+        """Return MuJoCo's geom type of an object."""
+        return int(self.model.geom_type[self.scene.objects[name].geom])
+
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""
         geoms = (self.scene.objects[name].geom,)

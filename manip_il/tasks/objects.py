@@ -1,8 +1,12 @@
-"""Objects that tasks share: cubes, and the marker of a goal."""
+"""What tasks put on the table: free objects, furniture, and the markers of goals."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import mujoco
+import numpy as np
 
 from manip_il.sim.world import GOAL
 
@@ -10,32 +14,72 @@ CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
 FRICTION = 1.0  # sliding, against anything
 RED = (0.86, 0.24, 0.16)
+BLUE = (0.16, 0.40, 0.80)
+YELLOW = (0.93, 0.72, 0.16)
+WOOD = (0.72, 0.58, 0.42)
+GREY = (0.45, 0.47, 0.50)
 _GREEN = (0.12, 0.72, 0.35, 0.55)
+SHAPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
 
 
 def add_cube(
     spec: mujoco.MjSpec, name: str, half: float = CUBE_HALF, mass: float = CUBE_MASS, colour: tuple[float, ...] = RED
 ) -> None:
     """Add a cube that lies free: half its edge [m], its mass [kg], its red, green and blue."""
+    add_object(spec, name, "box", [half] * 3, mass, colour)
+
+
+def add_object(
+    spec: mujoco.MjSpec, name: str, shape: str, size: Sequence[float], mass: float, colour: tuple[float, ...]
+) -> None:
+    """Add an object that lies free. shape: of `SHAPES`; size: MuJoCo's for it [m]; mass [kg]; red, green and blue."""
     material = spec.add_material(name=name, rgba=[*colour, 1], specular=0.3, shininess=0.5)
-    body = spec.worldbody.add_body(name=name, pos=[0.5, 0, half])
+    body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
     body.add_freejoint(name=name)
+    rolls = shape != "box"
     body.add_geom(
         name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[half] * 3,
+        type=SHAPES[shape],
+        size=[*size, *[0.0] * (3 - len(size))],
         mass=mass,
         material=material.name,
-        condim=4,
-        friction=[FRICTION, 0.02, 0.0001],
+        condim=6 if rolls else 4,
+        friction=[FRICTION, 0.02, 0.001 if rolls else 0.0001],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
         solref=[0.01, 1],
     )
 
 
-def add_goal(spec: mujoco.MjSpec) -> None:
-    """Add a marker without contacts; a mocap body, so that lockstep environments can share one model."""
+def add_furniture(spec: mujoco.MjSpec, name: str) -> Any:
+    """Add a mocap body that parts with contacts can be put on; a scene's start places it. Returns the body."""
+    return spec.worldbody.add_body(name=name, mocap=True, pos=[0.5, 0, 0])
+
+
+def add_part(body: Any, name: str, half: Sequence[float], at: Sequence[float], colour: tuple[float, ...]) -> None:
+    """Add a box that things touch to a body: half its lengths [m], its middle in the body's frame [m]."""
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=list(half),
+        pos=list(at),
+        rgba=[*colour, 1],
+        friction=[0.6, 0.005, 0.0001],
+        mass=1000 * 8 * float(np.prod(half)),
+    )
+
+
+def add_goal(spec: mujoco.MjSpec, *, flat: bool = False) -> None:
+    """Add a marker without contacts; a mocap body, so that lockstep environments can share one model.
+
+    flat: a disc on the table, not a ball in the air.
+    """
     material = spec.add_material(name=GOAL, rgba=list(_GREEN), specular=0.0, emission=0.4)
     body = spec.worldbody.add_body(name=GOAL, mocap=True, pos=[0.5, 0, 0.2])
-    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    body.add_geom(name=GOAL, type=sphere, size=[0.02, 0, 0], material=material.name, contype=0, conaffinity=0, mass=0)
+    shape = mujoco.mjtGeom.mjGEOM_CYLINDER if flat else mujoco.mjtGeom.mjGEOM_SPHERE
+    size = [0.03, 0.001, 0] if flat else [0.02, 0, 0]
+    body.add_geom(name=GOAL, type=shape, size=size, material=material.name, contype=0, conaffinity=0, mass=0)

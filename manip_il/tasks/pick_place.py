@@ -9,11 +9,12 @@ import mujoco
 import numpy as np
 
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.ladder import cube_yaw, pick_progress, pick_rungs
+from manip_il.tasks.grasp import lie_of
+from manip_il.tasks.ladder import pick_progress, pick_rungs
 from manip_il.tasks.objects import add_cube, add_goal
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_resting, draw_yaw, resting_height
-from manip_il.tasks.task import Observed, Rung, Start
+from manip_il.tasks.task import Limits, Observed, Rung, Start
 
 OBJECT = "object"
 
@@ -24,6 +25,8 @@ class PickPlace:
 
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
+    limits: Limits = Limits()
+    objects: tuple[str, ...] = (OBJECT,)
     grasped: tuple[str, ...] = (OBJECT,)
     rungs: tuple[Rung, ...] = pick_rungs(OBJECT)
 
@@ -53,16 +56,19 @@ class PickPlace:
 
 def observe_cube(world: World, name: str) -> Observed:
     """Return `environment_state` of a task with one cube and a goal for it."""
-    pose, ee, goal = world.pose(name), world.ee.position, world.goal
-    yaw, tilt = cube_yaw(pose.rotation)
+    goal = world.goal
+    way = goal - world.pose(name).position
+    return {**observe_hand(world), "goal": goal, **observe_object(world, name), f"goal_from_{name}": way}
+
+
+def observe_object(world: World, name: str) -> Observed:
+    """Return an object's position, yaw modulo its symmetry, tilt and width, and the way to it from the hand."""
+    position, lie = world.pose(name).position, lie_of(world, name)
     return {
-        **observe_hand(world),
-        "goal": goal,
-        name: pose.position,
-        f"{name}.cos4yaw": math.cos(4 * yaw),
-        f"{name}.sin4yaw": math.sin(4 * yaw),
-        f"{name}.tilt": tilt,
+        name: position,
+        f"{name}.cos4yaw": math.cos(4 * lie.yaw),
+        f"{name}.sin4yaw": math.sin(4 * lie.yaw),
+        f"{name}.tilt": lie.tilt,
         f"{name}.width": world.extents(name)[0],
-        f"{name}_from_ee": pose.position - ee,
-        f"goal_from_{name}": goal - pose.position,
+        f"{name}_from_ee": position - world.ee.position,
     }

@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.ladder import AT_GOAL, CLOSED, hand_down, nearness
+from manip_il.tasks.grasp import hand_down
+from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
 from manip_il.tasks.starts import UPRIGHT, draw_goal
-from manip_il.tasks.task import Observed, Rung, Start, Target
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 
 def _to_goal(world: World) -> Target:
@@ -31,6 +32,8 @@ class ReachGoal:
 
     name: str = "reach"
     instruction: str = "Move the hand to the green goal."
+    limits: Limits = Limits()
+    objects: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
     rungs: tuple[Rung, ...] = _RUNGS
 

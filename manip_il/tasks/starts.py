@@ -20,7 +20,12 @@ _MOST_DRAWS = 1_000
 
 def draw_resting(rng: np.random.Generator, world: World, name: str) -> F64:
     """Draw where an object's centre rests on the table, (3,) [m], not under the hand."""
-    centre, height = np.array(world.scene.robot.workspace.centre), resting_height(world, name)
+    return draw_resting_place(rng, world, name, resting_height(world, name))
+
+
+def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float) -> F64:
+    """Draw a place on the table, (3,) [m], where the hand reaches to a height [m] and does not begin."""
+    centre = np.array(world.scene.robot.workspace.centre)
 
     def draw() -> F64:
         return np.append(_xy(rng, world), height)

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from manip_il.errors import UnknownName
+from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.lift import Lift
 from manip_il.tasks.pick_place import PickPlace
+from manip_il.tasks.press import Press
+from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.stack import Stack
 from manip_il.tasks.task import Task
 
 TASKS: dict[str, Task] = {
     "reach": ReachGoal(),
     "lift": Lift(),
     "pick_place": PickPlace(),
+    "push": Push(),
+    "press": Press(),
+    "stack": Stack(),
+    "drawer": Drawer(),
 }
 
 

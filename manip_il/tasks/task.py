@@ -46,11 +46,21 @@ class Start:
     poses: Mapping[str, tuple[F64, F64]]
 
 
+@dataclass(frozen=True)
+class Limits:
+    """Limits of an episode. tolerance: error that counts as success [m]; success_steps, horizon: [control steps]."""
+
+    tolerance: float = 0.02
+    success_steps: int = 5
+    horizon: int = 100
+
+
 class Task(Protocol):
     """A task, for every arm that can do it.
 
-    grasped: objects that the gripper must go around. rungs: latest first, the last one holding everywhere; each is a
-    function of the world alone, so that the expert can label any state.
+    objects: what the arm moves and must reach, the first being what events move. grasped: those of them that the gripper
+    must go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that
+    the expert can label any state.
     """
 
     @property
@@ -61,6 +71,16 @@ class Task(Protocol):
     @property
     def instruction(self) -> str:
         """Text for policies that read language."""
+        ...
+
+    @property
+    def limits(self) -> Limits:
+        """What solves an episode and how long it may take, unless an environment's settings say otherwise."""
+        ...
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Objects that the arm moves."""
         ...
 
     @property

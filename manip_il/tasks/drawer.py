@@ -1,0 +1,252 @@
+"""Drawer: open it by its handle, put the object in, close it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
+from manip_il.tasks.ladder import CLOSED, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.objects import GREY, RED, WOOD, add_cube, add_furniture, add_part
+from manip_il.tasks.pick_place import OBJECT, observe_object
+from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
+HALF = 0.02  # of the cube's edge [m]
+# The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
+GAP = 0.056  # of the handle's middle from the drawer's front [m]
+INSIDE = (0.05, 0.06)  # half the drawer's inner length and width [m]
+WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height of walls, floor, front; half a wall [m]
+ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
+MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
+BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
+OPEN, OPEN_ENOUGH, SHUT = 0.125, 0.105, 0.008  # how far the drawer is pulled, may be for the object to go in, is shut [m]
+FINGERS = 0.045  # opening of the fingers around the handle [m]
+SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
+HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
+AROUND = (0.024, 0.03, 0.018, 0.25)  # of the hand off the handle while it moves it: x, y, z [m], angle [rad]
+HOVER, SLOPE = 0.08, 2.0  # of the hand over the handle on its way there [m]; height gained per distance from it
+BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.055  # of the object from the closed drawer's handle at the start [m]
+DROP = 0.018  # of the object over the drawer's floor where it is let go [m]
+OVER = 0.13  # of the hand over the object on its way to it [m]
+LIFT, LIFT_SLOPE, FREE = 0.10, 2.5, 0.012  # of the carried object over that; per distance; distance without [m]
+_STEP = 0.04  # how far ahead of the hand its target runs while it moves drawer or object [m]
+
+
+def pulled(world: World) -> float:
+    """Return how far the drawer is open [m]."""
+    return float(world.pose(CABINET).position[0] - world.pose(TRAY).position[0])
+
+
+def is_inside(world: World) -> bool:
+    """Return whether the object is in the drawer."""
+    x, y, z = (world.pose(OBJECT).position - _middle(world)).tolist()
+    return abs(x) < INSIDE[0] and abs(y) < INSIDE[1] and z < WALL + 0.01
+
+
+def _middle(world: World) -> F64:
+    """Middle of the drawer's floor, (3,)."""
+    return world.pose(TRAY).position + [MIDDLE, 0.0, FLOOR]
+
+
+def _bar(world: World) -> F64:
+    return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
+
+
+def _yaw(world: World) -> float:
+    """Yaw of a hand whose fingers close along the drawer's way: of two, the nearer one [rad]."""
+    x = world.ee.rotation[:, 0]
+    at, quarter = math.atan2(x[1], x[0]), math.pi / 2
+    return min((quarter, -quarter), key=lambda turn: (abs(turn - at), turn))
+
+
+def _at_bar(world: World) -> bool:
+    x, y, z = (world.ee.position - _bar(world)).tolist()
+    most_x, most_y, most_z, most_angle = AROUND
+    return (
+        abs(x) < most_x
+        and abs(y) < most_y
+        and abs(z) < most_z
+        and angle_from_down(world.ee.rotation, _yaw(world)) < most_angle
+        and world.opening < FINGERS + 0.012
+    )
+
+
+def _to_bar(world: World) -> Target:
+    """Over the handle and down around it; straight up if too low beside it."""
+    ee, bar, yaw = world.ee, _bar(world), _yaw(world)
+    off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
+    height = min(HOVER, SLOPE * max(0.0, off - 0.006))
+    if abs(world.opening - FINGERS) > 0.012:
+        height = max(height, 0.05)
+    sideways = min(1.0, max(0.0, 1.0 - (bar[2] + height - ee.position[2]) / 0.03))
+    position = np.append(ee.position[:2] + sideways * (bar - ee.position)[:2], bar[2] + height)
+    return Target(position, hand_down(yaw), FINGERS)
+
+
+def _move_drawer(world: World, to: float) -> Target:
+    """Move the drawer by its handle until it is open so far [m]."""
+    way = pulled(world) - to
+    step = way + math.copysign(SLACK, way)
+    return Target(_bar(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
+
+
+def _is_shut(world: World) -> bool:
+    return pulled(world) < SHUT
+
+
+def _is_open(world: World) -> bool:
+    return pulled(world) > (OPEN - 0.01 if _at_bar(world) else OPEN_ENOUGH)
+
+
+def _hand_is_in(world: World) -> bool:
+    """Whether the hand is at the object."""
+    x, y, z = (world.ee.position - world.pose(OBJECT).position).tolist()
+    return math.hypot(x, y) < 0.06 and z < 0.09
+
+
+def _up(world: World) -> Target:
+    """Open the fingers about the object, then rise."""
+    ee, g = world.ee, grasp_of(world, OBJECT)
+    free = world.opening > g.width + 0.012 and not world.touched(OBJECT)
+    yaw = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
+    up = ee.position[2] + (0.1 if free else 0.0)
+    return Target(np.array([*ee.position[:2], up]), hand_down(yaw), g.width + 0.025)
+
+
+def _carry(world: World) -> Target:
+    """Lift the object, move it over the drawer and lower it."""
+    at = world.pose(OBJECT).position
+    way = _middle(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP] - at
+    off = math.hypot(way[0], way[1])
+    missing = way[2] + min(LIFT, LIFT_SLOPE * max(0.0, off - FREE))
+    sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) if off > FREE else 1.0
+    step = np.array([sideways * way[0], sideways * way[1], missing])
+    return Target(world.ee.position + step, hand_down(0.0), CLOSED, max_step=0.06)
+
+
+def _is_low_at_bar(world: World) -> bool:
+    x, y, z = (world.ee.position - _bar(world)).tolist()
+    return abs(x) < 0.045 and abs(y) < 0.07 and z < 0.05
+
+
+def _rise(world: World) -> Target:
+    ee = world.ee.position
+    return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), FINGERS)
+
+
+def _put_down(world: World) -> Target:
+    """Lower the object to the table, then open the fingers."""
+    low = world.pose(OBJECT).position[2] - lie_of(world, OBJECT).tall / 2
+    ee = world.ee.position
+    to = np.array([*ee[:2], ee[2] - max(0.0, low)])
+    return Target(to, hand_down(0.0), CLOSED if low > 0.008 else world.most_opening)
+
+
+_RUNGS = (
+    Rung("done", "the object is in the drawer, and it is shut", lambda w: is_inside(w) and _is_shut(w), _to_bar),
+    Rung("let_go", "the object is in the drawer, and the hand lets go of it", lambda w: is_inside(w) and _hand_is_in(w), _up),
+    Rung("push", "the object is in the drawer, and the hand pushes it shut",
+         lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+    Rung("to_push", "the object is in the drawer, and the hand goes to the handle", is_inside, _to_bar),
+    Rung("carry", "the object is in the hand, on its way to the open drawer", lambda w: held(w, OBJECT) and _is_open(w), _carry),
+    Rung("put_down", "the object is in the hand, and the drawer is not open", lambda w: held(w, OBJECT), _put_down),
+    Rung("pull", "the hand is at the handle and pulls the drawer open",
+         lambda w: not _is_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
+    Rung("to_pull", "the drawer is not open, and the hand goes to the handle", lambda w: not _is_open(w), _to_bar),
+    Rung("leave", "the drawer is open, and the hand rises from the handle", _is_low_at_bar, _rise),
+    *grasp_rungs(lambda w: OBJECT, OVER),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Drawer:
+    """Open a drawer, put a cube in it, close it."""
+
+    name: str = "drawer"
+    instruction: str = "Put the red cube in the drawer and close it."
+    limits: Limits = Limits(tolerance=SHUT, horizon=250)
+    objects: tuple[str, ...] = (OBJECT,)
+    grasped: tuple[str, ...] = (OBJECT,)
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the cube, and a cabinet with a drawer."""
+        add_cube(spec, OBJECT, HALF)
+        cabinet = add_furniture(spec, CABINET)
+        front = GAP + 2 * THIN  # where the drawer's inside begins
+        length, width = INSIDE
+        deep, wide = length + 2 * THIN, width + 3 * THIN  # of the cabinet, half
+        back = front + 2 * deep
+        for side, sign in (("left", 1), ("right", -1)):
+            add_part(cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD)
+        add_part(cabinet, "cabinet back", (THIN, wide + 2 * THIN, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
+        add_part(cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
+        tray = cabinet.add_body(name=TRAY)
+        tray.add_joint(
+            name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN + 0.01],
+            damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
+        )  # fmt: skip
+        middle = front + length
+        add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
+        for side, sign in (("left", 1), ("right", -1)):
+            add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, sign * (width + THIN), WALL / 2), WOOD)
+        add_part(tray, "drawer back", (THIN, width, WALL / 2), (front + 2 * length + THIN, 0, WALL / 2), WOOD)
+        add_part(tray, "drawer front", (THIN, wide + 2 * THIN, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
+        add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
+        for side, sign in (("left", 1), ("right", -1)):
+            add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, sign * BAR_LENGTH, BAR_Z), GREY)
+        spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any yaw."""
+        x, y = world.scene.robot.workspace.centre
+        side = rng.choice([-1.0, 1.0])
+        cabinet = np.array([x + rng.uniform(0.01, 0.05), y + side * rng.uniform(0.05, 0.10), 0.0])
+
+        def fits(at: F64) -> bool:
+            return at[0] < cabinet[0] + BESIDE_X and abs(at[1] - cabinet[1]) > BESIDE_Y
+
+        at = draw_until(lambda: draw_resting(rng, world, OBJECT), fits, world, OBJECT)
+        return Start({OBJECT: (at, draw_yaw(rng)), CABINET: (cabinet, UPRIGHT)})
+
+    def observe(self, world: World) -> Observed:
+        """Return hand, cube and handle, how far the drawer is open, and the ways between them."""
+        ee, bar, cube = world.ee.position, _bar(world), world.pose(OBJECT).position
+        return {
+            **observe_hand(world),
+            **observe_object(world, OBJECT),
+            BAR: bar,
+            "drawer.open": pulled(world),
+            "handle_from_ee": bar - ee,
+            "drawer_from_object": _middle(world) - cube,
+        }
+
+    def error(self, world: World) -> float:
+        """Return how far the drawer is open [m], and as much more as the object is from its inside."""
+        missing = 0.0 if is_inside(world) else math.dist(world.pose(OBJECT).position, _middle(world))
+        return max(0.0, pulled(world)) + missing
+
+    def progress(self, world: World) -> float:
+        """Return progress of opening, putting in and closing."""
+        opened = min(1.0, max(0.0, pulled(world) / OPEN))
+        if is_inside(world):
+            if _is_shut(world):
+                return 1.0
+            if _hand_is_in(world):
+                return 0.75
+            return 0.8 + 0.05 * nearness(math.dist(world.ee.position, _bar(world))) + 0.15 * (1 - opened)
+        if held(world, OBJECT) and _is_open(world):
+            return 0.5 + 0.25 * nearness(math.dist(world.pose(OBJECT).position, _middle(world)))
+        if _is_open(world):
+            return 0.3 + 0.2 * grasp_progress(world, OBJECT)
+        return 0.1 * nearness(math.dist(world.ee.position, _bar(world))) + 0.2 * opened

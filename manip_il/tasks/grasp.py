@@ -1,0 +1,179 @@
+"""How an object lies, and where a hand that points down grasps it, by the symmetry of its shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+
+F64 = NDArray[np.float64]
+
+HOVER = 0.055  # of the hand over the object's top while it is not above it [m]
+FUNNEL_RADIUS = 0.010  # misalignment at which the hand may be all the way down [m]
+FUNNEL_SLOPE = 2.0  # height the hand gains per misalignment beyond it
+ANGLE_AS_LENGTH = 0.05  # how much misalignment a radian of wrong orientation counts for [m/rad]
+ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
+TIGHT = 0.35  # share of the room beside an object that fills the hand which misalignment may take
+LOWEST_EE = 0.021  # of the ee site over the table: the fingertips just clear it [m]
+DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
+OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may descend, where there is so much [m]
+OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
+PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
+WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a metre narrower [rad/m]
+_LEAST_ROOM = 0.002  # of an open gripper around an object [m]
+_QUARTER = math.pi / 2
+
+
+class Lie(NamedTuple):
+    """How an object lies.
+
+    grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
+    for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how
+    many of its yaws look alike, 0 for all.
+    """
+
+    grasps: tuple[tuple[float, float, float], ...]
+    tall: float
+    tilt: float
+    folds: int
+
+    @property
+    def yaw(self) -> float:
+        """Yaw of the first grasp [rad]."""
+        return self.grasps[0][0]
+
+
+class Grasp(NamedTuple):
+    """An object as the hand sees it.
+
+    offset: its centre in the `ee` frame [m]. width, length, half: of it between the fingers, across them, and half its
+    height [m]. tilt: off the nearest face [rad]. yaw: of a hand that points down to grasp it; angle: how far the hand
+    is from that [rad].
+    at: where `ee` grasps it [m]. open_enough: the fingers pass on both sides of it. off: how far the hand is from being
+    over it, with its angle [m]. funnel: how high over the object it must be for that [m]; height: the same, but no
+    higher than to clear its top.
+    """
+
+    offset: tuple[float, float, float]
+    width: float
+    length: float
+    half: float
+    tilt: float
+    yaw: float
+    angle: float
+    at: tuple[float, float, float]
+    open_enough: bool
+    off: float
+    height: float
+    funnel: float
+
+
+def grasp_of(world: World, name: str) -> Grasp:
+    """Return the pose of an object relative to the hand; computed once a state."""
+    return world.remember(("grasp", name), partial(_grasp, world, name))
+
+
+def lie_of(world: World, name: str) -> Lie:
+    """Return how an object lies; computed once a state."""
+    return world.remember(("lie", name), lambda: _lie(world.kind(name), world.pose(name).rotation, world.extents(name)))
+
+
+def _grasp(world: World, name: str) -> Grasp:
+    ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
+    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM)
+    angle = angle_from_down(ee.rotation, yaw)
+    x, y, z = position.tolist()
+    ee_x, ee_y, ee_z = ee.position.tolist()
+    dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
+    room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
+    free = min(ANGLE_FREE, TIGHT * room / width)
+    off = math.hypot(dx, dy) + ANGLE_AS_LENGTH * max(0.0, angle - free)
+    funnel = FUNNEL_SLOPE * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
+    half = lie.tall / 2
+    return Grasp(
+        offset=tuple(a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()),
+        width=width,
+        length=length,
+        half=half,
+        tilt=lie.tilt,
+        yaw=yaw,
+        angle=angle,
+        at=(x, y, max(z, LOWEST_EE, z + half - DEEPEST)),
+        open_enough=world.opening >= width + min(OPEN_SLACK, OPEN_SHARE * room),
+        off=off,
+        height=min(half + HOVER, funnel),
+        funnel=funnel,
+    )
+
+
+def _nearest(grasps: Sequence[tuple[float, float, float]], hand: F64, widest: float) -> tuple[float, float, float]:
+    """The grasp whose yaw is nearest to the hand's, with a small preference for 0 and for a narrow one.
+
+    hand: rotation of `ee`, (3, 3). Nearest to the hand, not to zero: a learner that averages both sides of the boundary
+    between two grasps then leaves it by any turn, and does not stand still in the middle. widest: what the fingers go
+    around [m].
+    """
+    at = math.atan2(hand[1, 0], hand[0, 0])
+    narrowest = min(width for _, width, _ in grasps)
+    fitting = [grasp for grasp in grasps if grasp[1] <= max(widest, narrowest)]
+    return min(
+        fitting,
+        key=lambda g: (abs(g[0] - at) + PREFER_ZERO * abs(g[0]) + WIDTH_AS_ANGLE * (g[1] - narrowest), g[0]),
+    )
+
+
+def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
+    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
+        return _box_lie(rotation, extents)
+    width, _, length = extents
+    if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
+        return Lie(((0.0, width, width),), width, 0.0, 0)
+    ahead, left, up = rotation[:, 2].tolist()
+    if abs(up) > math.sqrt(0.5):
+        return Lie(((0.0, width, width),), length, math.acos(min(1.0, abs(up))), 0)
+    yaw = math.atan2(left, ahead)
+    yaw -= math.pi * round(yaw / math.pi)
+    grasps = tuple((yaw + turn, width, length) for turn in (0.0, -math.pi, math.pi))
+    return Lie(grasps, width, math.asin(abs(up)), 2)
+
+
+def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
+    """A box lies on one of its faces, and its yaw is that of the side most along x or y, modulo a quarter turn."""
+    ahead, left, vertical = rotation.tolist()
+    heights = [abs(height) for height in vertical]
+    up = heights.index(max(heights))
+    side, other = (up + 1) % 3, (up + 2) % 3
+    yaw = math.atan2(left[side], ahead[side])
+    quarters = round(yaw / _QUARTER)
+    yaw -= _QUARTER * quarters
+    length, width = extents[side], extents[other]
+    if quarters % 2:
+        length, width = width, length
+    grasps = ((yaw, width, length), (yaw - _QUARTER, length, width), (yaw + _QUARTER, length, width))
+    folds = 4 if length == width else 2
+    return Lie(grasps, extents[up], math.acos(min(1.0, heights[up])), folds)
+
+
+def hand_down(yaw: float) -> F64:
+    """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def angle_from_down(rotation: F64, yaw: float) -> float:
+    """Return `angle_between` a rotation (3, 3) and `hand_down(yaw)` [rad]."""
+    (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
+    trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
+    return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))
+
+
+def angle_between(a: F64, b: F64) -> float:
+    """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
+    return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))

@@ -1,0 +1,114 @@
+"""Press: a button that stands anywhere on the table, to its stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+from manip_il.tasks.grasp import hand_down
+from manip_il.tasks.ladder import CLOSED, nearness
+from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
+from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.starts import draw_resting_place, draw_yaw
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+BUTTON, CAP = "button", "cap"
+TRAVEL = 0.015  # of the cap [m]
+CAP_RADIUS = 0.025  # [m]
+TOP = 0.055  # of the cap that is not pressed, over the table [m]
+STOPPED = 0.002  # of the cap from its stop: pressed [m]
+TIP = 0.02  # of the fingertips beyond `ee` [m]
+OVER = 0.012  # of the hand off the button's middle while it presses [m]
+DEEPER = 0.012  # how far beyond the stop the hand aims, so that it presses [m]
+HOVER, SLOPE = 0.08, 2.0  # of the hand over the cap while it is not above it [m]; height gained per distance from it
+_STIFF, _DAMPED = 150.0, 4.0  # of the spring [N/m], [N s/m]
+
+
+def pressed(world: World) -> float:
+    """Return how far the cap is down [m]."""
+    return min(TRAVEL, max(0.0, TOP - float(world.pose(CAP).position[2])))
+
+
+def _off(world: World) -> float:
+    """How far the hand is from over the button, sideways [m]."""
+    x, y = (world.ee.position - world.pose(BUTTON).position)[:2].tolist()
+    return math.hypot(x, y)
+
+
+def _aim(world: World) -> Target:
+    """Go over the button, the nearer the lower, and through its stop once over it."""
+    ee, off = world.ee.position, _off(world)
+    to = world.pose(BUTTON).position[:2]
+    height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER
+    height += TOP + TIP
+    sideways = min(1.0, max(0.0, 1.0 - (height - ee[2]) / 0.03))
+    return Target(np.append(ee[:2] + sideways * (to - ee[:2]), height), hand_down(0.0), CLOSED)
+
+
+def _is_down(world: World) -> bool:
+    return TRAVEL - pressed(world) < STOPPED
+
+
+_RUNGS = (
+    Rung("pressed", "the button is at its stop", _is_down, _aim),
+    Rung("press", "the hand is over the button and presses it", lambda w: _off(w) < OVER, _aim),
+    Rung("approach", "the hand is on its way to over the button", lambda w: True, _aim),
+)
+
+
+@dataclass(frozen=True)
+class Press:
+    """Press a button to its stop against its spring, and keep it there for a moment."""
+
+    name: str = "press"
+    instruction: str = "Press the red button."
+    limits: Limits = Limits(tolerance=STOPPED)
+    objects: tuple[str, ...] = ()
+    grasped: tuple[str, ...] = ()
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the button: a housing, and a cap on a spring."""
+        button = add_furniture(spec, BUTTON)
+        half = (TOP - TRAVEL - 0.005) / 2
+        add_part(button, BUTTON, (0.04, 0.04, half), (0, 0, half), GREY)
+        cap = button.add_body(name=CAP, pos=[0, 0, TOP])
+        cap.add_joint(
+            name=CAP, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1], limited=True, range=[0, TRAVEL],
+            stiffness=[_STIFF, 0, 0], damping=[_DAMPED, 0, 0], armature=0.01,
+        )  # fmt: skip
+        cap.add_geom(
+            name=CAP, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[CAP_RADIUS, 0.01, 0], pos=[0, 0, -0.01],
+            rgba=[*RED, 1], mass=0.05,
+        )  # fmt: skip
+        spec.add_exclude(bodyname1=BUTTON, bodyname2=CAP)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw where the button stands, not under the hand, and its yaw."""
+        at = draw_resting_place(rng, world, BUTTON, TOP)
+        return Start({BUTTON: (np.append(at[:2], 0.0), draw_yaw(rng))})
+
+    def observe(self, world: World) -> Observed:
+        """Return the hand, the middle of the cap's top, and the way to it."""
+        cap = world.pose(CAP).position
+        return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
+
+    def error(self, world: World) -> float:
+        """Return how far the cap is from its stop [m]."""
+        return TRAVEL - pressed(world)
+
+    def progress(self, world: World) -> float:
+        """Return progress of getting over the button and pressing it."""
+        if pressed(world) > STOPPED and _off(world) < OVER:
+            return 0.7 + 0.3 * pressed(world) / TRAVEL
+        off = _off(world)
+        above = max(0.0, float(world.ee.position[2]) - TOP - TIP)
+        height = min(HOVER, SLOPE * max(0.0, off - OVER))
+        return 0.7 * nearness(off + abs(above - height) + height)
