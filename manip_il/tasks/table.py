@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from manip_il.errors import UnknownName
+from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.lift import Lift
 from manip_il.tasks.pick_place import PickPlace
@@ -20,6 +21,7 @@ TASKS: dict[str, Task] = {
     "press": Press(),
     "stack": Stack(),
     "drawer": Drawer(),
+    "clear_table": ClearTable(),
 }
 
 

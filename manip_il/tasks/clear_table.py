@@ -1,0 +1,135 @@
+"""Clear the table: four objects into a box."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
+from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
+from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
+from manip_il.tasks.pick_place import observe_object
+from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW, "white": (0.92, 0.92, 0.90)}
+BOX = "box"
+INSIDE = (0.075, 0.075)  # half the box's inner length and width [m]
+HALF = 0.018  # of a cube's edge [m]
+SLOT = 0.032  # of where a cube is let go from the box's middle, along each side [m]
+SIDE = 0.235  # of the box's middle from the workspace's, left or right [m]
+APART = 0.08  # of the cubes at the start [m]
+FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
+
+
+def _inside(world: World, name: str) -> bool:
+    return is_in(world, name, BOX, INSIDE)
+
+
+def current(world: World) -> str:
+    """Return the cube that is in the hand, else the first that is not in the box; the last where all are."""
+    return world.remember("current", lambda: _current(world))
+
+
+def _current(world: World) -> str:
+    left = [name for name in COLOURS if not _inside(world, name)]
+    return next((name for name in left if held(world, name)), left[0] if left else list(COLOURS)[-1])
+
+
+def _to(world: World) -> F64:
+    """Where the current cube is let go: over a quarter of the box of its own."""
+    name = current(world)
+    slot = list(COLOURS).index(name)
+    return drop_place(world, name, BOX, (SLOT * (1 if slot % 2 else -1), SLOT * (1 if slot // 2 else -1)))
+
+
+def _all_in(world: World) -> bool:
+    return all(_inside(world, name) for name in COLOURS)
+
+
+def _rise(world: World) -> Target:
+    """Stand over the box."""
+    from manip_il.tasks.grasp import hand_down
+
+    return Target(world.pose(BOX).position + [0.0, 0.0, 0.2], hand_down(0.0), world.most_opening)
+
+
+_LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))
+_RUNGS = (
+    _LET_GO,
+    Rung("done", "all cubes are in the box", _all_in, _rise),
+    _CARRY,
+    *grasp_rungs(current, OVER),
+)
+
+
+@dataclass(frozen=True)
+class ClearTable:
+    """Put all cubes from the table into the box."""
+
+    name: str = "clear_table"
+    instruction: str = "Put all cubes into the box."
+    limits: Limits = Limits(tolerance=0.005, horizon=400)
+    objects: tuple[str, ...] = tuple(COLOURS)
+    grasped: tuple[str, ...] = tuple(COLOURS)
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the cubes and the box."""
+        for name, colour in COLOURS.items():
+            add_cube(spec, name, HALF, 0.05, colour)
+        add_bin(spec, BOX, INSIDE, WOOD)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw on which side the box stands, and the cubes on the table, apart, at any yaw."""
+        x, y = world.scene.robot.workspace.centre
+        box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
+        poses: dict[str, tuple[F64, F64]] = {BOX: (box, UPRIGHT)}
+        for name in COLOURS:
+            others = [poses[other][0] for other in COLOURS if other in poses]
+
+            def fits(at: F64, others: list[F64] = others) -> bool:
+                return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
+
+            poses[name] = draw_until(lambda name=name: draw_resting(rng, world, name), fits, world, name), draw_yaw(rng)
+        return Start(poses)
+
+    def observe(self, world: World) -> Observed:
+        """Return hand, box, every cube and whether it is in the box, and the ways of the next one."""
+        cubes: dict[str, F64 | float] = {}
+        for name in COLOURS:
+            cubes |= observe_object(world, name)
+            cubes[f"{name}.in_box"] = float(_inside(world, name))
+        at = world.pose(current(world)).position
+        return {
+            **observe_hand(world),
+            BOX: world.pose(BOX).position,
+            **cubes,
+            "next_from_ee": at - world.ee.position,
+            "place_from_next": _to(world) - at,
+        }
+
+    def error(self, world: World) -> float:
+        """Return how far the cubes that are not in the box are from its middle, together [m]."""
+        at = world.pose(BOX).position
+        return sum(math.dist(world.pose(name).position, at) for name in COLOURS if not _inside(world, name))
+
+    def progress(self, world: World) -> float:
+        """Return progress by the cubes in the box, and of the next one."""
+        done = sum(_inside(world, name) for name in COLOURS)
+        if done == len(COLOURS):
+            return 1.0
+        name = current(world)
+        if held(world, name):
+            part = 0.5 + 0.4 * drop_progress(world, name, _to(world))
+        else:
+            part = 0.45 * grasp_progress(world, name)
+        return (done + part) / len(COLOURS)
