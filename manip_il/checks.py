@@ -120,14 +120,19 @@ def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> An
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
     """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
+
+
+def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
+    """Return a file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
     try:
         with path.open("rb") as file:
             data = file.read(largest + 1)
     except OSError as error:
-        raise ManipError(f"cannot read {path}: {error.strerror}; expected {what}") from error
+        raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
     if len(data) > largest:
-        raise ManipError(f"{path} has more than {largest} bytes; expected {what}")
-    return mapping(str(path), parse_json(str(path), data))
+        raise refusal(f"{path} has more than {largest} bytes; expected {what}")
+    return data
 
 
 def _is_float(value: float) -> bool:

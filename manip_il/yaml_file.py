@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from manip_il import checks
 from manip_il.errors import UsageError
 
 LARGEST = 256 * 1024  # of a file [bytes]: the parser takes a second for 100 kB
@@ -38,13 +39,7 @@ def parse_yaml(text: str) -> Any:
 
 def read_yaml(path: Path, what: str) -> Any:
     """Return what is in a file; `UsageError` where it cannot be read. what: the file should be, for the message."""
-    try:
-        with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}; expected {what}") from error
-    if len(data) > LARGEST:
-        raise UsageError(f"{path} has more than {LARGEST} bytes; expected {what}")
+    data = checks.read_bytes(path, what, LARGEST, UsageError)
     try:
         return parse_yaml(data.decode())
     except ValueError as error:  # UnicodeDecodeError is one
