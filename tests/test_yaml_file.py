@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from manip_il.errors import UsageError
@@ -30,7 +28,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
         "\0",
     ],
 )
-def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str) -> None:
+def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path, text):
     path = tmp_path / "c.yaml"
     path.write_text(text)
     with pytest.raises(UsageError, match="is not YAML") as error:
@@ -39,21 +37,21 @@ def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str) -
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path: Path) -> None:
+def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path):
     path = tmp_path / "c.yaml"
     path.write_text("a: 1\n" * LARGEST)
     with pytest.raises(UsageError, match=f"has more than {LARGEST} bytes"):
         read_yaml(path, "a YAML file of options")
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+def test_bytes_that_are_no_text_are_refused(tmp_path):
     path = tmp_path / "c.yaml"
     path.write_bytes(b"a: \xff")
     with pytest.raises(UsageError, match="is not YAML"):
         read_yaml(path, "a YAML file of options")
 
 
-def test_plain_yaml_is_read() -> None:
+def test_plain_yaml_is_read():
     assert parse_yaml("a: [1, 2.5, yes, null, '*b']\nb: {c: d & e}") == {
         "a": [1, 2.5, True, None, "*b"],
         "b": {"c": "d & e"},

@@ -123,8 +123,9 @@ def read_file(path: Path, columns: list[str]) -> pa.Table:
 
 
 def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), as `feature` says, of any width: `to_array`, the doctor's, tells of another.
+    """Return a column, (T,) or (T, *shape), as `feature` says.
 
+    Numbers of another width are taken, as they are; the doctor, by `to_array`, tells of them.
     Raises `ManipError` naming the dataset `root` where values have another kind or shape, or some are missing.
     """
     shape, dtype = tuple(feature["shape"]), feature["dtype"]

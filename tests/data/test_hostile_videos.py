@@ -75,12 +75,6 @@ def test_a_name_is_a_path_and_no_address(tmp_path, monkeypatch, name):
     assert count_packets(Path(name)) == FRAMES
 
 
-def test_a_codec_without_a_decoder_is_refused(tmp_path):
-    path = film(tmp_path / "film.mp4", SIZE)
-    path.write_bytes(path.read_bytes().replace(b"mp4v", b"zzzz").replace(b"esds", b"zzzz"))
-    refuse(path, "no decoder is known")
-
-
 HLS = "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:0.6,\nsecret.mp4\n#EXT-X-ENDLIST"
 
 
@@ -116,21 +110,28 @@ def test_pictures_of_two_sizes_are_one_line(tmp_path):
         VideoReader().read(path, 0, 2 * FRAMES, FPS)
 
 
-@pytest.mark.parametrize("count", [pictures.MOST_INDEXED + 1, 170_000_000, 2**32 - 1])
-def test_an_index_of_equal_sizes_is_not_made_on_its_word(tmp_path, count):
-    path = film(tmp_path / "film.mp4", SIZE)
-    claim(claim(path, b"stsz", 4, 1), b"stsz", 8, count)
-    refuse(path, f"it declares {count:,} frames")
+def frames_of_one_size(path: Path, count: int) -> Path:
+    return claim(claim(film(path, SIZE), b"stsz", 4, 1), b"stsz", 8, count)
 
 
-def test_edits_that_repeat_an_index_are_counted(tmp_path):
-    path = claim(film(tmp_path / "film.mp4", SIZE), b"elst", 4, 10**6)
-    refuse(path, "it declares 6 frames and 1,000,000 edits")
+def without_decoder(path: Path) -> Path:
+    path.write_bytes(film(path, SIZE).read_bytes().replace(b"mp4v", b"zzzz").replace(b"esds", b"zzzz"))
+    return path
 
 
-def test_fragments_are_refused(tmp_path):
-    path = film(tmp_path / "film.mp4", SIZE, movflags="frag_keyframe+empty_moov")
-    refuse(path, "it has a box mvex")
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: frames_of_one_size(path, pictures.MOST_INDEXED + 1), "it declares 5,000,001 frames"),
+        (lambda path: frames_of_one_size(path, 170_000_000), "it declares 170,000,000 frames"),
+        (lambda path: frames_of_one_size(path, 2**32 - 1), "it declares 4,294,967,295 frames"),
+        (lambda path: claim(film(path, SIZE), b"elst", 4, 10**6), "it declares 6 frames and 1,000,000 edits"),
+        (lambda path: film(path, SIZE, movflags="frag_keyframe+empty_moov"), "it has a box mvex"),
+        (without_decoder, "no decoder is known"),
+    ],
+)
+def test_what_would_fill_the_memory_or_is_no_plain_film_is_refused(tmp_path, make, words):
+    refuse(make(tmp_path / "film.mp4"), words)
 
 
 def test_what_lies_among_the_coded_frames_is_not_looked_at(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import read_episodes, read_frames, read_spec, read_table
+from manip_il.data.lerobot_read import read_frames, read_spec, read_table
 from manip_il.data.video import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
@@ -147,19 +147,13 @@ def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precisi
                 np.testing.assert_allclose(left[key][name], table[name], rtol=1e-4, atol=1e-3, err_msg=f"{key} {name}")
 
 
-def test_pictures_equal_those_of_lerobots_writer(films, two):
+def test_pictures_equal_those_of_lerobots_writer(films, filmed, two):
+    assert read_spec(films[1]).image_keys == two.image_keys
     for key in two.image_keys:
-        for episode in range(3):
-            ours, theirs = (read_frames(root, key, episode) for root in films)
+        for number, episode in enumerate(filmed):
+            ours, theirs = (read_frames(root, key, number) for root in films)
             np.testing.assert_array_equal(ours, theirs)
-
-
-def test_quantiles_of_a_dataset_are_those_of_all_its_frames(ours, episodes):
-    stats = json.loads((ours / layout.STATS).read_text())
-    actions = np.concatenate([episode.columns[s.ACTION] for episode in episodes]).astype(np.float64)
-    for name, share in layout.QUANTILES.items():
-        expected = np.quantile(actions, share, axis=0, method="inverted_cdf")
-        np.testing.assert_array_equal(stats[s.ACTION][name], expected)
+            assert numbers_of(theirs) == numbers_of(episode.columns[key])
 
 
 def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec):
@@ -202,28 +196,6 @@ def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend
     assert index == len(dataset)
 
 
-def test_windows_in_time_stop_at_an_episodes_borders(ours, episodes, spec):
-    step = 1 / spec.fps
-    dataset = load(ours, delta_timestamps={s.ACTION: [0, step, 2 * step], s.STATE: [-step, 0]})
-    action, state = episodes[0].columns[s.ACTION], episodes[0].columns[s.STATE]
-    last = dataset[len(episodes[0]) - 1]
-    np.testing.assert_array_equal(last[s.ACTION].numpy(), [action[-1]] * 3)
-    assert last["action_is_pad"].tolist() == [False, True, True]
-    np.testing.assert_array_equal(last[s.STATE].numpy(), state[-2:])
-    first = dataset[0]
-    np.testing.assert_array_equal(first[s.ACTION].numpy(), action[:3])
-    np.testing.assert_array_equal(first[s.STATE].numpy(), [state[0], state[0]])
-    assert first["observation.state_is_pad"].tolist() == [True, False]
-    middle = dataset[len(episodes[0])]  # the episode of one frame
-    assert middle["action_is_pad"].tolist() == [False, True, True]
-
-
-def test_a_selection_of_episodes_loads(ours, episodes):
-    dataset = load(ours, episodes=[2])
-    assert dataset.num_frames == 12
-    np.testing.assert_array_equal(dataset[0][s.ACTION].numpy(), episodes[2].columns[s.ACTION][0])
-
-
 def test_many_small_files_load(tmp_path, episodes, spec):
     root = write(episodes * 4, tmp_path / "small", spec, data_files_size_in_mb=0.01)
     assert len(list(root.glob(layout.DATA_FILES))) > 1
@@ -234,18 +206,11 @@ def test_many_small_files_load(tmp_path, episodes, spec):
         assert number in pq.read_table(path)["episode_index"].to_pylist()
 
 
-def test_lerobots_own_dataset_reads_as_ours(theirs, ours):
-    left, right = read_table(theirs), read_table(ours)
+def test_lerobots_own_dataset_reads_as_ours(pair):
+    left, right = map(read_table, pair)
     assert left.keys() == right.keys()
     for key, values in left.items():
         np.testing.assert_array_equal(values, right[key])
-
-
-def test_lerobots_own_film_reads_as_ours(films, filmed, two):
-    assert read_spec(films[1]).image_keys == two.image_keys
-    for mine, yours in zip(read_episodes(films[1]), filmed, strict=True):
-        for key in two.image_keys:
-            assert numbers_of(mine.columns[key]) == numbers_of(yours.columns[key])
 
 
 def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
