@@ -145,8 +145,6 @@ def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, An
 
 def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
     array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):  # what older versions give for no chunk at all
-        array = pa.concat_arrays(array.chunks)
     length, nested = len(array), False
     while _is_list(array.type):
         array, nested = array.flatten(), True
@@ -164,7 +162,7 @@ class BadColumn(ValueError):
 
 @dataclass(frozen=True)
 class Shard:
-    """One parquet file, which need not be readable: the doctor tells of it and goes on, where `read_file` raises.
+    """One parquet file, which need not be readable: the doctor goes on to the next one, where `read_file` raises.
 
     columns: their names. problem: why it cannot be read; then it has no columns.
     """
@@ -244,11 +242,9 @@ def read_tasks(root: Path) -> tuple[list[int], list[str]]:
     return numbers.tolist(), table.column(names[0]).to_pylist()
 
 
-def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
+def to_array(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
     """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
-    array: Any = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    if isinstance(array, pa.ChunkedArray):  # what combining no chunk at all gives
-        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.array([], array.type)
+    array: Any = column.combine_chunks()
     rows, size = len(array), int(np.prod(shape, dtype=np.int64))
     while True:
         if isinstance(array.type, pa.BaseExtensionType):

@@ -162,6 +162,7 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
     [
         ({"data_path": "../victim/{chunk_index:03d}/{file_index:03d}.parquet"}, "data_path is"),
         ({"data_path": "/etc/{chunk_index}{file_index}"}, "data_path is"),
+        ({"data_path": "{chunk_index.__class__}"}, "data_path is"),
         ({"video_path": "{video_key.__class__}/{chunk_index}"}, "video_path is"),
         ({"video_path": "videos/{chunk_index:9999999999d}"}, "video_path is"),
         ({"video_path": ["x"]}, "video_path is"),

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import dataset_info, read_episodes, read_spec
+from manip_il.data.lerobot_read import dataset_info, read_spec
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.mdp import Episode
 
-from ..pictures import count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
 from .test_lerobot_library import REPO, add_episode, load, write_by_lerobot
 
 pytestmark = pytest.mark.slow
@@ -46,12 +46,7 @@ def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def assert_holds(root: Path, episodes: list[Episode]) -> None:
     """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
-    for mine, yours in zip(read_episodes(root), episodes, strict=True):
-        for key, values in yours.columns.items():
-            if key.startswith(s.IMAGES):
-                assert numbers_of(mine.columns[key]) == numbers_of(values)
-            else:
-                np.testing.assert_array_equal(mine.columns[key], values, err_msg=key)
+    assert_comes_back(root, episodes)
     assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
     assert not has_errors(examine_folder(root))
     dataset = load(root)
