@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ from ..damage import edit_json
 from ..pictures import encoded, numbered_episodes, numbers_of, picture, store_pictures, write
 from .test_video import largest_file
 
-MakeEpisode = Callable[..., Episode]
 FRONT, WRIST = KEYS = ["observation.images.front", "observation.images.wrist"]
 BYTES = 21 * 3 * 72 * 96  # one camera's, of three episodes
 PLENTY = 10 * BYTES

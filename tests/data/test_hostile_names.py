@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,13 +20,12 @@ from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.export import open_source
-from manip_il.mdp import Episode
 from manip_il.sim.conditions import Condition
 
 from ..damage import digests, edit_json, lines
 from ..pictures import numbered_episodes, with_cameras, write
+from ..synthetic import MakeEpisode
 
-MakeEpisode = Callable[..., Episode]
 HOSTILE = "x/../../../victim/videos/observation.images.front"
 FRONT = s.IMAGES + "front"
 

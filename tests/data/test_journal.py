@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,8 @@ from manip_il.errors import ManipError
 from manip_il.mcap.foxglove import SCALARS
 from manip_il.mdp import Episode
 
-MakeEpisode = Callable[..., Episode]
+from ..synthetic import MakeEpisode
+
 FINGERPRINT = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
 HERE = Path(__file__).parent
 

@@ -1,9 +1,11 @@
-"""LeRobot's unmodified library is the judge of what we write, with cameras and without; it imports torch."""
+"""LeRobot's unmodified library judges what we write, with cameras and without: its writer, its reader and its tools."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,14 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import read_frames, read_spec, read_table
+from manip_il.data.lerobot_read import dataset_info, read_frames, read_spec, read_table
 from manip_il.data.video import VideoConfig
+from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES
-from ..pictures import numbered_episodes, numbers_of, write
+from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"
@@ -72,6 +75,27 @@ def load(root: Path, **options: Any) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset(REPO, root=root, **options)
+
+
+def assert_loads(root: Path, episodes: list[Episode]) -> None:
+    """LeRobot's reader gives every frame of these episodes, pictures by the number that they show."""
+    import torch
+
+    dataset = load(root)
+    assert dataset.num_episodes == len(episodes)
+    frames = [(number, t, episode) for number, episode in enumerate(episodes) for t in range(len(episode))]
+    for index, (item, (number, t, episode)) in enumerate(zip(dataset, frames, strict=True)):
+        for key, values in episode.columns.items():
+            if key.startswith(s.IMAGES):
+                seen = item[key].permute(1, 2, 0).numpy() * 255
+                assert numbers_of(seen[None]) == numbers_of(values[t : t + 1])
+                continue
+            if key == s.SIM_STATE:  # LeRobot makes float32 of a float64 vector; `read_table` does not
+                values = values.astype(np.float32)
+            assert item[key].dtype == torch.from_numpy(values).dtype, key
+            np.testing.assert_array_equal(item[key].numpy(), values[t])
+        assert (item["episode_index"], item["frame_index"], item["index"]) == (number, t, index)
+        assert item["timestamp"] == pytest.approx(t / dataset.fps)
 
 
 def test_the_layout_is_the_librarys(spec):
@@ -157,22 +181,10 @@ def test_pictures_equal_those_of_lerobots_writer(films, filmed, two):
 
 
 def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec):
-    import torch
-
+    assert_loads(ours, episodes)
     dataset = load(ours)
-    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 20, spec.fps)
-    assert dataset.meta.robot_type == spec.robot
-    frames = ((number, episode, t) for number, episode in enumerate(episodes) for t in range(len(episode)))
-    for index, (number, episode, t) in enumerate(frames):
-        item = dataset[index]
-        for key, values in episode.columns.items():
-            if key == s.SIM_STATE:  # LeRobot makes float32 of a float64 vector; `read_table` does not
-                values = values.astype(np.float32)
-            assert item[key].dtype == torch.from_numpy(values).dtype, key
-            np.testing.assert_array_equal(item[key].numpy(), values[t])
-        assert (item["episode_index"], item["frame_index"], item["index"]) == (number, t, index)
-        assert item["timestamp"] == pytest.approx(t / spec.fps)
-        assert item["task"] == spec.instruction
+    assert (dataset.fps, dataset.meta.robot_type) == (spec.fps, spec.robot)
+    assert all(item["task"] == spec.instruction for item in dataset)
 
 
 @pytest.mark.parametrize("backend", ["pyav", "torchcodec"])
@@ -220,3 +232,81 @@ def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
     LeRobotDataset.create(REPO, fps=spec.fps, features=s.features(spec), root=root, use_videos=False)
     with pytest.raises(ManipError, match="no data"):
         read_table(root)
+
+
+@pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])
+def seen(request, spec) -> s.RobotTaskSpec:
+    return with_cameras(spec, *request.param)
+
+
+@pytest.fixture
+def recorded(tmp_path, make_episode, seen) -> tuple[Path, list[Episode]]:
+    episodes = numbered_episodes(make_episode, seen, 5)
+    return write(episodes, tmp_path / "lift", seen), episodes
+
+
+@pytest.fixture
+def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """The command in this process: each of its own would import torch again."""
+    from lerobot.scripts.lerobot_edit_dataset import main
+
+    def call(*words: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *words])
+        main()
+
+    return call
+
+
+def assert_holds(root: Path, episodes: list[Episode]) -> None:
+    """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
+    assert_comes_back(root, episodes)
+    assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
+    assert not has_errors(examine_folder(root))
+    assert_loads(root, episodes)
+
+
+def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
+    from lerobot.datasets import dataset_tools
+
+    root, episodes = recorded
+    kept = tmp_path / "kept"
+    words = ("--operation.type", "delete_episodes", "--operation.episode_indices", "[1, 2]")
+    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
+    assert_holds(kept, [episodes[0], *episodes[3:]])
+    s.check_same_spec("before", seen, "after", read_spec(kept))  # LeRobot drops our file
+    assert (read_spec(kept).instruction, dataset_info(kept).success) == (seen.instruction, 3)
+    assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
+
+
+def test_a_dataset_split_and_merged_again_by_lerobots_command(tmp_path, recorded, edit):
+    root, episodes = recorded
+    splits = json.dumps({"train": [0, 1, 2], "rest": [3, 4]})
+    words = ("--operation.type", "split", "--operation.splits", splits)
+    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(tmp_path / "split"), *words)
+    parts = [tmp_path / "split" / name for name in ("train", "rest")]
+    assert_holds(parts[0], episodes[:3])
+    assert_holds(parts[1], episodes[3:])
+    words = ("--operation.repo_ids", "['a/train', 'a/rest']", "--operation.roots", str([str(part) for part in parts]))
+    new = ("--new_repo_id", "a/all", "--new_root", str(tmp_path / "all"))
+    edit(*new, "--operation.type", "merge", *words)
+    assert_holds(tmp_path / "all", episodes)
+
+
+def test_lerobot_joins_ours_with_its_own(tmp_path, episodes, spec):
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    roots = [write(episodes, tmp_path / "ours", spec), write_by_lerobot(episodes, tmp_path / "theirs", spec)]
+    aggregate_datasets(["a/ours", "a/theirs"], "a/all", roots=roots, aggr_root=tmp_path / "all")
+    assert_holds(tmp_path / "all", episodes * 2)
+
+
+def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    _, episodes = recorded
+    root = write(episodes[:2], tmp_path / "resumed", seen)
+    dataset = LeRobotDataset.resume(REPO, root=root)
+    add_episode(dataset, episodes[2], seen)
+    dataset.finalize()
+    assert_holds(root, episodes[:3])
+    assert dataset_info(root).episodes == 3
