@@ -191,21 +191,16 @@ def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec)
 @pytest.mark.parametrize("file_size", [200.0, 0.001])
 def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend, file_size):
     episodes = numbered_episodes(make_episode, two, 6)
-    root = tmp_path / "film"
-    write(episodes, root, two, video_files_size_in_mb=file_size)
+    root = write(episodes, tmp_path / "film", two, video_files_size_in_mb=file_size)
     assert (len(list(root.rglob("*.mp4"))) > 2) == (file_size < 1)
     step = 1 / two.fps
     dataset = load(root, video_backend=backend, delta_timestamps={key: [-step, 0] for key in two.image_keys})
-    index = 0
-    for episode in episodes:
-        for t in range(len(episode)):
-            item = dataset[index]
-            for key in two.image_keys:
-                expected = numbers_of(episode.columns[key][[max(t - 1, 0), t]])
-                seen = (item[key].permute(0, 2, 3, 1).numpy() * 255).round()
-                assert numbers_of(seen) == expected, (index, key)
-            index += 1
-    assert index == len(dataset)
+    frames = [(episode, t) for episode in episodes for t in range(len(episode))]
+    for item, (episode, t) in zip(dataset, frames, strict=True):
+        for key in two.image_keys:
+            expected = numbers_of(episode.columns[key][[max(t - 1, 0), t]])
+            seen = (item[key].permute(0, 2, 3, 1).numpy() * 255).round()
+            assert numbers_of(seen) == expected, (item["index"], key)
 
 
 def test_many_small_files_load(tmp_path, episodes, spec):
