@@ -14,7 +14,6 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.config import FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 
-
 BRIGHTNESS, TURN = r"brightness is .*; expected a factor from 0\.1 to 2", r"light_turn is .* degrees"
 
 

@@ -32,6 +32,14 @@ def free_body(shape: str, size: str, mass: float = 0.2) -> tuple[mujoco.MjModel,
     return mujoco.MjSpec.from_string(xml).compile(), {"thing": Object("thing", 1, 0, 0, 0)}
 
 
+def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
+    """Of the one body: MuJoCo turns its axes so that its moments are sorted."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[1])
+    axes = axes.reshape(3, 3)
+    return axes @ np.diag(model.body_inertia[1]) @ axes.T
+
+
 @every_scene
 def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
     scene = build_scene(robot, task)
@@ -81,15 +89,7 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
     changed = copy.copy(plain)
     apply(changed, plain, objects, np.array([*size, *[0.0] * (3 - len(size)), mass, 1.0]))
     mujoco.mj_setConst(changed, mujoco.MjData(changed))
-    turned = compiled.body_iquat[1]  # MuJoCo turns a body's axes so that its moments are sorted
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, turned)
-    axes = axes.reshape(3, 3)
-    tensor = axes @ np.diag(compiled.body_inertia[1]) @ axes.T
-    own = np.empty(9)
-    mujoco.mju_quat2Mat(own, changed.body_iquat[1])
-    own = own.reshape(3, 3)
-    np.testing.assert_allclose(own @ np.diag(changed.body_inertia[1]) @ own.T, tensor, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(inertia_tensor(changed), inertia_tensor(compiled), rtol=1e-6, atol=1e-12)
     for name in ("body_mass", "body_subtreemass", "geom_rbound", "geom_aabb"):
         np.testing.assert_allclose(getattr(changed, name), getattr(compiled, name), rtol=1e-9, err_msg=name)
 
