@@ -9,6 +9,8 @@ import numpy as np
 from manip_il.expert import Expert
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import phases
@@ -21,6 +23,14 @@ def started(robot: str = "panda", task: str = "pick_place", seed: int = SEED, **
     env = ManipEnv(robot, task, **settings)
     env.start(seed)
     return env
+
+
+def world_at_home(robot: str, task: str = "pick_place") -> World:
+    """The arm as its YAML says it starts; call `update` after a change."""
+    world = World(build_scene(robot, task))
+    world.data.qpos[world.scene.arm_q] = world.scene.robot.home
+    world.update()
+    return world
 
 
 def still(env: ManipEnv, opening: float | None = None) -> np.ndarray:

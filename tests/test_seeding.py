@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from manip_il.errors import UsageError
 from manip_il.seeding import BLOCK, MAX_ROUNDS, MAX_SEED, rng_for, stream_base, stream_seeds
 
-STREAMS = ["demonstrations", "training", "validation", "test", "certificate", "held_out"]
-STREAMS += [f"round/{i}" for i in range(MAX_ROUNDS)]
+NAMED = ("demonstrations", "training", "validation", "test", "certificate", "held_out")
+STREAMS = [*NAMED, *(f"round/{i}" for i in range(MAX_ROUNDS))]
 LEROBOT_SEED = 1000
 streams, seeds = st.sampled_from(STREAMS), st.integers(0, MAX_SEED)
 

@@ -14,35 +14,28 @@ from hypothesis import strategies as st
 from manip_il.robots.gripper import TOUCH, Gripper, sweep
 from manip_il.robots.robot import ROBOTS, Robot, get_robot
 from manip_il.robots.spec import arm_spec
-from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import LOWEST_EE
 from manip_il.tasks.pick_place import OBJECT
 
-from ..scenes import started, still
+from ..scenes import started, still, world_at_home
 from ..tables import every_robot
 from .own import JAWS, write
 
 EDGE = 0.05  # of the model's cube [m]
 
 
-@cache
-def world_of(robot: str) -> World:
-    world = World(build_scene(robot, "pick_place"))
-    world.data.qpos[world.scene.arm_q] = world.scene.robot.home
-    return world
+world_of = cache(world_at_home)
 
 
-def with_cube(robot: str, opening: float, offset: tuple[float, float, float] = (0, 0, 0), turn: float = 0.0) -> World:
-    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m] and turned [rad]."""
-    world = world_of(robot)
+def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) -> World:
+    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m]."""
+    world, quat = world_of(robot), np.empty(4)
     gripper = world.scene.gripper
     world.data.qpos[gripper.q] = gripper.command(opening)
     world.update()
-    quat, turned, both = np.empty(4), np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), np.empty(4)
     mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
-    mujoco.mju_mulQuat(both, quat, turned)
-    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, both)
+    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, quat)
     world.update()
     return world
 

@@ -17,7 +17,7 @@ from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.sim.scene import PREFIX, build_scene
 
-from ..scenes import drive, started
+from ..scenes import drive, started, world_at_home
 from ..tables import every_robot
 from .own import ARM, JAWS, tree_of, write
 
@@ -237,21 +237,15 @@ def test_the_arm_alone_has_its_joints_and_no_others(robot: str):
 @pytest.mark.parametrize("value", [-0.5, 0.0, 0.7])
 @pytest.mark.parametrize("joint", ["turn", "elbow", "roll"])
 def test_a_fixed_joint_stands_where_the_yaml_says(joint: str, value: float, tmp_path: Path):
-    whole = arm_model(get_robot(str(write(tmp_path, "whole"))))
-    tree = tree_of()
+    whole, tree = get_robot(str(write(tmp_path, "whole"))), tree_of()
     place = tree["joints"].index(joint)
     for values in (tree["joints"], tree["home"], tree["gains"]):
         del values[place]
-    fixed = arm_model(get_robot(str(write(tmp_path, "fixed", tree=tree | {"fixed": {joint: value}}))))
-    assert fixed.njnt == whole.njnt - 1
-    free, held = mujoco.MjData(whole), mujoco.MjData(fixed)
-    for name in tree["joints"]:
-        free.joint(name).qpos[0] = held.joint(name).qpos[0] = 0.4
-    free.joint(joint).qpos[0] = value
-    for model, data in ((whole, free), (fixed, held)):
-        mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(held.site("ee").xpos, free.site("ee").xpos, atol=1e-9)
-    np.testing.assert_allclose(held.site("ee").xmat, free.site("ee").xmat, atol=1e-9)
+    fixed = get_robot(str(write(tmp_path, "fixed", tree=tree | {"fixed": {joint: value}})))
+    assert arm_model(fixed).njnt == arm_model(whole).njnt - 1
+    held, free = ArmIK(fixed).ee_pose(np.full(4, 0.4)), ArmIK(whole).ee_pose(np.insert(np.full(4, 0.4), place, value))
+    for one, other in zip(held, free, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 def test_a_base_moves_the_robot(tmp_path: Path):
@@ -262,45 +256,33 @@ def test_a_base_moves_the_robot(tmp_path: Path):
 
 @every_robot
 def test_at_home_the_hand_points_down_over_the_workspace(robot: str):
-    scene = build_scene(robot, "reach")
-    data = mujoco.MjData(scene.model)
-    data.qpos[scene.arm_q] = scene.robot.home
-    mujoco.mj_forward(scene.model, data)
-    rotation = data.site_xmat[scene.ee_site].reshape(3, 3)
-    np.testing.assert_allclose(rotation, np.diag([1.0, -1.0, -1.0]), atol=0.05)
-    assert np.hypot(*(data.site_xpos[scene.ee_site][:2] - scene.robot.workspace.centre)) < 0.06
+    world = world_at_home(robot)
+    np.testing.assert_allclose(world.ee.rotation, np.diag([1.0, -1.0, -1.0]), atol=0.05)
+    assert np.hypot(*(world.ee.position[:2] - world.scene.robot.workspace.centre)) < 0.06
 
 
 @every_robot
 def test_the_fingers_move_along_the_hands_y(robot: str):
-    scene = build_scene(robot, "reach")
-    data, gripper = mujoco.MjData(scene.model), scene.gripper
-    data.qpos[scene.arm_q] = scene.robot.home
-    places = []
+    world, places = world_at_home(robot), []
+    gripper = world.scene.gripper
     for opening in (gripper.least, gripper.most):
-        data.qpos[gripper.q] = gripper.command(opening)
-        mujoco.mj_kinematics(scene.model, data)
-        places.append(np.array([data.geom_xpos[pads[0]] for pads in gripper.pads]))
-    moved = (places[1] - places[0]) @ data.site_xmat[scene.ee_site].reshape(3, 3)
+        world.data.qpos[gripper.q] = gripper.command(opening)
+        world.update()
+        places.append(np.array([world.data.geom_xpos[pads[0]] for pads in gripper.pads]))
+    moved = (places[1] - places[0]) @ world.ee.rotation
     assert (np.abs(moved[:, 1]) > 0.02).all()
     assert (np.abs(moved[:, [0, 2]]) < 0.4 * np.abs(moved[:, [1]])).all()
 
 
 @every_robot
 def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
-    scene = build_scene(robot, "pick_place")
-    alone, data = arm_model(scene.robot), mujoco.MjData(scene.model)
-    alone_data = mujoco.MjData(alone)
-    rng = np.random.default_rng(0)
+    world, rng = world_at_home(robot), np.random.default_rng(0)
+    alone, home = ArmIK(world.scene.robot), np.asarray(world.scene.robot.home)
     for _ in range(5):
-        q = np.asarray(scene.robot.home) + rng.uniform(-0.5, 0.5, len(scene.robot.joints))
-        data.qpos[scene.arm_q] = q
-        alone_data.qpos[[alone.joint(name).qposadr[0] for name in scene.robot.joints]] = q
-        mujoco.mj_kinematics(scene.model, data)
-        mujoco.mj_kinematics(alone, alone_data)
-        site = alone.site("ee").id
-        np.testing.assert_allclose(alone_data.site_xpos[site], data.site_xpos[scene.ee_site], atol=1e-12)
-        np.testing.assert_allclose(alone_data.site_xmat[site], data.site_xmat[scene.ee_site], atol=1e-12)
+        q = world.data.qpos[world.scene.arm_q] = home + rng.uniform(-0.5, 0.5, len(home))
+        world.update()
+        for one, other in zip(alone.ee_pose(q), world.ee, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-12)
 
 
 @every_robot

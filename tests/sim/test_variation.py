@@ -47,24 +47,25 @@ def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
         np.testing.assert_array_equal(row, [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION])
 
 
-def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was():
-    plain = np.array([0.025, 0.025, 0.025, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"size": 0.07}), [0.035, 0.035, 0.035, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"mass": 0.3}), [0.025, 0.025, 0.025, 0.3, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"friction": 0.5}), [0.025, 0.025, 0.025, 0.1, 0.5])
-    np.testing.assert_array_equal(with_drawn(plain, {"colour": [1, 0, 0]}), plain)
-    assert plain.tolist() == [0.025, 0.025, 0.025, 0.1, 1.0]
+CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
 
 
-def test_a_drawn_size_is_the_longest_edge_and_keeps_proportions():
-    tall = np.array([0.01, 0.02, 0.04, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(tall, {"size": 0.04})[:3], [0.005, 0.01, 0.02])
-
-
-def test_every_object_is_drawn_alike_and_no_object_is_none():
-    two = np.tile([0.025, 0.025, 0.025, 0.1, 1.0], 2)
-    np.testing.assert_allclose(with_drawn(two, {"mass": 0.2})[[3, 8]], 0.2)
-    assert with_drawn(np.empty(0), {"mass": 0.2, "size": 0.05}).shape == (0,)
+@pytest.mark.parametrize(
+    ("before", "drawn", "after"),
+    [
+        (CUBE, {"size": 0.07}, [0.035, 0.035, 0.035, 0.1, 1.0]),
+        (TALL, {"size": 0.04}, [0.005, 0.01, 0.02, 0.1, 1.0]),  # the longest edge; proportions stay
+        (CUBE, {"mass": 0.3}, [0.025, 0.025, 0.025, 0.3, 1.0]),
+        (CUBE, {"friction": 0.5}, [0.025, 0.025, 0.025, 0.1, 0.5]),
+        (CUBE, {"colour": [1, 0, 0]}, CUBE),
+        (CUBE + TALL, {"mass": 0.2}, [0.025, 0.025, 0.025, 0.2, 1.0, 0.01, 0.02, 0.04, 0.2, 1.0]),
+        ([], {"mass": 0.2, "size": 0.05}, []),
+    ],
+)
+def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(before: list[float], drawn, after: list[float]):
+    base = np.array(before)
+    np.testing.assert_allclose(with_drawn(base, drawn), after)
+    assert base.tolist() == before
 
 
 @pytest.mark.parametrize("shape", SHAPES)
