@@ -11,7 +11,6 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
-from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import phases
 
@@ -43,8 +42,8 @@ def bits(env: ManipEnv) -> bytes:
 
 
 def cube(env: ManipEnv) -> np.ndarray:
-    """Its position [m]."""
-    return env.data.joint(OBJECT).qpos[:3].copy()
+    """Position of what is grasped [m]."""
+    return env.data.joint(TASKS[env.task].grasped[0]).qpos[:3].copy()
 
 
 def in_hand(env: ManipEnv) -> np.ndarray:

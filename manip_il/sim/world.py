@@ -67,11 +67,6 @@ class Scene:
         """Length of `State.physics`."""
         return mujoco.mj_stateSize(self.model, STATE_KIND)
 
-    @cached_property
-    def reach(self) -> Reach:
-        """Map of the points that the hand, pointing down, gets to."""
-        return reach_of(self.robot)
-
     @property
     def name(self) -> str:
         """Robot and task, for messages."""
@@ -200,10 +195,10 @@ class World:
         geoms = (self.scene.objects[name].geom,)
         return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
 
-    @property
+    @cached_property
     def reach(self) -> Reach:
         """Map of the points that the hand, pointing down, gets to."""
-        return self.scene.reach
+        return reach_of(self.scene.robot)
 
     @cached_property
     def has_goal(self) -> bool:
