@@ -83,7 +83,6 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         actions=_action_space(robot, joints, gripper),
         objects=objects,
         arm_q=np.array([joint.qposadr[0] for joint in joints], dtype=np.int64),
-        arm_v=np.array([joint.dofadr[0] for joint in joints], dtype=np.int64),
         arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
         ee_site=model.site(PREFIX + "ee").id,
         nominal=variation.nominal(model, objects),

@@ -40,7 +40,7 @@ class Pose(NamedTuple):
 class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
-    task: its name. arm_q, arm_v, arm_ctrl: indices of the arm's joints into qpos, qvel and ctrl. objects: free bodies
+    task: its name. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies
     by name. ee_site: id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
     """
 
@@ -51,16 +51,9 @@ class Scene:
     actions: ActionSpace
     objects: Mapping[str, Object]
     arm_q: NDArray[np.int64]
-    arm_v: NDArray[np.int64]
     arm_ctrl: NDArray[np.int64]
     ee_site: int
     nominal: F64
-
-    @cached_property
-    def qpos_slice(self) -> slice:
-        """Part of `State.physics` that is qpos."""
-        start = mujoco.mj_stateSize(self.model, int(mujoco.mjtState.mjSTATE_TIME))
-        return slice(start, start + self.model.nq)
 
     @cached_property
     def state_size(self) -> int:

@@ -17,7 +17,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn
-from manip_il.sim.world import GOAL, Scene
+from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
@@ -46,16 +46,24 @@ def written(label: Label) -> bytes:
     return label.action.tobytes() + np.float64(label.residual).tobytes() + bytes([label.phase, label.valid])
 
 
+world_of = cache(World)
+
+
+def world_in(scene: Scene, state: State) -> World:
+    world = world_of(scene)
+    world.restore(state.physics, state.variation)
+    return world
+
+
 def joints(scene: Scene, state: State) -> np.ndarray:
-    return state.physics[scene.qpos_slice][scene.arm_q]
+    return world_in(scene, state).data.qpos[scene.arm_q]
 
 
 def with_object(scene: Scene, state: State, move: np.ndarray) -> State:
     """The state with its object moved by `move` [m]."""
-    physics = state.physics.copy()
-    start = scene.qpos_slice.start + scene.objects[OBJECT].q
-    physics[start : start + 3] += move
-    return replace(state, physics=physics)
+    world, one = world_in(scene, state), scene.objects[get_task(scene.task).grasped[0]]
+    world.data.qpos[one.q : one.q + 3] += move
+    return replace(state, physics=world.physics())
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
@@ -133,9 +141,9 @@ def test_an_arm_outside_its_limits_is_led_back(robot: str, task: str):
     state = visited_states(robot, task, "expert")[0]
     high = scene.actions.high[scene.actions.arm]
     limited = int(np.flatnonzero(np.isfinite(high))[0])
-    physics = state.physics.copy()
-    physics[scene.qpos_slice.start + scene.arm_q[limited]] = high[limited] + 0.02
-    action = expert.label(replace(state, physics=physics)).action
+    world = world_in(scene, state)
+    world.data.qpos[scene.arm_q[limited]] = high[limited] + 0.02
+    action = expert.label(replace(state, physics=world.physics())).action
     assert action[scene.actions.arm][limited] <= high[limited]
 
 
@@ -165,7 +173,7 @@ def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str
     label = expert.label(state)
     assert (label.valid, label.phase, label.reason) == (False, 0, reason)
     np.testing.assert_array_equal(label.action[scene.actions.arm], joints(scene, state))
-    assert label.action[scene.actions.gripper] == scene.gripper.opening(state.physics[scene.qpos_slice])
+    assert label.action[scene.actions.gripper] == world_in(scene, state).opening
 
 
 @every_scene
