@@ -226,14 +226,6 @@ def test_a_models_own_world_is_left_out_without_a_warning(tmp_path: Path, monkey
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
-@every_robot
-def test_the_arm_alone_has_its_joints_and_no_others(robot: str):
-    the_robot = get_robot(robot)
-    alone = arm_model(the_robot)
-    assert [alone.joint(i).name for i in range(alone.njnt)] == list(the_robot.joints)
-    assert alone.nu == 0
-
-
 @pytest.mark.parametrize("value", [-0.5, 0.0, 0.7])
 @pytest.mark.parametrize("joint", ["turn", "elbow", "roll"])
 def test_a_fixed_joint_stands_where_the_yaml_says(joint: str, value: float, tmp_path: Path):
@@ -276,7 +268,9 @@ def test_the_fingers_move_along_the_hands_y(robot: str):
 
 @every_robot
 def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
-    world, rng = world_at_home(robot), np.random.default_rng(0)
+    world, model, rng = world_at_home(robot), arm_model(get_robot(robot)), np.random.default_rng(0)
+    assert [model.joint(i).name for i in range(model.njnt)] == list(world.scene.robot.joints)  # and no others
+    assert model.nu == 0
     alone, home = ArmIK(world.scene.robot), np.asarray(world.scene.robot.home)
     for _ in range(5):
         q = world.data.qpos[world.scene.arm_q] = home + rng.uniform(-0.5, 0.5, len(home))

@@ -131,14 +131,6 @@ def test_starts_reach_into_every_quarter_of_the_table(robot: str, task: str):
     assert len(quarters) == 4
 
 
-@every_scene
-def test_a_draw_follows_from_its_generator_alone(robot: str, task: str):
-    world = world_of(robot, task)
-    first = {name: np.concatenate(pose).tobytes() for name, pose in start(world, 3).poses.items()}
-    start(world, 4)
-    assert {name: np.concatenate(pose).tobytes() for name, pose in start(world, 3).poses.items()} == first
-
-
 @given(st.floats(0.01, np.pi), seeds)
 def test_a_drawn_turn_is_about_the_vertical_and_no_wider_than_asked(widest: float, seed: int):
     quaternion, matrix = draw_yaw(np.random.default_rng(seed), widest), np.empty(9)
