@@ -17,23 +17,23 @@ from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 
-from ..tables import every_scene, every_scene_with_an_object
+from ..scenes import world_at_home
+from ..tables import GRASPING, every_scene, every_scene_with_an_object
 
+BESIDE = np.array([-0.04, 0.1, 0.0])  # of the hand [m]
 HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 
 
-@pytest.fixture
-def world() -> World:
-    world = World(build_scene("fetch", "pick_place"))
-    world.update()
-    return world
+@pytest.fixture(params=GRASPING, ids="-".join)
+def world(request) -> World:
+    return world_at_home(*request.param)
 
 
 def fall(world: World, steps: int = 60) -> bytes:
     """The physics of a world in which the cube falls onto the table and the arm stays."""
     mujoco.mj_resetData(world.model, world.data)
     world.data.qpos[world.scene.arm_q] = world.data.ctrl[world.scene.arm_ctrl] = world.scene.robot.home
-    world.place(OBJECT, np.array([0.6, 0.1, 0.06]), np.array([0.9, 0.1, 0.3, 0.3]))
+    world.place(OBJECT, [*world.scene.robot.workspace.centre, 0.06] + BESIDE, np.array([0.9, 0.1, 0.3, 0.3]))
     mujoco.mj_step(world.model, world.data, steps)
     return world.physics().tobytes()
 
@@ -116,7 +116,7 @@ def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
 @pytest.mark.parametrize("edge", [0.03, 0.07])
 def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, edge: float):
     world.vary(with_drawn(world.scene.nominal, {"size": edge}))
-    world.place(OBJECT, np.array([0.6, 0.1, edge / 2 + 0.01]), UPRIGHT)
+    world.place(OBJECT, [*world.scene.robot.workspace.centre, edge / 2 + 0.01] + BESIDE, UPRIGHT)
     mujoco.mj_step(world.model, world.data, 400)
     world.update()
     assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
@@ -147,13 +147,13 @@ def test_a_restored_world_is_the_one_that_was_saved(world: World):
     world.update()
     other.restore(world.physics(), world.variation)
     assert other.physics().tobytes() == world.physics().tobytes()
-    for name in (OBJECT, "robot/robot0:gripper_link"):
+    for name in (OBJECT, f"robot/{world.scene.robot.ee.body}"):
         np.testing.assert_array_equal(other.pose(name).position, world.pose(name).position)
         np.testing.assert_array_equal(other.pose(name).rotation, world.pose(name).rotation)
 
 
 def test_numbers_of_another_scene_are_refused_with_both_sizes(world: World):
-    with pytest.raises(MismatchError, match=rf"has 3, fetch pick_place has {world.scene.state_size}"):
+    with pytest.raises(MismatchError, match=rf"has 3, {world.scene.name} has {world.scene.state_size}"):
         world.restore(np.zeros(3), world.scene.nominal)
     with pytest.raises(MismatchError, match=r"size of the variation.*has 3, .*has 5"):
         world.vary(np.ones(3))
@@ -179,7 +179,7 @@ def test_what_was_worked_out_is_known_until_the_world_moves(world: World):
 
 def test_answers_follow_the_world(world: World):
     gripper = world.scene.gripper
-    for opening, x in ((0.02, 0.55), (0.08, 0.65)):
+    for opening, x in ((0.02, 0.55), (0.075, 0.65)):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.place(OBJECT, np.array([x, 0.1, 0.2]), UPRIGHT)
         world.place("goal", np.array([x, 0.0, 0.3]), UPRIGHT)
@@ -205,5 +205,6 @@ def test_what_cannot_be_placed_is_refused_by_name(world: World):
         world.place("objct", np.zeros(3), UPRIGHT)
     with pytest.raises(UnknownName, match="did you mean 'goal'"):
         world.pose("gaol")
-    with pytest.raises(ManipError, match="'robot/robot0:gripper_link' is neither an object nor a mocap body"):
-        world.place("robot/robot0:gripper_link", np.zeros(3), UPRIGHT)
+    hand = f"robot/{world.scene.robot.ee.body}"
+    with pytest.raises(ManipError, match=f"'{hand}' is neither an object nor a mocap body"):
+        world.place(hand, np.zeros(3), UPRIGHT)
