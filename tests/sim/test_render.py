@@ -18,6 +18,8 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend, require_known_backend
+from manip_il.sim.world import GOAL
+from manip_il.tasks.starts import UPRIGHT
 
 from ..scenes import SEED, bits, started, still
 
@@ -71,6 +73,8 @@ def test_the_front_camera_sees_the_green_goal_and_the_red_cube(env: ManipEnv):
         picture = env.observe().images["front"]
         assert pixels_like(picture, 1) >= 8
         assert pixels_like(picture, 0) >= 8
+    env.world.place(GOAL, np.array([0.0, 0.0, -1.0]), UPRIGHT)
+    assert pixels_like(env.observe().images["front"], 1) == 0
 
 
 @pytest.mark.gl
