@@ -89,13 +89,11 @@ class Workspace:
     def read(cls, what: str, tree: Any) -> Self:
         """Make it of what YAML holds; `UsageError` names what is wrong."""
         tree = _tree(what, tree, cls)
-        sizes = (
-            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2) for name in _WORKSPACE_SIZES
+        half_width, height = (
+            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2)
+            for name in ("half_width", "height")
         )
-        return cls(_numbers(f"{what}.centre", tree["centre"], 2, _FURTHEST), *sizes)
-
-
-_WORKSPACE_SIZES = ("half_width", "height")
+        return cls(_numbers(f"{what}.centre", tree["centre"], 2, _FURTHEST), half_width, height)
 
 
 @dataclass(frozen=True)
