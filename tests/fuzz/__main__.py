@@ -48,6 +48,12 @@ def main() -> int:
     parser.add_argument("--number", type=int, help="this one input, in this process")
     parser.add_argument("--output", type=Path, default=Path("runs/fuzz"), help="where findings are kept")
     options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="manip-il-fuzz-", ignore_cleanup_errors=True) as home:
+        os.environ |= {"HF_HUB_OFFLINE": "1", "HOME": home}  # a process that harms nobody
+        return run(options, parser, [f"--basetemp={home}/tests"])
+
+
+def run(options: argparse.Namespace, parser: argparse.ArgumentParser, words: list[str]) -> int:
     from manip_il.sim.gl import choose_backend
 
     from .table import TARGETS
@@ -56,7 +62,7 @@ def main() -> int:
     targets = targets or [target.name for target in TARGETS if target.name.startswith(options.target)]
     if not targets:
         parser.error(f"no such target; there are: {', '.join(target.name for target in TARGETS)}")
-    words = [str(Path(__file__).with_name("test_fuzz.py")), "-q", "--disable-warnings", "-p", "no:cacheprovider"]
+    words += [str(Path(__file__).with_name("test_fuzz.py")), "-q", "--disable-warnings", "-p", "no:cacheprovider"]
     if options.number is None:
         shutil.rmtree(options.output, ignore_errors=True)
         words += [f"--numprocesses={options.workers}", "--dist=worksteal", f"--max-worker-restart={options.inputs}"]
@@ -64,9 +70,8 @@ def main() -> int:
         targets, words = targets[:1], [*words, "--capture=no"]
     choose_backend()
     settings = {**vars(options), "targets": targets, "output": str(options.output.absolute())}
-    with tempfile.TemporaryDirectory(prefix="manip-il-fuzz-", ignore_cleanup_errors=True) as home:
-        os.environ |= {"HF_HUB_OFFLINE": "1", "HOME": home, "MANIP_IL_FUZZ": json.dumps(settings)}
-        return pytest.main([*words, f"--basetemp={home}/tests"], plugins=[Table()])
+    os.environ["MANIP_IL_FUZZ"] = json.dumps(settings)
+    return pytest.main(words, plugins=[Table()])
 
 
 if __name__ == "__main__":

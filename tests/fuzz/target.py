@@ -22,8 +22,6 @@ LARGEST = 1024  # [MB] beyond what the process held before
 Read = Callable[[Path], object]
 
 
-
-
 @dataclass(frozen=True)
 class Target:
     """A file of a folder, and who reads it.
@@ -61,6 +59,11 @@ def command(*words: str) -> None:
     options = parse(load(name), list(words[len(name.split()) :]))
     with contextlib.redirect_stdout(io.StringIO()):
         options.run()
+
+
+def runs(*words: str) -> Read:
+    """A command; `{folder}` in its words is where the files are."""
+    return lambda folder: command(*(word.format(folder=folder) for word in words))
 
 
 class Bench:
