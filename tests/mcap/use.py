@@ -24,9 +24,10 @@ def decoded(data: bytes) -> list[tuple[str, int, Any]]:
     return found
 
 
-def load(folder: Path, features: dict[str, Any], fps: int = 10, task: Any = "t") -> Mapping:
+def load(folder: Path, features: Any, **more: Any) -> Mapping:
+    """The mapping that a file of these features is, at 10 frames a second unless `more` says otherwise."""
     path = folder / "m.yaml"
-    path.write_text(yaml.safe_dump({"fps": fps, "task": task, "features": features}))
+    path.write_text(yaml.safe_dump({"fps": 10, "task": "t", "features": features, **more}), encoding="utf-8")
     return load_mapping(path)
 
 
