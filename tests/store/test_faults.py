@@ -191,7 +191,7 @@ def test_an_object_that_is_gone_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from manip_il.store.push import scan
+    from manip_il.store.folder import scan
 
     run = make_run(tmp_path / "run", 1)
     _, remote = impatient(place)

@@ -19,9 +19,10 @@ from manip_il.store.errors import (
     RemoteError,
     Retry,
 )
+from manip_il.store.folder import scan
 from manip_il.store.hub import HubRemote
-from manip_il.store.push import scan
-from manip_il.store.remote import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl
+from manip_il.store.schemes import open_remote
 
 from .hub_server import LFS_SECRET, Hub
 from .hub_use import DATASET, POLICY, SAMPLE, TOKEN, copy_sample, do_pull, do_push, files_of_main

@@ -13,8 +13,9 @@ import pytest
 
 from manip_il.store import s3_store, s3_upload
 from manip_il.store.errors import AuthError, RemoteError
+from manip_il.store.folder import scan
 from manip_il.store.pull import pull
-from manip_il.store.push import push, scan
+from manip_il.store.push import push
 
 from .s3 import KEY, SECRET, Fault, Proxy
 from .trees import content, impatient, make_run, unwatched
