@@ -135,7 +135,7 @@ class HubConversation(Conversation):
         from huggingface_hub.utils import _http
 
         from ..store.hub_use import POLICY, a_hub, do_push
-        from ..store.hub_wire import Answer
+        from ..store.wire import Answer
 
         with a_hub(folder / "hub") as hub, _no_waiting(_http):
             self._script, honest = Script(-1, 0, False), hub.answer

@@ -1,4 +1,4 @@
-"""A Hub for tests, of git repositories: answers what the unmodified huggingface_hub client asks for push and pull."""
+"""A Hub for tests: answers what the unmodified huggingface_hub client asks for push and pull."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from urllib.parse import parse_qs
 import yaml
 
 from .hub_repo import LFS_SUFFIXES, Blob, Repo, WrongParentError
-from .hub_wire import Answer, Wire
+from .wire import Answer, Wire
 
 _API = r"/api/(?P<name>(?:models|datasets)/[^/]+/[^/]+)"
 LFS_SECRET = "signature-of-an-upload"  # stands in signed URLs: nothing may print it
@@ -122,7 +122,7 @@ def _create(hub: Hub, call: _Call) -> Answer:
     with hub.creating:
         if f"{kind}/{name}" in hub.repos:
             raise Refused(409, f"You already created this {kind[:-1]} repo", url=url)
-        hub.repos[f"{kind}/{name}"] = Repo(f"{kind}/{name}", hub.folder / kind / name, owner, bool(private))
+        hub.repos[f"{kind}/{name}"] = Repo(hub.folder / kind / name, owner, bool(private))
     return Answer(200, {"url": url, "name": name})
 
 
@@ -152,7 +152,7 @@ def _lfs_batch(hub: Hub, call: _Call, name: str) -> Answer:
     repo, objects = call.writable(name), []
     for one in call.json()["objects"]:
         entry = {"oid": one["oid"], "size": one["size"]}
-        if not repo.object_path(one["oid"]).exists():
+        if not (repo.lfs / one["oid"]).exists():
             base = f"{hub.url}/lfs/{name}/{one['oid']}"
             entry["actions"] = {
                 "upload": {"href": f"{base}?X-Amz-Signature={LFS_SECRET}"},
@@ -167,14 +167,14 @@ def _lfs_put(hub: Hub, call: _Call, name: str, oid: str) -> Answer:
         raise Refused(403, "not signed")
     if hashlib.sha256(call.body).hexdigest() != oid:
         raise Refused(400, "the sha256 of what arrived is another one")
-    path = hub.repo(name).object_path(oid)
+    path = hub.repo(name).lfs / oid
     path.with_suffix(".part").write_bytes(call.body)
     path.with_suffix(".part").replace(path)
     return Answer()
 
 
 def _lfs_verify(hub: Hub, call: _Call, name: str, oid: str) -> Answer:
-    path = call.writable(name).object_path(oid)
+    path = call.writable(name).lfs / oid
     if not path.exists() or path.stat().st_size != call.json()["size"]:
         raise Refused(404, "no such object")
     return Answer()
@@ -192,7 +192,7 @@ def _commit(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
         if one["path"] not in tree:
             raise Refused(404, "A file with this name doesn't exist", "EntryNotFound")
     for one in values["lfsFile"]:
-        if not repo.object_path(one["oid"]).exists():
+        if not (repo.lfs / one["oid"]).exists():
             raise Refused(400, f"LFS pointer of {one['path']} points to a file that does not exist")
     files = {one["path"]: base64.b64decode(one["content"]) for one in values["file"]}
     lfs = {one["path"]: (one["oid"], one["size"]) for one in values["lfsFile"]}

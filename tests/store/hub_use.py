@@ -52,9 +52,8 @@ def do_pull(target: Path, url: str = DATASET) -> Pulled:
 
 def files_of_main(hub: Hub) -> dict[str, bytes]:
     """Path -> bytes of what a reader of the dataset's main branch sees."""
-    repo = hub.repo("datasets/user/demos")
-    tree = repo.tree(repo.refs("heads")["main"])
-    return {path: repo.read(blob) for path, blob in tree.items() if path not in (MANIFEST_FILE, ".gitattributes")}
+    files = hub.repo("datasets/user/demos").files
+    return {path: data for path, data in files.items() if path not in (MANIFEST_FILE, ".gitattributes")}
 
 
 def copy_sample(target: Path) -> Path:

@@ -32,8 +32,8 @@ from .hub_use import (
     do_push,
     other_version,
 )
-from .hub_wire import Fault
 from .trees import content
+from .wire import Fault
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_an_edit_on_the_website_is_seen_and_overruled_by_the_next_push(hub: Hub,
     do_push(SAMPLE)
     repo = hub.repo("datasets/user/demos")
     head = repo.refs("heads")["main"]
-    text = repo.read(repo.tree(head)["meta/info.json"])
+    text = repo.files["meta/info.json"]
     edited = text.replace(b'"fps": 20', b'"fps": 21')  # the same size: only its hash tells
     assert edited != text
     repo.commit("refs/heads/main", head, {"meta/info.json": edited}, {}, [], "an edit")

@@ -26,8 +26,8 @@ from manip_il.store.schemes import open_remote
 
 from .hub_server import LFS_SECRET, Hub
 from .hub_use import DATASET, POLICY, SAMPLE, TOKEN, copy_sample, do_pull, do_push, files_of_main
-from .hub_wire import Fault
 from .trees import content, wait_little
+from .wire import Fault
 
 
 @pytest.fixture(autouse=True)
@@ -216,5 +216,5 @@ def test_the_token_is_nowhere(
         assert TOKEN not in text
         assert LFS_SECRET not in text
     for repo in hub.repos.values():
-        for commit, _ in repo.log("main"):
+        for commit, _ in repo.log(repo.find("main")):
             assert not any(TOKEN.encode() in repo.read(blob) for blob in repo.tree(commit).values())

@@ -92,10 +92,8 @@ def test_a_policy_that_lies_at_the_root_stays_as_it_is():
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):
     do_push(run, POLICY)
     repo = hub.repo("models/user/policy")
-    tree = repo.tree(repo.refs("heads")["main"])
     for path, data in content(tiny_policy).items():
-        assert repo.read(tree[path]) == data
-        assert repo.read(tree[f"best/pretrained_model/{path}"]) == data
+        assert repo.files[path] == repo.files[f"best/pretrained_model/{path}"] == data
     large = {hashlib.sha256(path.read_bytes()).hexdigest() for path in tiny_policy.glob("*.safetensors")}
     sent = [one.path.rpartition("/")[2] for one in hub.requests("^PUT ")]
     assert sorted(sent) == sorted(large)
@@ -121,7 +119,6 @@ def test_a_better_policy_replaces_the_copy_at_the_root(hub: Hub, run: Path, tmp_
     better = run / "best" / "pretrained_model" / "config.json"
     better.write_bytes(better.read_bytes() + b"\n")
     assert do_push(run, POLICY).uploaded == 2  # where it lies, and at the root
-    repo = hub.repo("models/user/policy")
-    assert repo.read(repo.tree(repo.refs("heads")["main"])["config.json"]) == better.read_bytes()
+    assert hub.repo("models/user/policy").files["config.json"] == better.read_bytes()
     do_pull(tmp_path / "back", POLICY)
     assert not (tmp_path / "back" / "config.json").exists()
