@@ -60,6 +60,8 @@ def refusal(match: str, status: int, code: str = "Busy", times: int = 10**6) -> 
 class Proxy(Wire):
     """Passes requests on to a store. change: what goes out in place of an answer."""
 
+    cuts_ranges = False  # the store does
+
     def __init__(self, endpoint: str):
         self._host = endpoint.removeprefix("http://")
         self.drops_conditions = False

@@ -1,4 +1,4 @@
-"""Push and pull by the Hub's own client, against a Hub of git repositories on loopback."""
+"""Push and pull by the Hub's own client, against a Hub on loopback."""
 
 from __future__ import annotations
 

@@ -72,9 +72,14 @@ def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
     assert without_root_copies(scanned.manifest) == manifest(RUN)
 
 
-@pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
-def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
-    files = {**RUN, there: b"its own"}
+@pytest.mark.parametrize(
+    "files",
+    [
+        *({**RUN, name: b"its own"} for name in ("config.json", "Model.safetensors", "config.json/notes.txt")),
+        {"config.json": b"{}", "model.safetensors": b"weights"},  # a policy without a run
+    ],
+)
+def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(files: dict[str, bytes]):
     assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
@@ -82,11 +87,6 @@ def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str
 def test_root_copies_that_are_not_the_policy_any_more_come_along(changed: str):
     files = {**RUN, "config.json": b"{}", "model.safetensors": b"weights", changed: b"edited on the website"}
     assert without_root_copies(manifest(files)) == manifest(files)
-
-
-def test_a_policy_that_lies_at_the_root_stays_as_it_is():
-    files = {"config.json": b"{}", "model.safetensors": b"weights"}
-    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):

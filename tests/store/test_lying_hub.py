@@ -48,7 +48,6 @@ def honest(line: str) -> list[bytes]:
 
 
 def pulled(hub: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a pull ends in; it is an error."""
     monkeypatch.setattr(constants, "ENDPOINT", hub.url)
     return error_of_pull(DATASET, folder, capsys, TOKEN)
 

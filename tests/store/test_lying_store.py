@@ -30,7 +30,6 @@ def _somebody(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pulled(store: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a pull ends in; it is an error."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", store.url)
     return error_of_pull("s3://bucket/demos", folder, capsys, TOKEN)
 

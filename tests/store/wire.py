@@ -64,8 +64,10 @@ class Answer:
 class Wire:
     """A threading HTTP server on a free port of loopback, with faults and a log.
 
-    `answer` gets every request that no fault took.
+    `answer` gets every request that no fault took; cuts_ranges: it gives whole files, whatever range was asked for.
     """
+
+    cuts_ranges = True
 
     def __init__(self) -> None:
         self.faults: list[Fault] = []
@@ -171,7 +173,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _send(self, answer: Answer) -> None:
         content, status = self._corrupted(answer.content(), self.command == "GET"), answer.status
         headers = {"Content-Type": "application/json", **answer.headers}
-        if (span := self.headers.get("Range")) and status == 200 and self.command == "GET":
+        if (span := self.headers.get("Range")) and status == 200 and self.command == "GET" and self.wire.cuts_ranges:
             start = int(re.fullmatch(r"bytes=(\d+)-\d*", span)[1])
             headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
             status = 206 if start < len(content) else 416
