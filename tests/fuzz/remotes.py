@@ -22,9 +22,9 @@ from manip_il.store.pull import pull
 from manip_il.store.push import push
 
 from ..store.hub_use import POLICY, a_hub, do_pull, do_push
-from ..store.hub_wire import Answer
 from ..store.s3 import KEY, SECRET, running_moto, running_proxy, variables
 from ..store.trees import impatient, no_wait, unwatched, wait_little
+from ..store.wire import Answer
 from .target import Target
 from .trees import damaged, mutate_json
 

@@ -15,7 +15,8 @@ from pathlib import Path
 from manip_il.store import cards, file_store, hub, s3_store, sftp_store
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.remote import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl
+from manip_il.store.schemes import open_remote
 
 from .trees import unwatched
 
