@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels
+from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels, plan_of
 from manip_il.algorithms.table import check_method
 from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
@@ -83,7 +83,7 @@ def test_pictures_are_rendered_exactly_where_the_policy_takes_them(fit, cameras,
 
 
 def test_a_branch_is_as_long_as_the_policy_needs_for_a_whole_plan():
-    assert [fit.plan_length for fit in (FitConfig(), ACT, DIFFUSION)] == [1, 8, 16]
+    assert [plan_of(fit) for fit in (FitConfig(), ACT, DIFFUSION)] == [(1, 0), (8, 0), (16, 7)]
     lengths = [RunConfig(fit=fit, label="branch").steps_of_branch for fit in (FitConfig(), ACT, DIFFUSION)]
     assert lengths == [1, 8, 16 + 7]
 
