@@ -26,7 +26,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
 
 from ..learn.tiny_policies import ACT
-from .trees import files, is_data
+from .trees import check_same_data, files
 
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
@@ -155,9 +155,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
         list(run_algorithm(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)))
     again = list(run_algorithm(CONFIG, tmp_path, Engine()))
     assert [result.validation for result in again] == [result.validation for result in results]
-    mine, theirs = files(tmp_path), files(whole)
-    assert mine.keys() == theirs.keys()
-    assert {name: mine[name] for name in mine if is_data(name)} == {n: theirs[n] for n in theirs if is_data(n)}
+    check_same_data(tmp_path, whole)
 
 
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypatch):

@@ -166,7 +166,7 @@ def test_batches_that_are_no_pictures_are_refused(pictures: Tensor) -> None:
 
 
 def test_every_row_comes_once_an_epoch():
-    order = ShuffledRows(10, 4, seed=0)
+    order = order_of(10, None, 4, seed=0)  # without weights
     drawn = torch.cat([order.batch(step) for step in range(5)])
     assert sorted(drawn[:10].tolist()) == sorted(drawn[10:].tolist()) == list(range(10))
     assert drawn[:10].tolist() != drawn[10:].tolist()
@@ -187,7 +187,3 @@ def test_a_weighted_batch_depends_on_seed_and_step_alone():
     assert torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(5))
     assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 1).batch(6))
     assert not torch.equal(WeightedRows(weights, 8, 1).batch(5), WeightedRows(weights, 8, 2).batch(5))
-
-
-def test_without_weights_every_row_comes_once_an_epoch():
-    assert isinstance(order_of(10, None, 5, 0), ShuffledRows)

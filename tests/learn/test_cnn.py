@@ -212,11 +212,10 @@ def test_features_that_do_not_fit_are_refused_in_one_line(meta):
     del config.input_features["observation.state"]
     with pytest.raises(UsageError, match=r"cnn policy needs observation\.state and action"):
         CNNPolicy(config)
-    narrow = meta.features | {"action": meta.features["action"] | {"shape": (3,)}}
-    with pytest.raises(MismatchError, match=r"\(4,\).*\(3,\)"):
-        new_policy(SimpleNamespace(features=narrow, root=meta.root, stats={}))
-    grey = meta.features["observation.images.front"] | {"shape": (SIDE, SIDE, 1)}
-    with pytest.raises(MismatchError, match=r"images\.front has \(1, 32, 32\)"):
-        new_policy(
-            SimpleNamespace(features=meta.features | {"observation.images.front": grey}, root=meta.root, stats={})
-        )
+    for key, shape, words in (
+        ("action", (3,), r"\(4,\).*\(3,\)"),
+        ("observation.images.front", (SIDE, SIDE, 1), r"images\.front has \(1, 32, 32\)"),
+    ):
+        columns = meta.features | {key: meta.features[key] | {"shape": shape}}
+        with pytest.raises(MismatchError, match=words):
+            new_policy(SimpleNamespace(features=columns, root=meta.root, stats={}))

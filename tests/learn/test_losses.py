@@ -71,14 +71,19 @@ def torchs(head: Distribution, params: torch.Tensor) -> td.Distribution:
 
 
 @pytest.mark.parametrize("loss", DISTRIBUTIONS)
-def test_the_loss_is_torchs_negative_log_likelihood(loss, generator):
+def test_the_loss_is_torchs_negative_log_likelihood_with_a_gradient(loss, generator):
     head = distribution(loss)
     if isinstance(head, GaussianHead):
         torch.nn.init.normal_(head.raw_log_std, generator=generator)
     params, target = 3 * torch.randn((5, head.size), generator=generator), torch.randn((5, N), generator=generator)
     bins = torch.tensor([0, 5, 10]).expand(5, N)
     ours, theirs = (bins / 5.0 - 1.0, bins) if loss == "categorical" else (target, target)
-    torch.testing.assert_close(head.nll(params, ours), -torchs(head, params).log_prob(theirs))
+    log_prob = head.log_prob(params.requires_grad_(), ours)
+    torch.testing.assert_close(log_prob, torchs(head, params).log_prob(theirs))
+    assert torch.equal(head.nll(params, ours), -log_prob)
+    log_prob.sum().backward()
+    assert params.grad is not None
+    assert params.grad.abs().sum() > 0
 
 
 def test_gaussian_learns_the_deviation(generator):
@@ -214,12 +219,3 @@ def test_the_mean_log_prob_of_samples_is_the_entropy(loss, generator):
     assert entropy[0] == pytest.approx(entropy[1], abs=0.05)
     if loss != "mixture":  # torch has no entropy of one
         assert entropy[0] == pytest.approx(torchs(head, params).entropy().item(), abs=0.03)
-
-
-@pytest.mark.parametrize("loss", DISTRIBUTIONS)
-def test_log_prob_has_a_gradient(loss, generator):
-    head = distribution(loss)
-    params = torch.randn((4, head.size), generator=generator).requires_grad_()
-    head.log_prob(params, torch.zeros(4, N)).sum().backward()
-    assert params.grad is not None
-    assert params.grad.abs().sum() > 0

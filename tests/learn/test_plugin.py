@@ -16,11 +16,7 @@ from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
 
 
-def test_the_plugin_is_known_by_name_after_import():
-    assert type(make_policy_config("mlp")).__module__ == "manip_il.learn.mlp.configuration_mlp"
-
-
-def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset, gapped):
+def test_make_policy_takes_features_and_the_statistics_of_the_valid_relative_targets(dataset, gapped, tmp_path):
     policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
     assert isinstance(policy, MLPPolicy)
     valid = gapped["label_valid"][:, 0] != 0
@@ -28,6 +24,10 @@ def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset,
     np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
     np.testing.assert_allclose(policy.model.target_scale[:-1], relative.std(0), rtol=1e-4)
     assert sorted(policy.config.input_features) == ["observation.environment_state", "observation.state"]
+    policy.save_pretrained(tmp_path / "policy")
+    config = PreTrainedConfig.from_pretrained(tmp_path / "policy")
+    assert config.input_features["observation.environment_state"].type is FeatureType.ENV
+    assert config.output_features["action"].shape == (4,)
 
 
 def test_lerobots_batches_leave_out_frames_without_a_valid_label(dataset):
@@ -71,11 +71,3 @@ def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, datase
     assert json.loads(config.read_text())["policy"]["type"] == "mlp"
     lerobot_train(f"--config_path={config}", "--resume=true", "--steps=110")
     assert (tmp_path / "run/checkpoints/000110/pretrained_model/model.safetensors").is_file()
-
-
-def test_features_of_a_checkpoint_are_lerobots(dataset):
-    policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
-    policy.save_pretrained(dataset.root / "policy")
-    config = PreTrainedConfig.from_pretrained(dataset.root / "policy")
-    assert config.input_features["observation.environment_state"].type is FeatureType.ENV
-    assert config.output_features["action"].shape == (4,)

@@ -94,10 +94,11 @@ def test_only_the_steps_and_options_of_the_policys_own_processors_are_loaded(ste
     assert len(str(caught.value)) < 1_000
 
 
-def test_a_step_by_its_import_path_is_refused_in_any_case(act):
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_step_by_its_import_path_is_refused_in_any_case(trust, act):
     add_step(act, {"class": "subprocess.Popen", "config": {"args": "true"}})
     with pytest.raises(ManipError, match=r"subprocess\.Popen"):
-        LearnedPolicy.load(act, trust=True)
+        LearnedPolicy.load(act, trust=trust)
 
 
 @pytest.mark.parametrize("name", ["../secret.safetensors", "/etc/secret", "sub/x.safetensors", "missing.safetensors"])
