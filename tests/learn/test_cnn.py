@@ -31,8 +31,8 @@ def table(gapped):
 @pytest.fixture
 def meta(dataset, spec):
     """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
-    seen = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
-    return SimpleNamespace(features=features(seen), root=dataset.root, stats={})
+    pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
+    return SimpleNamespace(features=features(pictured), root=dataset.root, stats={})
 
 
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
@@ -151,9 +151,9 @@ def test_saved_and_loaded_by_lerobot_it_acts_bit_equal(meta, table, tmp_path):
     again = get_policy_class("cnn").from_pretrained(tmp_path / "policy", strict=True)
     before, after = make_pre_post_processors(again.config, pretrained_path=str(tmp_path / "policy"))
     expected = policy.eval().select_action(batch)
-    seen = {key: batch[key] for key in again.config.input_features or {}}
+    inputs = {key: batch[key] for key in again.config.input_features or {}}
     for row in range(3):  # unbatched, as a robot gives them
-        action = after(again.select_action(before({key: value[row] for key, value in seen.items()})))
+        action = after(again.select_action(before({key: value[row] for key, value in inputs.items()})))
         assert torch.equal(action, expected[row : row + 1])
 
 

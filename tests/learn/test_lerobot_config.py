@@ -119,7 +119,7 @@ PLANS = {
 def test_no_more_actions_are_taken_of_a_plan_than_it_has(kind) -> None:
     option, plan, taken = PLANS[kind]
     config = policy_config({"type": kind, option: plan, "device": "cpu"}, trust=True)
-    assert (getattr(config, option), config.n_action_steps) == (plan, taken)
+    assert (getattr(config, option), vars(config)["n_action_steps"]) == (plan, taken)
 
 
 def test_a_policy_that_plans_and_is_not_above_is_new_in_lerobot() -> None:
@@ -174,23 +174,23 @@ def test_a_name_that_is_not_there_is_refused_with_the_nearest():
     ],
 )
 def test_a_choice_is_its_columns_and_a_checkpoint_tells_it(observation, inputs, pictured):
-    seen, given = policy_features(features(pictured), observation)
-    assert list(seen) == inputs
-    assert list(given) == ["action"]
-    assert given["action"].shape == (4,)
-    assert observation_of(seen) == observation
+    observed, acted = policy_features(features(pictured), observation)
+    assert list(observed) == inputs
+    assert list(acted) == ["action"]
+    assert acted["action"].shape == (4,)
+    assert observation_of(observed) == observation
     assert observation_of(["observation.state"]) == "state"
 
 
 def test_pictures_are_channels_first_for_a_policy_and_kinds_are_lerobots(pictured):
     table = features(pictured)
     table["observation.state"] |= {"shape": [4]}  # as JSON has it
-    seen, given = policy_features(table, "both")
-    assert seen["observation.images.front"].shape == (3, 32, 48)
-    assert seen["observation.state"].shape == (4,)
+    observed, acted = policy_features(table, "both")
+    assert observed["observation.images.front"].shape == (3, 32, 48)
+    assert observed["observation.state"].shape == (4,)
     kinds = [FeatureType.STATE, FeatureType.ENV, FeatureType.VISUAL, FeatureType.VISUAL]
-    assert [feature.type for feature in seen.values()] == kinds
-    assert given["action"].type is FeatureType.ACTION
+    assert [feature.type for feature in observed.values()] == kinds
+    assert acted["action"].type is FeatureType.ACTION
 
 
 def test_what_is_missing_is_named_with_a_way_out(spec, pictured):

@@ -87,7 +87,7 @@ def test_an_mlps_config_that_lacks_something(mlp):
         ({"normalization_mapping": 3}, "LeRobot cannot load it"),
         ({"dropout": "lots"}, "LeRobot cannot load it"),
         ({"no_such_option": 3}, r"LeRobot cannot load it.*no_such_option"),
-        ({"dim_model": 16}, "do not match"),
+        ({"dim_model": 32}, "do not match"),
     ],
 )
 def test_a_config_of_a_policy_of_lerobots(changes, words, act):

@@ -50,24 +50,20 @@ def test_features_that_do_not_fit_are_refused(dataset):
 
 
 @pytest.mark.slow
-def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, dataset, gapped, tmp_path):
+def test_a_run_of_lerobot_train_is_resumed_by_it(warm_lerobot, dataset, tmp_path):
     def lerobot_train(*options: str) -> None:
         run = warm_lerobot.run("lerobot-train", *options, "--policy.discover_packages_path=manip_il.learn.mlp")
         assert run.returncode == 0, run.stderr[-3000:]
 
     lerobot_train(
-        "--policy.type=mlp", "--policy.width=64", "--policy.optimizer_lr=5e-3", "--policy.scheduler_warmup_steps=10",
-        "--dataset.repo_id=manip/test", f"--dataset.root={dataset.root}", f"--output_dir={tmp_path / 'run'}",
-        "--steps=200", "--save_freq=100", "--batch_size=32", "--num_workers=0", "--prefetch_factor=null",
-        "--persistent_workers=false", "--wandb.enable=false",
+        "--policy.type=mlp", "--policy.width=64", "--policy.scheduler_warmup_steps=10", "--dataset.repo_id=manip/test",
+        f"--dataset.root={dataset.root}", f"--output_dir={tmp_path / 'run'}", "--steps=20", "--save_freq=10",
+        "--batch_size=32", "--num_workers=0", "--prefetch_factor=null", "--persistent_workers=false",
+        "--wandb.enable=false",
     )  # fmt: skip
-    last = tmp_path / "run/checkpoints/last/pretrained_model"
-    policy = LearnedPolicy.load(last)
-    actions = policy.act(gapped["observation.state"], gapped["observation.environment_state"])
-    relative = gapped["action"][:, :-1] - gapped["observation.state"][:, :-1]
-    assert np.abs(actions - gapped["action"])[:, :-1].mean() < 0.4 * np.abs(relative - relative.mean(0)).mean()
-
-    config = tmp_path / "run/checkpoints/000100/pretrained_model/train_config.json"
+    checkpoints = tmp_path / "run/checkpoints"
+    config = checkpoints / "000010/pretrained_model/train_config.json"
     assert json.loads(config.read_text())["policy"]["type"] == "mlp"
-    lerobot_train(f"--config_path={config}", "--resume=true", "--steps=110")
-    assert (tmp_path / "run/checkpoints/000110/pretrained_model/model.safetensors").is_file()
+    lerobot_train(f"--config_path={config}", "--resume=true", "--steps=11")
+    for step in ("000011", "last"):
+        assert LearnedPolicy.load(checkpoints / step / "pretrained_model").interface.type == "mlp"

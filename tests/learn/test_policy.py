@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import socket
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -61,20 +59,6 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
         fast = LearnedPolicy.load(checkpoint).act(states[row : row + 1], environments[row : row + 1])
         assert fast.dtype == np.float64
         assert np.array_equal(action.numpy().astype(np.float64), fast)
-
-
-def test_a_fresh_process_acts_bit_equal(checkpoint, tmp_path):
-    states, environments = observations(9)
-    np.savez(tmp_path / "in.npz", states=states, environments=environments)
-    code = (
-        "import sys, numpy as np; from manip_il.learn.policy import LearnedPolicy;"
-        "z = np.load(sys.argv[2]); p = LearnedPolicy.load(sys.argv[1]);"
-        "np.save(sys.argv[3], p.act(z['states'], z['environments']))"
-    )
-    arguments = [str(checkpoint), str(tmp_path / "in.npz"), str(tmp_path / "out.npy")]
-    run = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
-    assert run.stdout == ""
-    assert np.array_equal(np.load(tmp_path / "out.npy"), LearnedPolicy.load(checkpoint).act(states, environments))
 
 
 def test_loading_needs_no_network(checkpoint, monkeypatch):

@@ -126,14 +126,12 @@ def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
     require_trust(settings, "x", trust=True)
 
 
-def test_an_encoder_by_name_is_refused_in_options_and_in_checkpoints(tmp_path):
+def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(tmp_path):
     settings = {"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}
-    with pytest.raises(ManipError, match=r"--policy\.type=gaussian_actor.*vision_encoder_name='evil/encoder'"):
-        policy_config(settings)
-    assert policy_config({"type": "gaussian_actor"}).type == "gaussian_actor"
-    config = settings | {"input_features": {}, "output_features": {}}
-    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "config.json").write_text(json.dumps(settings | {"input_features": {}, "output_features": {}}))
     (tmp_path / "model.safetensors").touch()
-    with pytest.raises(ManipError, match=r"vision_encoder_name='evil/encoder'.*--trust=true"):
+    with pytest.raises(ManipError, match=r"--policy\.path.*vision_encoder_name='evil/encoder'.*--trust=true"):
         policy_config({"path": str(tmp_path)})
     assert policy_config({"path": str(tmp_path)}, trust=True).type == "gaussian_actor"
+    with pytest.raises(ManipError, match=r"--policy\.type=gaussian_actor.*vision_encoder_name='evil/encoder'"):
+        policy_config(settings)
