@@ -1,4 +1,4 @@
-"""Options of one run of an algorithm: who drives, what is learnt from, and all of it checked against each other."""
+"""Options of one run of an algorithm: the driver, the data, and all of it checked against each other."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ CORRECTION = 0.25  # of the longest step: where expert and learner differ by mor
 class Sampling:
     """Relative weight of a frame. All equal: each frame once an epoch.
 
-    demonstrations: of round 0. corrections: of later rounds, where the expert drove or differed from who did by more
-    than `CORRECTION`. rollouts: the others of later rounds.
+    demonstrations: of round 0. corrections: of later rounds, where the expert drove, or its label differs from the
+    executed action by more than `CORRECTION`. rollouts: the others of later rounds.
     """
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
@@ -203,7 +203,7 @@ class RunConfig:
     @property
     def steps_of_branch(self) -> int:
         """Return the control steps of a branch: those given, else enough to learn a whole plan from."""
-        return self.branch_steps or self.fit.plan_length + self.fit.dropped_frames
+        return self.branch_steps or sum(plan_of(self.fit))
 
     @property
     def query(self) -> QueryRule:
@@ -214,6 +214,16 @@ class RunConfig:
         if self.query_rule is not None or self.label == "per_state":
             return self.query_rule or QueryRule()
         return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)
+
+
+def plan_of(fit: FitConfig) -> tuple[int, int]:
+    """Return how many actions a policy plans at once, and how many last frames of an episode it does not learn from."""
+    if fit.is_mlp:  # without LeRobot, whose import takes seconds
+        return 1, 0
+    from manip_il.learn.lerobot_config import policy_config
+
+    policy = policy_config(fit.policy, trust=fit.trust)
+    return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
 
 
 def check_cameras(config: RunConfig) -> None:
@@ -232,17 +242,18 @@ def check_labels(config: RunConfig) -> None:
     """
     from manip_il.learn.lerobot_config import LeRobotFit
 
-    fit, plan = config.fit, config.fit.plan_length
+    fit = config.fit
     LeRobotFit(fit)
+    plan, dropped = plan_of(fit)
     name, rule = fit.policy.get("type", "mlp"), config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(
             f"query={rule} with label=per_state yields single labels, and {name} learns from {plan} in a row; "
             "use label=branch or label=takeover"
         )
-    if config.label == "branch" and config.steps_of_branch <= fit.dropped_frames:
+    if config.label == "branch" and config.steps_of_branch <= dropped:
         raise UsageError(
-            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {fit.dropped_frames} frames of "
+            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {dropped} frames of "
             "every episode; give more, or --policy.drop_n_last_frames=0"
         )
     if rule.kind == "likelihood":

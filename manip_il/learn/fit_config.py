@@ -123,25 +123,6 @@ class FitConfig:
         """Peak learning rate; None for that of the optimiser's preset."""
         return MLP_LR if self.lr is None and self.is_mlp else self.lr
 
-    @property
-    def plan_length(self) -> int:
-        """Actions that the policy plans at once: 1 for one that maps a state to an action."""
-        indices = self._lerobot_option("action_delta_indices")
-        return len(indices) if indices else 1
-
-    @property
-    def dropped_frames(self) -> int:
-        """Frames at an episode's end that the policy does not learn from."""
-        return self._lerobot_option("drop_n_last_frames") or 0
-
-    def _lerobot_option(self, name: str) -> Any:
-        """An attribute of the policy's configuration, which imports LeRobot; None for the mlp."""
-        if self.is_mlp:
-            return None
-        from manip_il.learn.lerobot_config import policy_config
-
-        return getattr(policy_config(self.policy, trust=self.trust), name, None)
-
 
 @cache
 def policy_files() -> Mapping[str, Path]:

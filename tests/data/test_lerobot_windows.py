@@ -15,7 +15,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_read import camera_keys
-from manip_il.data.video import VideoConfig
+from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 

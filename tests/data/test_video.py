@@ -29,6 +29,7 @@ from manip_il.data.lerobot_read import (
 )
 from manip_il.data.lerobot_stats import pixel_counts
 from manip_il.data.video import VideoConfig
+from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
