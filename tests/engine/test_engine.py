@@ -112,7 +112,8 @@ def test_what_a_worker_raises_arrives_and_the_engine_goes_on(two_processes, tmp_
 def test_workers_end_with_the_process_that_started_them():
     code = (
         "from multiprocessing import forkserver, resource_tracker\n"
-        "from manip_il.engine.engine import *\n"
+        "from manip_il.engine.engine import Engine\n"
+        "from manip_il.engine.jobs import RolloutJob\n"
         "from manip_il.sim.env import EnvConfig\n"
         "engine = Engine(2)\n"
         "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
