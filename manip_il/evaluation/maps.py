@@ -77,9 +77,9 @@ class DrawnMark(NamedTuple):
     """A mark in one view [px]. end: None where there is none inside the picture."""
 
     mark: MapMark
-    start: tuple[float, float]
-    goal: tuple[float, float]
-    end: tuple[float, float] | None
+    start: Sequence[float]
+    goal: Sequence[float]
+    end: Sequence[float] | None
 
 
 @dataclass(frozen=True)
@@ -195,10 +195,10 @@ def _draw(marks: Sequence[MapMark], view: View) -> list[DrawnMark]:
     pixels = view.project(places.reshape(-1, 3)).reshape(-1, 3, 2).tolist()
     edge = MARGIN / 2
     drawn: list[DrawnMark] = []
-    for mark, (start, goal, end) in zip(marks, pixels, strict=True):
-        inside = edge < end[0] < WIDTH - edge and edge < end[1] < view.height - edge
+    for mark, (start, goal, (x, y)) in zip(marks, pixels, strict=True):
+        inside = edge < x < WIDTH - edge and edge < y < view.height - edge
         has_end = mark.outcome != "solved" and mark.end is not None and inside
-        drawn.append(DrawnMark(mark, tuple(start), tuple(goal), tuple(end) if has_end else None))
+        drawn.append(DrawnMark(mark, start, goal, (x, y) if has_end else None))
     return drawn
 
 
