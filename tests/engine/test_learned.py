@@ -77,13 +77,13 @@ def test_a_policy_sees_the_pictures_that_lerobot_would_show_it(seeing):
 
 @pytest.mark.gl
 def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing, tmp_path):
-    seen = RolloutJob(ENV, "mixture", policy=seeing, beta=0.5)
+    job = RolloutJob(ENV, "mixture", policy=seeing, beta=0.5)
     keep = JournalKeep(tmp_path, env_spec(ENV), env_fingerprint(ENV))
-    episodes = list(Engine(1).run(seen, SEEDS[:2], keep))
+    episodes = list(Engine(1).run(job, SEEDS[:2], keep))
     assert not [key for episode in episodes for key in episode.columns if key.startswith("observation.images")]
     assert [read_journal(path)[1].seed for path in list_episodes(tmp_path)] == list(SEEDS[:2])
     both = replace(DIM, names=("wrist", "front"))
-    recorded = list(run_job(replace(seen, cameras=both), SEEDS[:2]))
+    recorded = list(run_job(replace(job, cameras=both), SEEDS[:2]))
     assert recorded[0].columns["observation.images.wrist"].shape == (8, 32, 32, 3)
     assert written(episode.without_pictures() for episode in recorded) == written(episodes)
 
@@ -119,8 +119,8 @@ def test_pictures_that_no_environment_has_are_refused(seeing, tmp_path):
     features = {"observation.state": {"type": "STATE", "shape": [8]}}
 
     def look_at(**pictures: list[int]) -> None:
-        shown = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
-        edit_config(folder, input_features=features | shown)
+        visual = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
+        edit_config(folder, input_features=features | visual)
 
     for pictures, kind, words in (
         ({"top": [3, 32, 32]}, MismatchError, r"cameras .*top, the environment has front, wrist"),

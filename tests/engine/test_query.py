@@ -26,13 +26,13 @@ STATE = State(np.zeros(4), np.zeros(3))
 
 
 class Teacher:
-    """An expert of one answer, which counts how often it was asked."""
+    """An expert of one answer, which counts its queries."""
 
-    def __init__(self, action: list[float]):
-        self.action, self.asked = np.array(action), 0
+    def __init__(self, *action: float):
+        self.action, self.queries = np.array(action), 0
 
     def label(self, state: State) -> Label:
-        self.asked += 1
+        self.queries += 1
         return Label(self.action, 5, True, 0.0)
 
 
@@ -93,15 +93,15 @@ def test_differences_are_measured_in_steps_of_the_worst_dimension():
     assert action_gap(left, right, SCALE) == pytest.approx([0.5, 1.0])
 
 
-def test_safety_asks_where_expert_and_learner_differ_by_more_than_the_bound():
-    teacher = Teacher([0.0, 0.0, 0.08])
+def test_safety_queries_where_expert_and_learner_differ_by_more_than_the_bound():
+    teacher = Teacher(0.0, 0.0, 0.08)
     turns = [turn(teacher=teacher), turn(teacher=teacher)]
     gate = on_gap(0.5, SCALE)
     assert gate(turns, [np.array([0.04, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])]) == [False, True]
     assert [one.label for one in turns] == [None, None]  # knowing is not keeping
 
 
-def test_an_ensemble_asks_where_its_members_spread():
+def test_an_ensemble_queries_where_its_members_spread():
     others = [Constant(0.0, 0.0, 0.08), Constant(0.0, 0.0, 0.08)]
     gate = on_disagreement(0.2, others, SCALE)
     agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
@@ -109,18 +109,18 @@ def test_an_ensemble_asks_where_its_members_spread():
     assert [member.begun for member in others] == [[7], [7]]  # a policy with a memory must know who begins
 
 
-def test_an_unsure_learner_asks():
+def test_an_unsure_learner_queries():
     assert on_low_likelihood(-1.0, Doubtful())([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
 
 
-def test_chance_asks_in_its_share_of_the_steps_and_the_same_for_a_seed():
-    def asked(seeds) -> np.ndarray:
+def test_chance_queries_in_its_share_of_the_steps_and_the_same_for_a_seed():
+    def queried(seeds) -> np.ndarray:
         gate = by_chance(0.3)
         return np.array([gate([turn(seed, step) for seed in seeds], []) for step in range(200)])
 
-    both = asked([1, 2])
+    both = queried([1, 2])
     assert both.mean() == pytest.approx(0.3, abs=5 * math.sqrt(0.3 * 0.7 / both.size))
-    assert np.array_equal(asked([2])[:, 0], both[:, 1])
+    assert np.array_equal(queried([2])[:, 0], both[:, 1])
 
 
 def test_one_step_of_an_episode_is_drawn_evenly():
@@ -130,10 +130,10 @@ def test_one_step_of_an_episode_is_drawn_evenly():
     assert [gate([turn(3, step)], []) for step in range(10)].index([True]) == drawn[3]
 
 
-def test_a_turn_asks_once_and_only_where_there_is_an_expert():
-    teacher = Teacher([0.0, 0.0, 0.0])
+def test_a_turn_queries_once_and_only_where_there_is_an_expert():
+    teacher = Teacher(0.0, 0.0, 0.0)
     one = turn(teacher=teacher)
     assert one.query() is one.query() is one.label
-    assert teacher.asked == 1
+    assert teacher.queries == 1
     with pytest.raises(ManipError, match="episode 4: nobody to ask for a label at step 9"):
         turn(4, 9).query()
