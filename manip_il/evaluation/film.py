@@ -34,7 +34,7 @@ Frames = Sequence[NDArray[np.uint8]]
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
     """Return the episode of one seed, the same as in an evaluation of `job`, with its states."""
-    return next(iter(run_job(replace(job, label="last"), [seed])))
+    return next(run_job(replace(job, label="last"), [seed]))
 
 
 def film(

@@ -65,7 +65,7 @@ def test_the_least_that_machine_and_control_groups_leave(tmp_path, groups, lines
     for folder, numbers in held.items():
         group(groups / folder, *numbers)
     proc = machine(tmp_path / "proc", free=64 * GB, groups=lines)
-    assert abs(available_memory(proc, groups) - left) <= (KIB if left == 64 * GB else 0)
+    assert available_memory(proc, groups) == (pytest.approx(left, abs=KIB) if left == 64 * GB else left)
 
 
 def test_more_workers_cameras_networks_and_weights_each_need_more():
