@@ -16,7 +16,6 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.lerobot_read import dataset_info, read_frames, read_spec, read_table
-from manip_il.data.video import VideoConfig
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError

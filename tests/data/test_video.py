@@ -28,7 +28,6 @@ from manip_il.data.lerobot_read import (
     read_table,
 )
 from manip_il.data.lerobot_stats import pixel_counts
-from manip_il.data.video import VideoConfig
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
