@@ -6,36 +6,26 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
-from manip_il.data import schema as s
 from manip_il.data.build import build
 from manip_il.data.journal import write_episode
 from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
+from .made_runs import make_episode
+
 ENV = EnvConfig("panda", "reach", 20)
-
-
-def episode(seed: int, length: int = 6) -> Episode:
-    columns: dict[str, np.ndarray] = {}
-    rng = np.random.default_rng(seed)
-    for key, feature in s.features(env_spec(ENV)).items():
-        shape = (length, *feature["shape"])
-        columns[key] = rng.integers(0, 2, shape).astype(feature["dtype"])
-    columns[s.SEED][:], columns[s.SUCCESS][:] = seed, True
-    columns[s.DONE][:, 0] = np.arange(length) == length - 1
-    return Episode(seed, columns, True, True)
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for seed in (1, 2):
-        write_episode(tmp_path / "d.journals", episode(seed), env_spec(ENV), env_fingerprint(ENV))
+        write_episode(
+            tmp_path / "d.journals", make_episode(env_spec(ENV), seed, 6), env_spec(ENV), env_fingerprint(ENV)
+        )
     build(tmp_path / "d.journals", tmp_path / "d")
     return tmp_path / "d"
 
