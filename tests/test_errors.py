@@ -13,12 +13,9 @@ from manip_il.errors import (
 
 
 def test_a_near_name_is_offered_and_all_are_listed():
-    known = ["panda", "fetch"]
-    assert (
-        str(UnknownName("robot", "pnada", known))
-        == "unknown robot 'pnada' (did you mean 'panda'?); known: fetch, panda"
-    )
-    assert str(UnknownName("robot", "xylophone", known)) == "unknown robot 'xylophone'; known: fetch, panda"
+    near, far = (str(UnknownName("robot", name, ["panda", "fetch"])) for name in ("pnada", "xylophone"))
+    assert near == "unknown robot 'pnada' (did you mean 'panda'?); known: fetch, panda"
+    assert far == "unknown robot 'xylophone'; known: fetch, panda"
     assert nearest("lfit", iter(["reach", "lift"])) == " (did you mean 'lift'?)"
 
 
