@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
+from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 
 ENV = EnvConfig("panda", "reach", horizon=8)
@@ -54,8 +54,7 @@ def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
 
 def mark(policy: Path, words: str) -> Path:
     """Make a policy another one, that acts the same."""
-    path = policy / META_FILE
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"options": {"mark": words}}))
+    edit_json(policy / META_FILE, lambda meta: meta.update(options={"mark": words}))
     return policy
 
 

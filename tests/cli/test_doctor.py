@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from manip_il.data.journal import write_episode
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.sim.env import EnvConfig
 
+from ..damage import edit_json
 from .made_runs import make_episode
 
 ENV = EnvConfig("panda", "reach", 20)
@@ -73,10 +73,8 @@ def test_what_stays_wrong_exits_1(root, capsys):
 
 
 def test_the_robots_joints_are_compared(root, capsys):
-    ours = json.loads((root / layout.OURS).read_text())
-    ours["spec"]["joint_names"][0] = "elbow"
-    ours["fingerprint"]["model_sha256"] = "0" * 64
-    (root / layout.OURS).write_text(json.dumps(ours))
+    edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "elbow"))
+    edit_json(root / layout.OURS, lambda ours: ours["fingerprint"].update(model_sha256="0" * 64))
     assert main(["doctor", str(root)]) == 1
     out = capsys.readouterr().out
     assert "error    meta/manip_il.json: joint_names is elbow, " in out
@@ -84,9 +82,7 @@ def test_the_robots_joints_are_compared(root, capsys):
 
 
 def test_a_robot_that_is_not_known_is_said(root, capsys):
-    for name, key in ((layout.OURS, "robot"), (layout.INFO, "robot_type")):
-        data = json.loads((root / name).read_text())
-        (data["spec"] if name == layout.OURS else data)[key] = "so100"
-        (root / name).write_text(json.dumps(data))
+    edit_json(root / layout.OURS, lambda ours: ours["spec"].update(robot="so100"))
+    edit_json(root / layout.INFO, lambda info: info.update(robot_type="so100"))
     assert main(["doctor", str(root)]) == 0
     assert "is for so100 reach, which is not known here" in capsys.readouterr().out

@@ -19,6 +19,7 @@ from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
 
+from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 from .made_runs import make_policy, make_run, mark
 
@@ -41,17 +42,14 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
         assert suite_conditions(suite, "pick_place", sees=True)
     assert {name for names in SUITES.values() for name in names} == set(CONDITIONS)
     assert suite_conditions("nominal", "reach", sees=False) == (NOMINAL,)
+    [knocked] = suite_conditions("knocked", "pick_place", sees=False)
+    assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
     names = [one.name for one in suite_conditions("all", "pick_place", sees=True)]
     assert names == ["nominal", "knocked", "sensing", "object", "view"]
     assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == names[:-1]
     assert [one.name for one in suite_conditions("all", "reach", sees=False)] == names[:-2]
     with pytest.raises(UsageError, match="changes nothing for reach"):
         suite_conditions("object", "reach", sees=True)
-
-
-def test_knocked_is_the_disturbance_that_dagger_collects_under():
-    [knocked] = suite_conditions("knocked", "pick_place", sees=False)
-    assert knocked.ranges == STANDARD.ranges
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
@@ -190,11 +188,8 @@ def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys)
 
 def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
-    path = Path("e/eval.json")
-    data = json.loads(path.read_text())
-    data["episodes"][0] |= {"success": True, "return": 3.0}
-    data["episodes"][1]["drawn"]["delay"] = 77
-    path.write_text(json.dumps(data))
+    edit_json(Path("e/eval.json"), lambda data: data["episodes"][0].update({"success": True, "return": 3.0}))
+    edit_json(Path("e/eval.json"), lambda data: data["episodes"][1]["drawn"].update(delay=77))
     capsys.readouterr()
     assert main(["replay", "e", "--episode=0"]) == 1
     line = error()

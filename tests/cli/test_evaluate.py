@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
 
+from ..damage import edit_json
 from ..learn.tiny_policies import edit_config, write_checkpoint
 from .made_runs import make_policy
 
@@ -41,11 +41,6 @@ def seeing(tmp_path) -> Path:
     return write_checkpoint(tmp_path / "policy", "act", spec, "images", meta=meta)
 
 
-def change_meta(policy: Path, **changes: object) -> None:
-    path = policy / META_FILE
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
 def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):
     assert evaluate(act, tmp_path / "e") == 0
     out, err = capsys.readouterr()
@@ -68,7 +63,7 @@ def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
 
 @pytest.mark.gl
 def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tmp_path, capsys):
-    change_meta(seeing, look=None)
+    edit_json(seeing / META_FILE, lambda meta: meta.update(look=None))
     assert evaluate(seeing, tmp_path / "e") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "size and look" in line]
     for fingerprint in (env_fingerprint(ENV, DIM), env_fingerprint(ENV, replace(DIM, look=Look()))):

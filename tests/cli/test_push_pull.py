@@ -27,7 +27,7 @@ def url(tmp_path: Path) -> str:
     return f"file://{tmp_path}/store"
 
 
-def test_there_and_back(run, url, tmp_path, capsys):
+def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
     assert main(["push", str(run), url]) == 0
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
@@ -42,11 +42,6 @@ def test_there_and_back(run, url, tmp_path, capsys):
     assert captured.out == f"{target}: a policy of 2 files, 1.51 kB, all verified\n"
     assert captured.err == ""
     assert (target / "metrics.jsonl").read_bytes() == b"x" * 1500
-
-
-def test_again_nothing_travels(run, url, capsys):
-    assert main(["push", str(run), url]) == 0
-    capsys.readouterr()
     assert main(["push", str(run), url]) == 0
     assert capsys.readouterr().out.splitlines()[0] == f"{url}: 2 files, all there already"
 

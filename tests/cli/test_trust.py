@@ -19,6 +19,7 @@ from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.lerobot_config import LeRobotFit
 
+from ..damage import edit_json
 from .made_runs import ENV, make_eval, make_policy, make_run
 
 COMMANDS = ("train", "dagger", "eval", "replay", "compare", "study", "certify")
@@ -35,10 +36,7 @@ REQUIRED = {
 def hostile(tmp_path) -> Path:
     """A policy of which a processor's step fetches a tokenizer by name."""
     policy = make_policy(tmp_path / "hostile")
-    path = policy / "policy_preprocessor.json"
-    values = json.loads(path.read_text())
-    values["steps"].append(STEP)
-    path.write_text(json.dumps(values))
+    edit_json(policy / "policy_preprocessor.json", lambda values: values["steps"].append(STEP))
     return policy
 
 
