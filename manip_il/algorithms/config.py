@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.engine.drivers import QueryRule, action_gap
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.mdp import Actor
 from manip_il.option import option
-from manip_il.seeding import MAX_ROUNDS
 from manip_il.sim.config import CameraConfig, EnvConfig
+
+if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from manip_il.engine.drivers import QueryRule
+
+    F64 = NDArray[np.float64]
 
 SCHEDULES = {
     "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
@@ -74,8 +76,6 @@ def _number(text: str) -> float | None:
         return None
 
 
-F64 = NDArray[np.float64]
-COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
 CORRECTION = 0.25  # of the longest step: where expert and learner differ by more, the label corrects
 
 
@@ -94,7 +94,7 @@ class Sampling:
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
-            if not 0 <= value < np.inf:
+            if not 0 <= value < math.inf:
                 raise UsageError(f"sampling.{one.name} is {value}; expected 0 or more")
         if self.demonstrations == 0:
             raise UsageError("sampling.demonstrations is 0, but round 0 has nothing else to learn from")
@@ -105,12 +105,18 @@ class Sampling:
         return self.demonstrations == self.corrections == self.rollouts
 
     def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
-        """Return the weight of every frame of a table with `COLUMNS`, (N,); None where all are equal.
+        """Return the weight of every frame of a table with `fitting.COLUMNS`, (N,); None where all are equal.
 
         scale: see `action_gap`.
         """
         if self.is_even:
             return None
+        import numpy as np
+
+        from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
+        from manip_il.engine.drivers import action_gap
+        from manip_il.mdp import Actor
+
         gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
         by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
         later = np.where(by_expert | (gap > CORRECTION), self.corrections, self.rollouts)
@@ -167,6 +173,8 @@ class RunConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        from manip_il.seeding import MAX_ROUNDS
+
         for name in _AT_LEAST_1:
             if (value := getattr(self, name)) is not None and value < 1:
                 raise UsageError(f"{name} is {value}; expected at least 1")
@@ -181,6 +189,8 @@ class RunConfig:
         self._check_queries()
 
     def _check_queries(self) -> None:
+        from manip_il.engine.drivers import QueryRule
+
         rule = self.query_rule or QueryRule()
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
@@ -211,6 +221,8 @@ class RunConfig:
 
         `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
         """
+        from manip_il.engine.drivers import QueryRule
+
         if self.query_rule is not None or self.label == "per_state":
             return self.query_rule or QueryRule()
         return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)

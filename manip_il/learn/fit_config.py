@@ -33,6 +33,15 @@ _FEW = 12  # names that one line of an error may list
 
 
 @dataclass(frozen=True)
+class MLPOptions:
+    """The options of the mlp that change most; `MLPConfig` has them all."""
+
+    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
+    width: int = option(256, "units per layer")
+    depth: int = option(3, "hidden layers")
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 

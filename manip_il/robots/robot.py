@@ -14,10 +14,9 @@ import numpy as np
 
 from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.robots import ROBOTS
 from manip_il.yaml_file import read_yaml
 
-HERE = Path(__file__).parent
-ROBOTS = {"panda": HERE / "panda.yaml", "fetch": HERE / "fetch.yaml"}
 SUFFIXES = (".yaml", ".yml")
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 _MOST_JOINTS = 100

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.robots import reach
+from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
-from manip_il.robots.robot import HERE, Robot, get_robot
+from manip_il.robots.robot import Robot, get_robot
 
 from ..tables import every_robot
 from .own import write
