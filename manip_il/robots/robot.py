@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from manip_il import checks
+from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
-from manip_il.yaml_file import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]

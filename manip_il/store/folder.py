@@ -1,4 +1,4 @@
-"""Folders of datasets and runs as they are pushed: which files, with their hashes, and where a run's policy lies."""
+"""What push, pull and cards share: the remote of a URL, and folders as they are pushed, with their files' hashes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from manip_il.errors import UsageError
 from manip_il.store.disk import HASHERS, hash_file
 from manip_il.store.errors import ManifestError
 from manip_il.store.manifest import FileEntry, Kind, Manifest, check_path, fold
-from manip_il.store.remote import MANIFEST_FILE
+from manip_il.store.remote import MANIFEST_FILE, Remote, RemoteUrl
 
 CONFIG = "config.json"  # of every policy
 CARD = "README.md"
@@ -168,3 +168,23 @@ def _policy_files(manifest: Manifest) -> Mapping[str, FileEntry]:
     start = f"{folder}/"
     inside = {path.removeprefix(start): entry for path, entry in manifest.by_path.items() if path.startswith(start)}
     return {name: entry for name, entry in inside.items() if "/" not in name and name != CARD}
+
+
+def open_remote(url: RemoteUrl, *, private: bool = False) -> Remote:
+    """Return the remote of a URL, without connecting yet; the library of its scheme is imported here.
+
+    private: of a repository that a push creates on the Hub.
+    """
+    if url.scheme == "hf":
+        from manip_il.store.hub import HubRemote
+
+        return HubRemote(url, private)
+    if url.scheme == "s3":
+        from manip_il.store.s3_store import S3Blobs as Blobs
+    elif url.scheme == "sftp":
+        from manip_il.store.sftp_store import SftpBlobs as Blobs
+    else:
+        from manip_il.store.file_store import FileBlobs as Blobs
+    from manip_il.store.object_store import ObjectRemote
+
+    return ObjectRemote(Blobs(url))

@@ -15,7 +15,7 @@ from manip_il.cli.options import Open, expected, metavar, options_of, value_of, 
 from manip_il.cli.parsing import dump_yaml, from_layers, from_yaml, parse
 from manip_il.errors import UsageError
 
-from ..test_yaml_file import BOMB
+from ..test_yaml import BOMB
 
 
 @dataclass

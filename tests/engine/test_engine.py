@@ -18,7 +18,8 @@ from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
-from ..test_child_processes import is_alive, wait_for
+from ..faults.child import living
+from ..test_child_processes import wait_for
 
 SEEDS = stream_seeds("certificate", 6)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=3)
@@ -110,9 +111,9 @@ def test_workers_end_with_the_process_that_started_them():
         "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
         "    print(pids, flush=True)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert parent.stdout is not None
     pids = [int(pid) for pid in parent.stdout.readline().strip("[]\n").split(",")]
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    wait_for(lambda: not any(map(is_alive, pids)))
+    wait_for(lambda: not set(pids) & set(living(parent.pid)))

@@ -11,10 +11,10 @@ import pytest
 from huggingface_hub import constants
 
 from manip_il.store.errors import Retry
+from manip_il.store.folder import open_remote
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
 from manip_il.store.remote import MANIFEST_FILE, Published, RemoteUrl
-from manip_il.store.schemes import open_remote
 
 from ..learn.tiny_policies import write_checkpoint
 from .hub_server import Hub, hub_server

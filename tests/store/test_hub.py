@@ -18,11 +18,10 @@ from manip_il.errors import UsageError
 from manip_il.store.cards import CARD, PICTURE
 from manip_il.store.disk import git_digest
 from manip_il.store.errors import ConflictError
-from manip_il.store.folder import scan
+from manip_il.store.folder import open_remote, scan
 from manip_il.store.hub_session import hub_session
 from manip_il.store.push import check_source, push
 from manip_il.store.remote import MANIFEST_FILE, RemoteUrl
-from manip_il.store.schemes import open_remote
 
 from .hub_server import Hub
 from .hub_use import (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from manip_il.checks import DEEPEST_YAML, LARGEST_YAML, parse_yaml, read_yaml
 from manip_il.errors import UsageError
-from manip_il.yaml_file import DEEPEST, LARGEST, parse_yaml, read_yaml
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
@@ -18,7 +18,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
         BOMB,
         "&a [*a]",
         "[" * 100_000,
-        "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1),
+        "[" * (DEEPEST_YAML + 1) + "]" * (DEEPEST_YAML + 1),
         "a: !!python/object/apply:os.getcwd []",
         "2001-99-99",
         "!!timestamp x",
@@ -40,8 +40,8 @@ def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path, text):
 
 def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path):
     path = tmp_path / "c.yaml"
-    path.write_text("a: 1\n" * LARGEST)
-    with pytest.raises(UsageError, match=f"has more than {LARGEST} bytes"):
+    path.write_text("a: 1\n" * LARGEST_YAML)
+    with pytest.raises(UsageError, match=f"has more than {LARGEST_YAML} bytes"):
         read_yaml(path, "a YAML file of options")
 
 
@@ -50,5 +50,5 @@ def test_plain_yaml_is_read():
         "a": [1, 2.5, True, None, "*b"],
         "b": {"c": "d & e"},
     }
-    deep = "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
+    deep = "[" * (DEEPEST_YAML - 1) + "]" * (DEEPEST_YAML - 1)
     assert isinstance(parse_yaml(deep), list)
