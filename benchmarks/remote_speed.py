@@ -43,9 +43,10 @@ from store.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[rep
 from store.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
 
 from manip_il.store.disk import sync_disk
+from manip_il.store.folder import open_remote
 from manip_il.store.pull import pull
 from manip_il.store.push import push
-from manip_il.store.remote import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl
 from manip_il.store.sftp_connection import quick_transport
 
 BUCKET = "benchmark"

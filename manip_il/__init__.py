@@ -2,6 +2,7 @@
 
 Importing the package registers its environments with gymnasium, as packages of environments do: at once where
 gymnasium is loaded, else when somebody imports it, so that a command that needs no environment starts without it.
+(Since 1.0 gymnasium loads no plugins by the entry point `gymnasium.envs`.)
 The OpenGL for pictures is chosen too, as mujoco reads MUJOCO_GL when it is imported, never after.
 """
 

@@ -1,4 +1,4 @@
-"""Check what is read from outside (JSON, names that become paths, numbers, text) where its type is made.
+"""Check what is read from outside (JSON, YAML, names that become paths, numbers, text) where its type is made.
 
 Every check returns the value with its declared type, or raises `ManipError` with one short line that names the thing,
 its value and what was expected. Values are printed shortened, so that a hostile one can neither flood a terminal nor
@@ -7,6 +7,7 @@ take time to print.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -15,14 +16,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
 LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million episodes
+LARGEST_YAML = 256 * 1024  # [bytes]: the parser takes a second for 100 kB
+DEEPEST_YAML = 50  # levels
 LARGEST_SEED = 2**63 - 1  # datasets store seeds as int64
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
+_LONGEST_WHY = 300  # of a parser's message [characters]
 _LONGEST_PRINTED = 300  # [characters]
 _PRINTED = reprlib.Repr()
 _PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
@@ -120,14 +124,19 @@ def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> An
 
 def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
     """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
+
+
+def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
+    """Return a file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
     try:
         with path.open("rb") as file:
             data = file.read(largest + 1)
     except OSError as error:
-        raise ManipError(f"cannot read {path}: {error.strerror}; expected {what}") from error
+        raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
     if len(data) > largest:
-        raise ManipError(f"{path} has more than {largest} bytes; expected {what}")
-    return mapping(str(path), parse_json(str(path), data))
+        raise refusal(f"{path} has more than {largest} bytes; expected {what}")
+    return data
 
 
 def _is_float(value: float) -> bool:
@@ -141,3 +150,45 @@ def _to_none(constant: str) -> None:
 
 def _refuse_constant(constant: str) -> Any:
     raise ValueError(f"{constant} is not a number in JSON")
+
+
+def parse_yaml(text: str) -> Any:
+    """Return what a YAML text holds. Raises `ValueError`, in one line, for what is none, has aliases or is too deep."""
+    import yaml  # here, as most of what checks something reads no YAML
+
+    try:
+        return yaml.load(text, _loader())
+    except Exception as error:  # besides its own errors it raises whatever int() or datetime() do
+        raise ValueError(" ".join(str(error).split())[:_LONGEST_WHY]) from error
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """Return what is in a file; `UsageError` where it cannot be read. what: the file should be, for the message."""
+    data = read_bytes(path, what, LARGEST_YAML, UsageError)
+    try:
+        return parse_yaml(data.decode())
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise UsageError(f"{path} is not YAML: {error}") from error
+
+
+@functools.cache
+def _loader() -> Any:
+    """Return a loader without tags that run code, and without aliases, which can grow beyond any memory."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        _depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError(
+                    f"an alias (*) in line {self.peek_event().start_mark.line + 1}; write the value out"
+                )
+            self._depth += 1
+            if self._depth > DEEPEST_YAML:
+                raise yaml.YAMLError(f"nested deeper than {DEEPEST_YAML} levels")
+            node = super().compose_node(parent, index)
+            self._depth -= 1
+            return node
+
+    return Loader

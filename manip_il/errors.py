@@ -1,16 +1,26 @@
 """Errors that explain themselves: the thing, its value, what was expected, what to do next.
 
-The command line turns every `ManipError` into one line on standard error and its `exit_code`.
+The command line turns every `ManipError` into one line on standard error and its `exit_code`. LeRobot's warning of
+missing FFmpeg libraries becomes one line, too.
 """
 
 from __future__ import annotations
 
 import difflib
+import functools
+import logging
+import sys
 from collections.abc import Iterable, Sequence
 
 _FEW = 3  # names that an error offers
 _BEGINNING = 3  # characters of a name that tell it from others
 _LONGEST_NAME = 200  # [characters] of a name that is compared or printed
+_LOGGER = "lerobot.utils.import_utils"  # logs a traceback of 90 lines where torchcodec finds no FFmpeg
+_MARK = "'torchcodec' is installed but cannot be loaded"
+NO_FFMPEG = (
+    "manip-il: warning: FFmpeg's shared libraries are missing, so LeRobot reads videos with PyAV (slower); on Debian: "
+    "apt-get install -y ffmpeg"
+)
 
 
 class ManipError(Exception):
@@ -110,3 +120,20 @@ def did_you_mean(names: Sequence[str]) -> str:
 def shorten(text: str) -> str:
     """Return a text in quotes, cut where it is longer than a line."""
     return repr(text if len(text) <= _LONGEST_NAME else f"{text[:_LONGEST_NAME]}...")
+
+
+def shorten_ffmpeg_warning() -> None:
+    """Replace LeRobot's warning of missing FFmpeg libraries by one line; a second call changes nothing."""
+    logging.getLogger(_LOGGER).addFilter(_passes)
+
+
+def _passes(record: logging.LogRecord) -> bool:
+    if _MARK not in record.getMessage():
+        return True
+    _print_once()
+    return False
+
+
+@functools.cache
+def _print_once() -> None:
+    print(NO_FFMPEG, file=sys.stderr, flush=True)  # as every other warning of ours, whatever handlers there are

@@ -13,20 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.examine import examine
-from manip_il.doctor.finding import Finding
+from manip_il.doctor.examine import examine_folder
 
 DATA = layout.DATA_PATH.format(chunk_index=0, file_index=0)
 EPISODES = layout.EPISODES_PATH.format(chunk_index=0, file_index=0)
 
 
-def findings(root: Path) -> list[Finding]:
-    return list(examine(Dataset(root)))
-
-
 def lines(root: Path) -> list[str]:
-    return [str(finding) for finding in findings(root)]
+    return [str(finding) for finding in examine_folder(root)]
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], None]) -> None:

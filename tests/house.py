@@ -13,6 +13,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "manip_il"
@@ -78,22 +79,12 @@ def arrays(trees: Mapping[Path, ast.Module]) -> Iterator[str]:
 
 
 def circles(trees: Mapping[Path, ast.Module]) -> Iterator[str]:
-    """Yield a line for every circle of modules that import each other, found from its first module by name."""
+    """Yield a line for a circle of modules that import each other."""
     names = {module(path): path for path in trees}
-    imports = {name: set(imported(trees[path], names)) - {name} for name, path in names.items()}
-    done: set[str] = set()
-    for name in imports:
-        for circle in _from(name, imports, [], done):
-            yield f"circle of imports: {' -> '.join(circle)}"
-
-
-def _from(name: str, imports: Mapping[str, set[str]], way: list[str], done: set[str]) -> Iterator[list[str]]:
-    if name in way:
-        yield [*way[way.index(name) :], name]
-    elif name not in done:
-        for other in sorted(imports[name]):
-            yield from _from(other, imports, [*way, name], done)
-        done.add(name)
+    try:
+        TopologicalSorter({name: {*imported(trees[path], names)} - {name} for name, path in names.items()}).prepare()
+    except CycleError as error:
+        yield f"circle of imports: {' <- '.join(error.args[1])}"
 
 
 def imported(tree: ast.Module, known: Iterable[str]) -> Iterator[str]:
@@ -119,10 +110,8 @@ def long(trees: Mapping[Path, ast.Module]) -> Iterator[str]:
     for path, tree in trees.items():
         if (lines := len(path.read_text(encoding="utf-8").splitlines())) > MOST_LINES:
             yield f"{path.relative_to(PACKAGE.parent)}: {lines} lines; expected at most {MOST_LINES}"
-        for node in ast.walk(tree):
-            if isinstance(node, ast.FunctionDef) and (lines := (node.end_lineno or 0) - node.lineno + 1) > (
-                MOST_FUNCTION_LINES
-            ):
+        for node in (one for one in ast.walk(tree) if isinstance(one, ast.FunctionDef)):
+            if (lines := (node.end_lineno or 0) - node.lineno + 1) > MOST_FUNCTION_LINES:
                 yield f"{where(path, node)}: {node.name}: {lines} lines; expected at most {MOST_FUNCTION_LINES}"
 
 

@@ -18,7 +18,7 @@ from PIL import Image
 from manip_il.data import schema as s
 from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.lerobot_layout import INFO, VIDEO_PATH
-from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.lerobot_read import camera_keys, read_episodes
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
@@ -90,6 +90,19 @@ def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options:
             writer.add(episode)
         writer.finish()
     return root
+
+
+def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
+    """A dataset holds these episodes: numbers bit for bit, pictures by the number that they show."""
+    for mine, yours in zip(read_episodes(root), episodes, strict=True):
+        assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
+        assert list(mine.columns) == list(yours.columns)
+        for key, values in yours.columns.items():
+            assert mine.columns[key].dtype == values.dtype
+            if key.startswith(s.IMAGES):
+                assert numbers_of(mine.columns[key]) == numbers_of(values)
+            else:
+                np.testing.assert_array_equal(mine.columns[key], values, err_msg=key)
 
 
 def video_rows(root: Path) -> dict[Path, int]:

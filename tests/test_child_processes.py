@@ -7,14 +7,15 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from manip_il import child_processes
 from manip_il.child_processes import bound_to_this_process
+
+from .faults.child import living
 
 PATIENCE = 120.0  # [s]
 BUSY = """
@@ -73,26 +74,22 @@ def test_a_child_that_never_comes_up_for_air_ends_with_its_parent(code, preload,
         [child] = wait_for(lambda: [int(path.name) for path in seen.iterdir() if path.name.isdecimal()])
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-        wait_for(lambda: not is_alive(child))
+        wait_for(lambda: child not in living(parent.pid))
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(parent.pid, signal.SIGKILL)
 
 
 def test_only_what_is_started_inside_is_bound():
+    def environment() -> dict[str, str]:
+        with bound_to_this_process():
+            return dict(os.environ)
+
     before = dict(os.environ)
-    with bound_to_this_process():
-        assert os.environ.keys() - before.keys() == {"MANIP_IL_PARENT"}
+    assert environment().keys() - before.keys() == {"MANIP_IL_PARENT"}
     assert dict(os.environ) == before
-    thread = threading.Thread(target=check_a_thread, args=(before,))
-    thread.start()
-    thread.join()
-
-
-def check_a_thread(before: dict[str, str]) -> None:
-    """The children of a thread would be killed when it ends."""
-    with bound_to_this_process():
-        assert dict(os.environ) == before
+    with ThreadPoolExecutor(1) as pool:  # whose children would be killed when the thread ends
+        assert pool.submit(environment).result() == before
 
 
 def test_a_child_whose_parent_is_gone_already_ends(tmp_path):
@@ -116,10 +113,3 @@ def wait_for(what):
         assert time.monotonic() < ends
         time.sleep(0.02)
     return found
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.sim.gl import PACKAGES
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -19,32 +21,27 @@ def dockerfile() -> str:
     return text.replace("\\\n", " ")
 
 
-def final_stage(dockerfile: str) -> str:
+@pytest.fixture(scope="module")
+def final(dockerfile: str) -> str:
+    """The last stage."""
     return re.split(r"^FROM ", dockerfile, flags=re.MULTILINE)[-1]
 
 
-def ignored() -> list[str]:
-    lines = (ROOT / ".dockerignore").read_text().splitlines()
-    return [line for line in lines if line and not line.startswith("#")]
-
-
 def test_what_is_copied_is_sent_and_nothing_else_is(dockerfile):
-    copied = {
-        name
-        for line in re.findall(r"^COPY (?!--from)(.*)$", dockerfile, flags=re.MULTILINE)
-        for name in line.split()[:-1]
-    }
-    assert ignored()[0] == "*"
-    assert {line[1:] for line in ignored() if line.startswith("!")} == copied
+    lines = re.findall(r"^COPY (?!--from)(.*)$", dockerfile, flags=re.MULTILINE)
+    copied = {name for line in lines for name in line.split()[:-1]}
+    first, *ignored = re.findall(r"^[^#\n].*", (ROOT / ".dockerignore").read_text(), flags=re.MULTILINE)
+    assert first == "*"
+    assert {line[1:] for line in ignored if line.startswith("!")} == copied
     assert all((ROOT / name).exists() for name in copied)
     assert not {"runs", "datasets", ".git", ".venv", ".tools", "tests"} & copied
 
 
-def test_uv_and_the_version_are_those_of_the_project(dockerfile):
+def test_uv_and_the_version_are_those_of_the_project(dockerfile, final):
     [uv] = re.findall(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
     assert f"ARG UV_VERSION={uv}\n" in dockerfile
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert f'org.opencontainers.image.version="{version}"' in final_stage(dockerfile)
+    assert f'org.opencontainers.image.version="{version}"' in final
 
 
 def test_hashes_are_required_unless_another_index_is_asked_for(dockerfile):
@@ -54,24 +51,17 @@ def test_hashes_are_required_unless_another_index_is_asked_for(dockerfile):
         assert ("$TORCH_BACKEND" in stage) == ("ARG TORCH_BACKEND=\n" in stage)
 
 
-def test_the_final_image_is_debians_without_build_tools_and_not_roots(dockerfile):
-    final = final_stage(dockerfile)
+def test_the_final_image_is_debians_without_build_tools_and_not_roots(final):
     assert final.startswith("debian:trixie-slim\n")
     assert re.search(r"^USER [1-9]\d*:[1-9]\d*$", final, flags=re.MULTILINE)
     assert not re.search(r"\b(pip|uv pip|python3-venv|gcc|build-essential)\b", final)
     assert 'ENTRYPOINT ["manip-il"]' in final
 
 
-def test_whatever_is_written_goes_under_tmp(dockerfile):
-    settings = dict(re.findall(r"\b((?:HOME|\w+_HOME|\w+_DIR|\w+DIR))=(\S+)", final_stage(dockerfile)))
+def test_whatever_is_written_goes_under_tmp(final):
+    settings = dict(re.findall(r"\b((?:HOME|\w+_HOME|\w+_DIR|\w+DIR))=(\S+)", final))
     assert {"HOME", "HF_HOME", "XDG_CACHE_HOME"} <= settings.keys()
     assert all(place == "/tmp" or place.startswith("/tmp/") for place in settings.values())
-
-
-def test_pictures_need_the_packages_that_errors_name(dockerfile):
-    from manip_il.sim.gl import PACKAGES
-
-    assert PACKAGES in final_stage(dockerfile)
 
 
 @pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / ".ci").iterdir()))
@@ -79,7 +69,6 @@ def test_the_scripts_are_sound_bash(script):
     subprocess.run(["bash", "-n", str(ROOT / ".ci" / script)], check=True)
 
 
-def test_make_brings_the_packages_that_errors_name():
-    from manip_il.sim.gl import PACKAGES
-
+def test_the_image_and_make_bring_the_packages_that_errors_name(final):
+    assert PACKAGES in final
     assert f"({PACKAGES})" in (ROOT / ".ci" / "system").read_text()

@@ -59,40 +59,34 @@ def test_a_vector_with_a_number_that_is_not_finite_is_none(place: int):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_refused_where_it_enters(bad: float):
-    with pytest.raises(NotFiniteError, match=r"State\.physics: .* at index 2"):
-        State(np.array([0.0, 0.0, bad]), np.zeros(3))
-    with pytest.raises(NotFiniteError, match=r"State\.variation: .* at index 1"):
-        State(np.zeros(4), np.array([0.0, bad, 0.0]))
-    with pytest.raises(NotFiniteError, match=r"Label\.action"):
-        Label(np.array([bad]), 1, True, 0.0)
-    with pytest.raises(NotFiniteError, match=r"observation\.environment_state"):
-        Observation(np.zeros(2, np.float32), np.array([bad], np.float32))
-
-
-def test_the_row_that_is_not_finite_is_named():
-    column = np.zeros((5, 2), np.float32)
-    column[3, 1] = np.nan
-    with pytest.raises(NotFiniteError, match=r"episode 12, action: .* at frame 3 is not finite"):
-        Episode(12, {"action": column}, False, False)
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda bad: State(np.array([0.0, 0.0, bad]), np.zeros(3)), r"State\.physics: .* at index 2"),
+        (lambda bad: State(np.zeros(4), np.array([0.0, bad, 0.0])), r"State\.variation: .* at index 1"),
+        (lambda bad: Label(np.array([bad]), 1, True, 0.0), r"Label\.action"),
+        (lambda bad: Observation(np.zeros(2, "f4"), np.array([bad], "f4")), r"observation\.environment_state"),
+        (
+            lambda bad: Episode(12, {"action": np.array([[0, 0], [0, bad], [0, 0]])}, False, False),
+            r"episode 12, action: .* at frame 1 is not finite",
+        ),
+    ],
+)
+def test_what_is_not_finite_is_refused_where_it_enters(make, words: str, bad: float):
+    with pytest.raises(NotFiniteError, match=words):
+        make(bad)
 
 
 def test_whole_numbers_are_always_finite():
     require_finite("actor", np.array([[1], [2]]))
 
 
-def test_columns_of_unequal_lengths_are_refused_with_both_numbers():
+def test_an_episode_has_frames_and_columns_of_one_length():
+    assert len(Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((3, 1))}, True, True)) == 3
     with pytest.raises(ManipError, match=r"'action': 3.*'actor': 4"):
         Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((4, 1))}, False, False)
-
-
-def test_an_episode_has_frames():
     with pytest.raises(ManipError, match="no frames"):
         Episode(5, {"action": np.zeros((0, 2))}, False, False)
-
-
-def test_an_episodes_length_is_its_columns():
-    assert len(Episode(0, {"action": np.zeros((3, 2)), "actor": np.zeros((3, 1))}, True, True)) == 3
 
 
 def test_a_state_cannot_be_changed():

@@ -12,8 +12,9 @@ import pytest
 from manip_il.data.build import Recording, build
 from manip_il.data.journal import list_episodes, read_episode, read_header
 from manip_il.data.lerobot_read import read_table
-from manip_il.engine.engine import Engine, Keep
+from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.pool import Keep
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.recording import check_journals, collect, collect_successes, record

@@ -46,14 +46,29 @@ class Counter:
         return State(np.array([self.x]), np.empty(0), self.steps)
 
 
+class Kicked(Counter):
+    """Its number is set back by 5 before one step, and every action is off by a tenth."""
+
+    def __init__(self, at: int):
+        super().__init__()
+        self._at = at
+
+    def begin_step(self) -> None:
+        if self.steps == self._at:
+            self.x -= 5.0
+
+    def advance(self, action: np.ndarray) -> np.ndarray:
+        return super().advance(action + 0.1)
+
+
 class Ones:
-    """An expert that always adds one; remembers in which steps it was asked."""
+    """An expert that always adds one; remembers in which steps it was queried."""
 
     def __init__(self) -> None:
-        self.asked: list[int] = []
+        self.queried: list[int] = []
 
     def label(self, state: State) -> Label:
-        self.asked.append(state.step)
+        self.queried.append(state.step)
         return Label(np.array([1.0]), 1, True, 0.0)
 
 
@@ -75,76 +90,52 @@ class Follow:
         return [(turn.label.action, Actor.EXPERT) for turn in turns]
 
 
-class Kicked(Counter):
-    """Its number is set back by 5 before one step, and every action is off by a tenth."""
-
-    def __init__(self, at: int):
-        super().__init__()
-        self._at = at
-
-    def begin_step(self) -> None:
-        if self.steps == self._at:
-            self.x -= 5.0
-
-    def advance(self, action: np.ndarray) -> np.ndarray:
-        return super().advance(action + 0.1)
-
-
 def episodes(transitions) -> dict[int, list[Transition]]:
     frames = sorted(transitions, key=lambda t: (t.seed, t.step))
     return {seed: list(group) for seed, group in groupby(frames, key=lambda t: t.seed)}
 
 
-def columns(frames: list[Transition]) -> list[tuple]:
-    return [
-        (t.step, t.state.physics[0], t.observation.state[0], t.executed_action[0], t.actor, t.success, t.done)
-        for t in frames
-    ]
+def one_episode(env: Counter, driver: Halves | Follow, rules: Rules, expert: Ones | None = None) -> list[Transition]:
+    return list(rollout([env], [0], driver, rules, expert or Ones()))
 
 
 @pytest.mark.parametrize("envs", [1, 2, 3, 7])
 def test_every_seed_is_one_whole_episode(envs: int):
-    seen = episodes(rollout([Counter() for _ in range(envs)], range(5), Halves(), Rules(horizon=4)))
-    assert list(seen) == list(range(5))
-    for frames in seen.values():
-        assert [frame.step for frame in frames] == [0, 1, 2, 3]
-        assert [frame.done for frame in frames] == [False, False, False, True]
+    found = episodes(rollout([Counter() for _ in range(envs)], range(5), Halves(), Rules(horizon=4)))
+    assert list(found) == list(range(5))
+    for frames in found.values():
+        assert [(frame.step, frame.done) for frame in frames] == [(0, False), (1, False), (2, False), (3, True)]
 
 
 @pytest.mark.parametrize("envs", [2, 5])
 def test_an_episode_does_not_depend_on_its_neighbours(envs: int):
     def run(count: int) -> dict[int, list[tuple]]:
         found = rollout([Kicked(3) for _ in range(count)], range(9), Follow(), Rules(horizon=20, hold=1), Ones())
-        return {seed: columns(frames) for seed, frames in episodes(found).items()}
+        return {seed: list(map(columns, frames)) for seed, frames in episodes(found).items()}
+
+    def columns(t: Transition) -> tuple:
+        return t.step, t.state.physics[0], t.observation.state[0], t.executed_action[0], t.actor, t.success, t.done
 
     assert run(envs) == run(1)
 
 
-def test_no_seeds_give_nothing():
-    assert list(rollout([Counter()], [], Halves(), Rules(horizon=4))) == []
-
-
-def test_environments_without_a_seed_left_do_not_run():
+@pytest.mark.parametrize(("seeds", "rows"), [(6, [4, 4, 4, 2, 2, 2]), (0, [])])
+def test_environments_without_a_seed_left_do_not_run(seeds: int, rows: list[int]):
     driver = Halves()
-    list(rollout([Counter() for _ in range(4)], range(6), driver, Rules(horizon=3)))
-    assert driver.rows == [4, 4, 4, 2, 2, 2]
+    assert len(list(rollout([Counter() for _ in range(4)], range(seeds), driver, Rules(horizon=3)))) == sum(rows)
+    assert driver.rows == rows
 
 
 def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
-    frames = episodes(rollout([Counter()], [0], Follow(), Rules(horizon=4), Ones()))[0]
+    frames = one_episode(Counter(), Follow(), Rules(horizon=4))
     assert [frame.state.physics[0] for frame in frames] == [0, 1, 2, 3]
     assert [frame.observation.state[0] for frame in frames] == [0, 1, 2, 3]
-    assert [frame.success for frame in frames] == [False, False, True, True]
-    assert [frame.reward for frame in frames] == [0, 0, 1, 1]
-
-
-def test_progress_is_that_of_the_state_before_the_step():
-    frames = episodes(rollout([Counter()], [0], Follow(), Rules(horizon=4), Ones()))[0]
     assert [frame.progress for frame in frames] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert [(frame.success, frame.reward) for frame in frames] == [(False, 0), (False, 0), (True, 1), (True, 1)]
 
 
 @pytest.mark.parametrize("envs", [1, 3])
-def test_the_last_frame_alone_has_what_was_seen_after_it(envs: int):
+def test_the_last_frame_alone_has_what_was_observed_after_it(envs: int):
     rules = Rules(horizon=6, hold=1)
     found = episodes(rollout([Counter() for _ in range(envs)], range(4), Follow(), rules, Ones()))
     for frames in found.values():
@@ -158,41 +149,38 @@ def test_the_last_frame_alone_has_what_was_seen_after_it(envs: int):
 
 @pytest.mark.parametrize(("hold", "length"), [(0, 3), (2, 5), (None, 30)])
 def test_hold_ends_an_episode_that_long_after_success(hold: int | None, length: int):
-    frames = episodes(rollout([Counter()], [0], Follow(), Rules(30, hold), Ones()))[0]
-    assert len(frames) == length
+    frames = one_episode(Counter(), Follow(), Rules(30, hold))
     assert [frame.done for frame in frames] == [False] * (length - 1) + [True]
 
 
 def test_an_episode_goes_on_to_its_end_where_success_is_lost_again():
-    frames = episodes(rollout([Kicked(4)], [0], Follow(), Rules(30, hold=3), Ones()))[0]
+    frames = one_episode(Kicked(4), Follow(), Rules(30, hold=3))
     assert [frame.success for frame in frames] == [False, False, True, True, False, False]
 
 
-@pytest.mark.parametrize(("query", "asked"), [("every", [0, 1, 2, 3]), ("last", [3]), ("driver", [])])
-def test_the_expert_is_asked_where_the_rules_say(query, asked: list[int]):
+@pytest.mark.parametrize(("query", "steps"), [("every", [0, 1, 2, 3]), ("last", [3]), ("driver", [])])
+def test_the_expert_is_queried_where_the_rules_say(query, steps: list[int]):
     expert = Ones()
-    frames = episodes(rollout([Counter()], [0], Halves(), Rules(4, query=query), expert))[0]
-    assert expert.asked == asked
-    assert [frame.step for frame in frames if frame.label is not None] == asked
+    frames = one_episode(Counter(), Halves(), Rules(4, query=query), expert)
+    assert expert.queried == [frame.step for frame in frames if frame.label is not None] == steps
 
 
-def test_the_label_is_the_experts_whoever_drove():
-    frames = episodes(rollout([Counter()], [0], Halves(), Rules(4), Ones()))[0]
+@pytest.mark.parametrize(
+    ("env", "driver", "executed", "actor"),
+    [
+        (Counter(), Halves(), 0.5, Actor.LEARNER),
+        (Kicked(99), Halves(), 0.6, Actor.LEARNER),
+        (Kicked(99), Follow(), 1.1, Actor.NOISY_EXPERT),  # as its action is changed on its way
+    ],
+)
+def test_the_label_is_the_experts_whoever_drove(env, driver, executed: float, actor: Actor):
+    frames = one_episode(env, driver, Rules(4))
     assert [frame.label.action[0] for frame in frames] == [1.0] * 4
-    assert [frame.executed_action[0] for frame in frames] == [0.5] * 4
-    assert {frame.actor for frame in frames} == {Actor.LEARNER}
-
-
-def test_an_expert_whose_action_is_changed_on_its_way_is_a_noisy_one():
-    frames = episodes(rollout([Kicked(99)], [0], Follow(), Rules(4), Ones()))[0]
-    assert {frame.actor for frame in frames} == {Actor.NOISY_EXPERT}
-    assert [frame.label.action[0] for frame in frames] == [1.0] * 4
-    assert [frame.executed_action[0] for frame in frames] == [1.1] * 4
-    learner = episodes(rollout([Kicked(99)], [0], Halves(), Rules(4), Ones()))[0]
-    assert {frame.actor for frame in learner} == {Actor.LEARNER}
+    assert [frame.executed_action[0] for frame in frames] == [executed] * 4
+    assert {frame.actor for frame in frames} == {actor}
 
 
 def test_a_disturbance_happens_before_the_state_is_read():
-    frames = episodes(rollout([Kicked(1)], [0], Halves(), Rules(3)))[0]
+    frames = one_episode(Kicked(1), Halves(), Rules(3))
     assert [frame.state.physics[0] for frame in frames] == pytest.approx([0, 0.6 - 5, 1.2 - 5])
     assert [frame.observation.state[0] for frame in frames] == pytest.approx([0, 0.6 - 5, 1.2 - 5])

@@ -6,13 +6,13 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-class Warm:
+class Warm(AbstractContextManager["Warm"]):
     """The process starts when it is first needed. home: its own. imported: modules of ours that it has imported too."""
 
     def __init__(self, environment: Mapping[str, str], home: Path, imported: Sequence[str] = ()) -> None:
@@ -36,12 +36,7 @@ class Warm:
         said = [path.read_text(encoding="utf-8", errors="replace") for path in (out, err)]
         return subprocess.CompletedProcess(line, int(code), *said)
 
-    def __enter__(self) -> Warm:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._process is not None:
             assert self._process.stdin is not None
             self._process.stdin.close()

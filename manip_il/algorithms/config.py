@@ -1,22 +1,24 @@
-"""Options of one run of an algorithm: who drives, what is learnt from, and all of it checked against each other."""
+"""Options of one run of an algorithm: the driver, the data, and all of it checked against each other."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.engine.drivers import QueryRule, action_gap
 from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
-from manip_il.mdp import Actor
 from manip_il.option import option
-from manip_il.seeding import MAX_ROUNDS
 from manip_il.sim.config import CameraConfig, EnvConfig
+
+if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from manip_il.engine.drivers import QueryRule
+
+    F64 = NDArray[np.float64]
 
 SCHEDULES = {
     "constant": "constant:0.0 lets the learner drive alone from round 1 on (the paper's parameter-free choice)",
@@ -74,8 +76,6 @@ def _number(text: str) -> float | None:
         return None
 
 
-F64 = NDArray[np.float64]
-COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)
 CORRECTION = 0.25  # of the longest step: where expert and learner differ by more, the label corrects
 
 
@@ -83,8 +83,8 @@ CORRECTION = 0.25  # of the longest step: where expert and learner differ by mor
 class Sampling:
     """Relative weight of a frame. All equal: each frame once an epoch.
 
-    demonstrations: of round 0. corrections: of later rounds, where the expert drove or differed from who did by more
-    than `CORRECTION`. rollouts: the others of later rounds.
+    demonstrations: of round 0. corrections: of later rounds, where the expert drove, or its label differs from the
+    executed action by more than `CORRECTION`. rollouts: the others of later rounds.
     """
 
     demonstrations: float = option(1.0, "weight of a frame of round 0")
@@ -94,7 +94,7 @@ class Sampling:
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
-            if not 0 <= value < np.inf:
+            if not 0 <= value < math.inf:
                 raise UsageError(f"sampling.{one.name} is {value}; expected 0 or more")
         if self.demonstrations == 0:
             raise UsageError("sampling.demonstrations is 0, but round 0 has nothing else to learn from")
@@ -105,12 +105,18 @@ class Sampling:
         return self.demonstrations == self.corrections == self.rollouts
 
     def weights(self, table: Mapping[str, NDArray[Any]], scale: F64) -> F64 | None:
-        """Return the weight of every frame of a table with `COLUMNS`, (N,); None where all are equal.
+        """Return the weight of every frame of a table with `fitting.COLUMNS`, (N,); None where all are equal.
 
         scale: see `action_gap`.
         """
         if self.is_even:
             return None
+        import numpy as np
+
+        from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
+        from manip_il.engine.drivers import action_gap
+        from manip_il.mdp import Actor
+
         gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
         by_expert = table[ACTOR].reshape(-1) != Actor.LEARNER
         later = np.where(by_expert | (gap > CORRECTION), self.corrections, self.rollouts)
@@ -167,6 +173,8 @@ class RunConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        from manip_il.seeding import MAX_ROUNDS
+
         for name in _AT_LEAST_1:
             if (value := getattr(self, name)) is not None and value < 1:
                 raise UsageError(f"{name} is {value}; expected at least 1")
@@ -181,6 +189,8 @@ class RunConfig:
         self._check_queries()
 
     def _check_queries(self) -> None:
+        from manip_il.engine.drivers import QueryRule
+
         rule = self.query_rule or QueryRule()
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
@@ -203,7 +213,7 @@ class RunConfig:
     @property
     def steps_of_branch(self) -> int:
         """Return the control steps of a branch: those given, else enough to learn a whole plan from."""
-        return self.branch_steps or self.fit.plan_length + self.fit.dropped_frames
+        return self.branch_steps or sum(plan_of(self.fit))
 
     @property
     def query(self) -> QueryRule:
@@ -211,9 +221,21 @@ class RunConfig:
 
         `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
         """
+        from manip_il.engine.drivers import QueryRule
+
         if self.query_rule is not None or self.label == "per_state":
             return self.query_rule or QueryRule()
         return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)
+
+
+def plan_of(fit: FitConfig) -> tuple[int, int]:
+    """Return how many actions a policy plans at once, and how many last frames of an episode it does not learn from."""
+    if fit.is_mlp:  # without LeRobot, whose import takes seconds
+        return 1, 0
+    from manip_il.learn.lerobot_config import policy_config
+
+    policy = policy_config(fit.policy, trust=fit.trust)
+    return len(policy.action_delta_indices or [0]), getattr(policy, "drop_n_last_frames", 0)
 
 
 def check_cameras(config: RunConfig) -> None:
@@ -232,17 +254,18 @@ def check_labels(config: RunConfig) -> None:
     """
     from manip_il.learn.lerobot_config import LeRobotFit
 
-    fit, plan = config.fit, config.fit.plan_length
+    fit = config.fit
     LeRobotFit(fit)
+    plan, dropped = plan_of(fit)
     name, rule = fit.policy.get("type", "mlp"), config.query
     if config.label == "per_state" and plan > 1 and rule.kind != "every":
         raise UsageError(
             f"query={rule} with label=per_state yields single labels, and {name} learns from {plan} in a row; "
             "use label=branch or label=takeover"
         )
-    if config.label == "branch" and config.steps_of_branch <= fit.dropped_frames:
+    if config.label == "branch" and config.steps_of_branch <= dropped:
         raise UsageError(
-            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {fit.dropped_frames} frames of "
+            f"branch_steps is {config.steps_of_branch}, but {name} leaves out the last {dropped} frames of "
             "every episode; give more, or --policy.drop_n_last_frames=0"
         )
     if rule.kind == "likelihood":

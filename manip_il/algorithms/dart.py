@@ -7,18 +7,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from manip_il.algorithms.rounds import Noise, RoundResult, noisy_expert
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the algorithms are read for help, without numpy
+    import numpy as np
+    from numpy.typing import NDArray
+
     from manip_il.algorithms.config import RunConfig
     from manip_il.algorithms.run import Run
 
-F64 = NDArray[np.float64]
+    F64 = NDArray[np.float64]
 
 
 def dart(run: Run, c: RunConfig) -> Iterator[RoundResult]:
@@ -40,7 +39,10 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
     learnt from, or its errors are taken for smaller than they are. trust: see `LearnedPolicy.load`. Raises `ManipError`
     without a sound label.
     """
+    import numpy as np
+
     from manip_il.data.lerobot_read import read_table
+    from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
     from manip_il.learn.columns import EPISODE_INDEX, LEARNING_COLUMNS
     from manip_il.learn.policy import LearnedPolicy
 
@@ -60,6 +62,8 @@ def fitted_noise(policy: Path, root: Path, *, trust: bool = False) -> Noise:
 
 def _rows_by_step(episodes: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Rows (R,) of the first frame of every episode, of the second, and so on."""
+    import numpy as np
+
     starts = np.flatnonzero(np.diff(episodes, prepend=episodes[0] - 1))
     steps = np.arange(len(episodes)) - np.repeat(starts, np.diff(np.append(starts, len(episodes))))
     return [np.flatnonzero(steps == step) for step in range(int(steps.max()) + 1)]

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.algorithms.config import COLUMNS, RunConfig
+from manip_il.algorithms.config import RunConfig
 from manip_il.data.lerobot_read import read_tables
+from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
@@ -19,6 +20,7 @@ from manip_il.seeding import stream_base
 from manip_il.sim.scene import build_scene
 
 F64 = NDArray[np.float64]
+COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)  # what `Sampling.weights` reads
 Table = dict[str, NDArray[Any]]
 OnLog = Callable[[dict[str, Any]], None]
 CHUNK_STEPS = 20_000  # of a round, for policies other than the mlp, where none are given

@@ -185,10 +185,10 @@ class Run:
     def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[Collected]:
         """A round's episodes, of which the first `disturbed` are."""
         seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
-        journals, seen = self._folder(job.round) / JOURNALS, self._watch.on_episode
+        journals, on_episode = self._folder(job.round) / JOURNALS, self._watch.on_episode
         return itertools.chain(
-            collect(self._engine, replace(job, conditions=(STANDARD,)), seeds[:disturbed], journals, seen),
-            collect(self._engine, job, seeds[disturbed:], journals, seen),
+            collect(self._engine, replace(job, conditions=(STANDARD,)), seeds[:disturbed], journals, on_episode),
+            collect(self._engine, job, seeds[disturbed:], journals, on_episode),
         )
 
     def _record(self, job: RolloutJob, episodes: Iterator[Collected], recording: Recording) -> None:

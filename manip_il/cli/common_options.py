@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.errors import UsageError
 from manip_il.option import option, option_of
+from manip_il.robots import ROBOTS
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class TaskGroup:
 class MaybeRobotGroup:
     """`--robot.*` where a checkpoint may say it."""
 
-    type: str | None = option(None, f"panda or fetch; by default the policy's, else {EnvConfig.robot}")
+    type: str | None = option(None, f"{' or '.join(ROBOTS)}; by default the policy's, else {EnvConfig.robot}")
 
 
 @dataclass

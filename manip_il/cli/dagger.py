@@ -26,7 +26,6 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
-from manip_il.engine.drivers import QueryRule
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import MLP_STEPS, FitConfig
 from manip_il.option import option, option_of
@@ -120,6 +119,8 @@ class DaggerOptions(common.EnvOptions):
 
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
+        from manip_il.engine.drivers import QueryRule  # which imports numpy
+
         same = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         made = {
             "env": self.env_config(),

@@ -82,7 +82,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     except (OSError, ValueError, TypeError, RecursionError, ManipError):
         return  # named by the check of the spec
     from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.robots.robot import ROBOTS
+    from manip_il.robots import ROBOTS
     from manip_il.sim.env import EnvConfig
     from manip_il.tasks.table import TASKS
 

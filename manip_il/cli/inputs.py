@@ -89,7 +89,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
     from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.robots.robot import ROBOTS
+    from manip_il.robots import ROBOTS
     from manip_il.sim.env import EnvConfig
     from manip_il.tasks.table import TASKS
 

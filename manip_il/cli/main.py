@@ -132,7 +132,7 @@ def _dispatch(words: list[str]) -> None:
         options = parse(load(name), words, command=name)
         if hasattr(options, "check"):
             options.check()
-        from manip_il.data.lerobot_log import shorten_ffmpeg_warning
+        from manip_il.errors import shorten_ffmpeg_warning
         from manip_il.sim.gl import require_known_backend
 
         require_known_backend()

@@ -143,8 +143,8 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     records = [_record(line) for line in lines]
     if None in records:
         number = records.index(None)
-        shown = lines[number][:80].decode(errors="replace")
-        raise ManipError(f"{path}, line {number + 1}: expected a JSON object, got {shown!r}")
+        text = lines[number][:80].decode(errors="replace")
+        raise ManipError(f"{path}, line {number + 1}: expected a JSON object, got {text!r}")
     return [record for record in (*records, _record(tail)) if record is not None]
 
 

@@ -113,7 +113,7 @@ def _open_group(name: str, known: Mapping[str, Option]) -> str:
 
 
 def _as_yaml(word: str, group: str) -> Any:
-    from manip_il.yaml_file import parse_yaml
+    from manip_il.checks import parse_yaml
 
     try:
         return parse_yaml(word)
@@ -132,7 +132,7 @@ def _next_value(name: str, known: Mapping[str, Option], rest: list[str]) -> str:
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
-    from manip_il.yaml_file import read_yaml
+    from manip_il.checks import read_yaml
 
     tree = read_yaml(path, "a YAML file of options")
     if not isinstance(tree, dict | None):

@@ -84,8 +84,9 @@ class PushOptions:
 
     def run(self) -> None:
         """Examine, list, upload, switch over; print what was done."""
+        from manip_il.store.folder import open_remote
         from manip_il.store.push import push
-        from manip_il.store.remote import RemoteUrl, open_remote
+        from manip_il.store.remote import RemoteUrl
 
         url = RemoteUrl.parse(self.remote)
         remote = open_remote(url, private=self.private)
@@ -140,8 +141,8 @@ class PullOptions:
 
     def run(self) -> None:
         """Fetch, verify, rename; print what was pulled."""
+        from manip_il.store.folder import open_remote
         from manip_il.store.pull import pull
-        from manip_il.store.remote import open_remote
 
         url = self._url()
         remote = open_remote(url)

@@ -20,8 +20,8 @@ from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.trials import Pictures, Shot, Trial, film_shots, suite_conditions
 from manip_il.errors import UnknownName, UsageError
+from manip_il.learn.fit_config import MLP, MLPOptions
 from manip_il.option import option, option_of
-from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.report_data import Kind, PolicyRow
     from manip_il.evaluation.results import EvalResult
 
-POLICY_TYPES = ("mlp",)
 TIMINGS_FILE = "timings.json"
 SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}  # by the folder of the evaluations
 
@@ -38,16 +37,16 @@ SUITES = {"nominal": "nominal", "disturbed": "knocked", "validation": "nominal"}
 class PolicyGroup:
     """`--policy.*` of the mlp that is fitted."""
 
-    type: str = option("mlp", "the policy; `manip-il train` trains every other LeRobot policy")
-    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
-    width: int = option(256, "units per layer")
-    depth: int = option(3, "hidden layers")
+    type: str = option(MLP, "the policy; `manip-il train` trains every other LeRobot policy")
+    loss: str = option_of(MLPOptions, "loss")
+    width: int = option_of(MLPOptions, "width")
+    depth: int = option_of(MLPOptions, "depth")
 
     def settings(self) -> Open:
         """Return them as `--policy.*` of `manip-il train`; `UsageError` for another type."""
-        if self.type not in POLICY_TYPES:
+        if self.type != MLP:
             raise UsageError(
-                f"{UnknownName('policy', self.type, POLICY_TYPES)}; LeRobot's policies (act, diffusion) are trained by "
+                f"{UnknownName('policy', self.type, [MLP])}; LeRobot's policies (act, diffusion) are trained by "
                 "manip-il train and manip-il dagger, with --policy.type=..."
             )
         return to_plain(self)
@@ -173,6 +172,8 @@ class _Quickstart:
 
     def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
         """Return folder -> policy -> evaluation; those of an interrupted run are read."""
+        from manip_il.seeding import stream_seeds
+
         options, more = self.options, [one for one in contestants if one.key == "cloned_more"]
         measured: dict[str, dict[str, EvalResult]] = {}
         for folder, stream, count, measured_ones in (

@@ -19,8 +19,9 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.progress import Stages, progress, say, warn
 from manip_il.data.atomic import exclusive
+from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
-from manip_il.option import option
+from manip_il.option import option, option_of
 from manip_il.sim.config import Look
 
 if TYPE_CHECKING:
@@ -34,11 +35,11 @@ HOLD = 10  # control steps that a demonstration goes on for after success
 class EncoderGroup:
     """`--dataset.rgb_encoder.*`: how pictures are compressed, in LeRobot's names."""
 
-    vcodec: str = option("h264", "h264, or libsvtav1 (LeRobot's own choice, slower)")
-    pix_fmt: str = option("yuv420p", "pixel format")
-    g: int = option(2, "frames from one key frame to the next")
-    crf: int | None = option(None, "quality, lower is better and larger; by default 23, libsvtav1 30")
-    preset: str | None = option(None, "the codec's own; by default ultrafast, libsvtav1 12")
+    vcodec: str = option_of(VideoConfig, "vcodec")
+    pix_fmt: str = option_of(VideoConfig, "pix_fmt")
+    g: int = option_of(VideoConfig, "g")
+    crf: int | None = option_of(VideoConfig, "crf")
+    preset: str | None = option_of(VideoConfig, "preset")
 
 
 @dataclass
@@ -85,9 +86,9 @@ class RecordOptions(common.EnvOptions):
         """Record; the dataset is written as the episodes come."""
         env, cameras = self.env_config(), self.image.config(self.cameras)
         if cameras:
-            from manip_il.data.video import VideoConfig
+            from manip_il.data.video import try_encoder
 
-            VideoConfig(**asdict(self.dataset.rgb_encoder)).check(cameras.size, env.control_hz)
+            try_encoder(VideoConfig(**asdict(self.dataset.rgb_encoder)), cameras.size, env.control_hz)
         from manip_il.engine.engine import Engine
         from manip_il.engine.jobs import RolloutJob
 

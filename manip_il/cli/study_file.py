@@ -127,9 +127,9 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
             f"{path}: arms.{name}: expected a mapping of options of manip-il dagger, got {checks.shorten(differences)}"
         )
     layers = [(f"{path}: common", file.common), (f"{path}: arms.{name}", differences or {})]
-    for where, tree in layers:
+    for origin, tree in layers:
         if own := next((own for own in OWN if own in tree), None):
-            raise UsageError(f"{where}: {own} is set by the study itself, for every run; take it out")
+            raise UsageError(f"{origin}: {own} is set by the study itself, for every run; take it out")
     with _named(path, name):
         return from_layers(DaggerOptions, layers)
 

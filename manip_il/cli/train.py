@@ -137,7 +137,7 @@ class TrainOptions:
         from manip_il.learn.fit_policy import PolicyTrainer
 
         root = self.dataset.root
-        with self._decoding() as seen:
+        with self._decoding() as on_frames:
             trainer = PolicyTrainer(
                 root,
                 config,
@@ -146,7 +146,7 @@ class TrainOptions:
                 fingerprint=fingerprint,
                 look=recorded_look(read_provenance(root), fingerprint),
                 resume=self.resume,
-                on_frames=seen,
+                on_frames=on_frames,
             )
         with self._begin(config) as stages:
             kind, samples = trainer.lerobot.policy.type, len(trainer.samples.train)

@@ -158,8 +158,8 @@ def require_suite(suite: str) -> None:
 
 def read_condition(name: str) -> Condition:
     """Return a condition by its name, or a YAML of ranges by its path; `UsageError` names what is wrong with it."""
+    from manip_il.checks import read_yaml
     from manip_il.sim.conditions import Condition
-    from manip_il.yaml_file import read_yaml
 
     require_suite(name)
     path = Path(name) if name.endswith(_YAML) else _suites_folder() / f"{name}.yaml"

@@ -31,7 +31,7 @@ from manip_il.data.lerobot_read import (
 )
 from manip_il.data.lerobot_write import DatasetWriter, new_dataset, own_file, write_dataset
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
-from manip_il.data.video import VideoConfig
+from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 

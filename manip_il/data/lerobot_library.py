@@ -113,9 +113,7 @@ def _nature(meta: LeRobotDatasetMetadata) -> tuple[list[str], int, list[str]]:
 
 
 def _metadata(root: Path) -> Metadata:
-    if not (root / INFO).is_file():  # LeRobot would request it from the Hub
-        raise ManipError(f"{root} is not a LeRobot dataset: it has no {INFO}")
-    check_dataset(root)
+    check_dataset(root)  # else LeRobot would request what is not there from the Hub
     meta = Metadata(f"local/{root.name}", root=root)
     if meta.stats is None:
         raise ManipError(f"{root} has no statistics (meta/stats.json); run `manip-il doctor` to see what is left")

@@ -233,6 +233,7 @@ def _check_rows(root: Path, found: int) -> None:
 
 
 def _read_info(root: Path) -> dict[str, Any]:
+    """Stricter than `info.read_info`, which the doctor lists all problems of: no NaN, and `robot_type` is there."""
     path = root / layout.INFO
     if not path.is_file():
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {layout.INFO}")

@@ -24,7 +24,8 @@ from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
-from manip_il.data.video import CameraFiles, CameraThreads, Clip, VideoConfig
+from manip_il.data.video import CameraFiles, CameraThreads, Clip, try_encoder
+from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -62,7 +63,7 @@ def new_dataset(
     """
     video = video or VideoConfig()
     if spec.cameras:
-        video.check(spec.image_size, spec.fps)
+        try_encoder(video, spec.image_size, spec.fps)
     ours = own_file(repo_id, spec, fingerprint)
     with new_folder(root, replace=replace) as folder:
         writer = DatasetWriter(folder, root, spec, ours, video, (data_files_size_in_mb, video_files_size_in_mb))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,7 @@ def read_file(path: Path, columns: list[str]) -> pa.Table:
 def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
     """Return a column, (T,) or (T, *shape), as `feature` says.
 
+    Numbers of another width are taken, as they are; the doctor, by `to_array`, tells of them.
     Raises `ManipError` naming the dataset `root` where values have another kind or shape, or some are missing.
     """
     shape, dtype = tuple(feature["shape"]), feature["dtype"]
@@ -143,8 +145,6 @@ def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, An
 
 def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
     array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):  # what older versions give for no chunk at all
-        array = pa.concat_arrays(array.chunks)
     length, nested = len(array), False
     while _is_list(array.type):
         array, nested = array.flatten(), True
@@ -162,18 +162,15 @@ class BadColumn(ValueError):
 
 @dataclass(frozen=True)
 class Shard:
-    """One parquet file. problem: why it cannot be read; then it has no rows and no schema."""
+    """One parquet file, which need not be readable: the doctor goes on to the next one, where `read_file` raises.
+
+    columns: their names. problem: why it cannot be read; then it has no columns.
+    """
 
     name: str  # in the dataset
     path: Path
     problem: str = ""
-    rows: int = 0
-    schema: pa.Schema | None = None
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of its columns."""
-        return list(self.schema.names) if self.schema else []
+    columns: tuple[str, ...] = ()
 
     def tables(self, columns: Sequence[str] | None = None, rows: int = _ROWS) -> Iterator[pa.Table]:
         """Yield the rows in order, about `rows` at a time. Raises one of `UNREADABLE`.
@@ -219,10 +216,15 @@ def open_shard(name: str, path: Path) -> Shard:
         if last != MAGIC or size < 12:
             return Shard(name, path, NO_FOOTER)
         check_parquet([path])
-        metadata = pq.read_metadata(path)
-        return Shard(name, path, rows=metadata.num_rows, schema=metadata.schema.to_arrow_schema())
+        return Shard(name, path, columns=_column_names(path, size, path.stat().st_mtime_ns))
     except UNREADABLE as problem:
         return Shard(name, path, f"cannot be read: {problem}")
+
+
+@lru_cache(100)
+def _column_names(path: Path, size: int, changed: int) -> tuple[str, ...]:
+    """Names of a file's columns, parsed once a version of it: of `meta/episodes` that takes longer than its rows."""
+    return tuple(pq.read_metadata(path).schema.to_arrow_schema().names)
 
 
 def read_tasks(root: Path) -> tuple[list[int], list[str]]:
@@ -240,11 +242,9 @@ def read_tasks(root: Path) -> tuple[list[int], list[str]]:
     return numbers.tolist(), table.column(names[0]).to_pylist()
 
 
-def to_array(column: pa.ChunkedArray | pa.Array, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
+def to_array(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
     """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
-    array: Any = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    if isinstance(array, pa.ChunkedArray):  # what combining no chunk at all gives
-        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.array([], array.type)
+    array: Any = column.combine_chunks()
     rows, size = len(array), int(np.prod(shape, dtype=np.int64))
     while True:
         if isinstance(array.type, pa.BaseExtensionType):

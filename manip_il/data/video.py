@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
@@ -23,100 +23,14 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
 from manip_il.data.pictures import Pictures, count_packets, open_video
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.data.video_config import VideoConfig
+from manip_il.errors import ManipError, UsageError
 
-# Default crf and preset. LeRobot's own codec and settings are those of libsvtav1; h264 takes a sixth of its time for
-# the same error, which lets encoding keep up with rendering on one core.
-CODECS: dict[str, tuple[float, int | str]] = {"h264": (23, "ultrafast"), "libsvtav1": (30, 12)}
 QUEUE_BYTES = 128 * 1024 * 1024  # of pictures that wait to be encoded; an episode that is alone may be larger
 _MIB = 1024 * 1024
-_MOST_SETTING = 1_000_000  # no codec knows a larger one
-
-
-@dataclass(frozen=True)
-class VideoConfig:
-    """Settings of the encoder, named as in LeRobot's `RGBEncoderConfig`; those of `libsvtav1` default as there.
-
-    Raises `UnknownName` for the codec, `UsageError` for g, `ManipError` for a value of another type; `check` tries the
-    rest with the codec itself.
-    """
-
-    vcodec: str = "h264"
-    pix_fmt: str = "yuv420p"
-    g: int | None = 2  # frames from one key frame to the next: what reading any single one costs
-    crf: float | None = None  # lower is better and larger
-    preset: int | str | None = None  # the codec's own
-
-    def __post_init__(self) -> None:
-        checks.text("vcodec", self.vcodec, checks.LONGEST_NAME)
-        checks.name("pix_fmt", self.pix_fmt)
-        if self.vcodec not in CODECS:
-            raise UnknownName("video codec", self.vcodec, CODECS)
-        if self.g is not None and checks.whole("video setting g", self.g, -_MOST_SETTING, _MOST_SETTING) < 1:
-            raise UsageError(f"video setting g={self.g}; expected 1 or more frames from one key frame to the next")
-        if self.crf is not None:
-            checks.number("video setting crf", self.crf, -_MOST_SETTING, _MOST_SETTING)
-        if isinstance(self.preset, str):
-            checks.name("video setting preset", self.preset)
-        elif self.preset is not None:
-            checks.whole("video setting preset", self.preset, -_MOST_SETTING, _MOST_SETTING)
-        crf, preset = CODECS[self.vcodec]
-        object.__setattr__(self, "crf", crf if self.crf is None else self.crf)
-        object.__setattr__(self, "preset", preset if self.preset is None else self.preset)
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> VideoConfig:
-        """Return the settings in a JSON object; raises `UnknownName` for a key that is none of them."""
-        known = [field.name for field in fields(cls)]
-        for key in checks.mapping("video", data):
-            if key not in known:
-                raise UnknownName("video setting", checks.text("a video setting", key, checks.LONGEST_NAME), known)
-        return cls(**data)
-
-    def options(self) -> dict[str, str]:
-        """Return the codec's own options. One thread: a second saves no work, and of h264 it changes the bytes."""
-        named = {"g": self.g, "crf": self.crf, "preset": self.preset}
-        options = {name: str(value) for name, value in named.items() if value is not None}
-        if self.vcodec == "libsvtav1":
-            return {**options, "svtav1-params": "fast-decode=0:lp=1"}
-        return {**options, "threads": "1", "bf": "0"}  # frames in their order: so that an episode can follow another
-
-    def check(self, size: tuple[int, int], fps: int) -> None:
-        """Encode one picture of this height and width; raises `UsageError` with the encoder's reason."""
-        level = av.logging.get_level()
-        av.logging.set_level(av.logging.ERROR)  # else there is no reason to read
-        with av.logging.Capture() as log:
-            try:
-                if len(av.VideoFormat(self.pix_fmt).components) < 3:
-                    raise ValueError(f"{self.pix_fmt} has no colour")
-                encoder = _encoder(self, size, fps)
-                encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
-                encoder.encode(None)
-            except (av.FFmpegError, ValueError) as error:
-                reason = log[0][2].strip() if log else str(error)
-                raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {self}: {reason}") from error
-            finally:
-                av.logging.set_level(level)
-
-    def info(self, path: Path) -> dict[str, Any]:
-        """Return the entry of LeRobot's `info.json` for a camera whose video files are like `path`."""
-        with contextlib.closing(open_video(path)) as container:
-            stream = container.streams.video[0]
-            found = {
-                "video.height": stream.height,
-                "video.width": stream.width,
-                "video.codec": stream.codec.canonical_name,
-                "video.pix_fmt": stream.pix_fmt,
-                "video.fps": int(stream.base_rate or 0),
-                "video.channels": len(stream.format.components),
-                "has_audio": False,
-            }
-        chosen = {"video.g": self.g, "video.crf": self.crf, "video.preset": self.preset, "video.fast_decode": 0}
-        return {**found, **chosen, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}
 
 
 @dataclass(frozen=True)
@@ -172,8 +86,8 @@ class CameraFiles:
             raise ManipError(f"{name} holds {found} frames; {file.frames} were encoded")
 
     def info(self) -> dict[str, Any]:
-        """Return `VideoConfig.info` of the first file, which must be closed."""
-        return self._config.info(self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0])
+        """Return `video_info` of the first file, which must be closed."""
+        return video_info(self._config, self._folder / layout.numbered(layout.VIDEO_PATH, 0, video_key=self._key)[0])
 
 
 class CameraThreads:
@@ -268,3 +182,38 @@ def _video_frame(picture: NDArray[np.uint8], number: int, fps: int) -> av.VideoF
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
     frame.pts, frame.time_base = number, Fraction(1, fps)
     return frame
+
+
+def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
+    """Encode one picture of this height and width; raises `UsageError` with the encoder's reason."""
+    level = av.logging.get_level()
+    av.logging.set_level(av.logging.ERROR)  # else there is no reason to read
+    with av.logging.Capture() as log:
+        try:
+            if len(av.VideoFormat(config.pix_fmt).components) < 3:
+                raise ValueError(f"{config.pix_fmt} has no colour")
+            encoder = _encoder(config, size, fps)
+            encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+            encoder.encode(None)
+        except (av.FFmpegError, ValueError) as error:
+            reason = log[0][2].strip() if log else str(error)
+            raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error
+        finally:
+            av.logging.set_level(level)
+
+
+def video_info(config: VideoConfig, path: Path) -> dict[str, Any]:
+    """Return the entry of LeRobot's `info.json` for a camera whose video files are like `path`."""
+    with contextlib.closing(open_video(path)) as container:
+        stream = container.streams.video[0]
+        found = {
+            "video.height": stream.height,
+            "video.width": stream.width,
+            "video.codec": stream.codec.canonical_name,
+            "video.pix_fmt": stream.pix_fmt,
+            "video.fps": int(stream.base_rate or 0),
+            "video.channels": len(stream.format.components),
+            "has_audio": False,
+        }
+    settings = {"video.g": config.g, "video.crf": config.crf, "video.preset": config.preset, "video.fast_decode": 0}
+    return {**found, **settings, "video.video_backend": "pyav", "video.extra_options": {}, "is_depth_map": False}

@@ -23,6 +23,9 @@ F64 = NDArray[np.float64]
 class Moments:
     """Statistics of a column, added up piece by piece in float64, in memory of one row.
 
+    Not `RunningStats`, which computes the quantiles themselves and for that writes every number to a file of the
+    dataset's folder: a check writes nothing, and that a quantile is right shows in two counts.
+
     size: n, numbers of a row. quantiles: (Q, n), whose ranks are counted; `below` and `up_to`, (Q, n), count the
     numbers below each of them, and those that are not above it.
     """

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from manip_il.data.atomic import new_folder
-from manip_il.engine.engine import Message, Task, portable, run_task
+from manip_il.engine.pool import Message, Task, portable, run_task
 from manip_il.errors import FolderExistsError, ManipError
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported

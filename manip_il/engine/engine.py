@@ -8,76 +8,19 @@ from __future__ import annotations
 
 import os
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from types import TracebackType
-from typing import Any, Literal, Protocol
+from typing import Literal
 
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.local import LocalProcesses, start_server
+from manip_il.engine.pool import Keep, Pool, Task
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
 MAX_DEATHS = 3  # of workers that one seed may cost before it is left out
 Backend = Literal["local", "ray"]
-
-
-class Keep(Protocol):
-    """Stores finished episodes; must pickle."""
-
-    def pack(self, episode: Episode) -> Any:
-        """Make what is stored; called in the process that ran the episode."""
-        ...
-
-    def store(self, seed: int, packed: Any) -> None:
-        """Store it; called on the machine with the disk: on a cluster in the engine's process, else in the worker."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """Some seeds of one job."""
-
-    job: RolloutJob
-    seeds: tuple[int, ...]
-    keep: Keep | None
-
-
-@dataclass(frozen=True)
-class Message:
-    """Message of a worker: an episode ended, all did, the worker died, or the work itself failed.
-
-    episode: without pictures. packed: what is still to be stored in the engine's process.
-    """
-
-    kind: Literal["episode", "done", "died", "failed"]
-    episode: Episode | None = None
-    packed: Any = None
-    error: BaseException | None = None
-
-
-class Pool(Protocol):
-    """Workers of one backend."""
-
-    @property
-    def workers(self) -> int:
-        """Tasks that run at once."""
-        ...
-
-    def has_room(self) -> bool:
-        """Return whether another task can start at once."""
-        ...
-
-    def submit(self, task: Task) -> None:
-        """Start a task."""
-        ...
-
-    def wait(self) -> list[tuple[Task, Message]]:
-        """Wait until tasks have messages; returns at least one."""
-        ...
-
-    def close(self, in_order: bool) -> None:
-        """End all workers; those still at work are killed unless all is `in_order`."""
-        ...
 
 
 class Engine:
@@ -119,8 +62,6 @@ class Engine:
     def warm_up(self, learned: bool) -> None:
         """Begin to start what workers need, and return at once. learned: whether policies will drive."""
         if self._backend == "local" and self.workers != 1:
-            from manip_il.engine.local import start_server
-
             start_server(learned)
 
     def __enter__(self) -> Engine:
@@ -177,28 +118,6 @@ class Engine:
                 waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
 
 
-def run_task(get_task: Callable[[], Task], store: bool) -> Iterator[Message]:
-    """Run a task in a worker: yields a message for each episode as it ends, and one for the end or a failure.
-
-    store: whether episodes are stored here, or in the engine's process.
-    """
-    try:
-        task = get_task()
-        for episode in run_job(task.job, task.seeds):
-            packed = task.keep.pack(episode) if task.keep is not None else None
-            if store and task.keep is not None:
-                task.keep.store(episode.seed, packed)
-            yield Message("episode", episode.without_pictures(), None if store else packed)
-        yield Message("done")
-    except Exception as error:
-        yield Message("failed", error=portable(error))
-
-
-def portable(error: Exception) -> Exception:
-    """Return the error in a form that pickles: the program's own as it is, others in words."""
-    return error if isinstance(error, ManipError) else ManipError(f"{type(error).__name__}: {error}")
-
-
 def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:
     """One seed a task; where a learner drives, a lockstep batch, smaller where that would leave a worker idle."""
     size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
@@ -206,13 +125,11 @@ def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: in
 
 
 def _open_pool(backend: Backend, workers: int | None) -> Pool:
-    if backend == "ray":
-        from manip_il.engine.cluster import RayCluster
+    if backend == "local":
+        return LocalProcesses(workers or default_workers())
+    from manip_il.engine.cluster import RayCluster  # here, as Ray is an extra
 
-        return RayCluster(workers)
-    from manip_il.engine.local import LocalProcesses
-
-    return LocalProcesses(workers or default_workers())
+    return RayCluster(workers)
 
 
 def default_workers() -> int:

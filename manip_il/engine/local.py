@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from manip_il.child_processes import bound_to_this_process, watch_parent
-from manip_il.engine.engine import Message, Task, run_task
+from manip_il.engine.pool import Message, Task, run_task
 from manip_il.errors import ManipError
 
 # Workers are forked from a server that has imported what they need, and nothing else: neither OpenGL nor threads are

@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from manip_il.engine.environments import env_fingerprint
 from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
-from manip_il.mdp import Actor, Episode
+from manip_il.mdp import F32, F64, Actor, Episode
 from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
@@ -68,12 +69,22 @@ def count_episodes(env: EnvConfig, cases: int, policy: Path | None = None) -> in
     return cases * (2 + len(kinds_for(get_task(env.task))) + (policy is not None))
 
 
+class _Moment(NamedTuple):
+    """A step of the undisturbed run, how many more that took, its state (m,) and the action (n,) executed there."""
+
+    step: int
+    steps: int
+    state: F64
+    action: F32
+
+
 class _Run:
     """The rows of one certificate; `starts` comes first, as the others need its runs."""
 
     def __init__(self, engine: Engine, env: EnvConfig, seeds: Sequence[int], on_episode: Progress | None):
-        self._engine, self._env, self._seeds, self._seen = engine, env, seeds, on_episode
-        self._undisturbed: dict[int, tuple[int, Episode]] = {}  # seed -> steps until solved, the expert's own run
+        self._engine, self._env, self._seeds, self._on_episode = engine, env, seeds, on_episode
+        self._kinds = kinds_for(get_task(env.task))
+        self._moments: dict[str, dict[int, _Moment]] = {kind: {} for kind in self._kinds}  # kind -> seed -> moment
 
     def starts(self) -> Row:
         """Episodes as they begin."""
@@ -82,8 +93,10 @@ class _Run:
             case = self._case(episode, 0)
             cases.append(case)
             if case.steps is not None:
-                self._undisturbed[case.seed] = case.steps, episode
-        if not self._undisturbed:
+                for kind, moments in self._moments.items():
+                    step = draw_moment(case.seed, kind, case.steps)
+                    moments[case.seed] = _Moment(step, case.steps - step, *_state_and_action(episode, step))
+        if not any(case.steps for case in cases):
             raise ManipError(
                 f"the expert solved none of {len(self._seeds)} undisturbed episodes within {self._env.horizon} steps, "
                 "so there is nothing to perturb; give it a longer --env.horizon"
@@ -98,16 +111,17 @@ class _Run:
 
     def perturbed(self, kind: str) -> Row:
         """Episodes perturbed once."""
-        moments = {seed: draw_moment(seed, kind, steps) for seed, (steps, _) in self._undisturbed.items()}
-        longer = replace(self._env, horizon=max(moments.values()) + self._env.horizon)
-        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, moments),))
+        moments = self._moments[kind]
+        steps = {seed: moment.step for seed, moment in moments.items()}
+        longer = replace(self._env, horizon=max(steps.values()) + self._env.horizon)
+        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, steps),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
-            moment, (steps, run) = moments[episode.seed], self._undisturbed[episode.seed]
-            changed = (schema.SIM_STATE, schema.EXECUTED_ACTION)
-            if not all(np.array_equal(episode.columns[key][moment], run.columns[key][moment]) for key in changed):
-                cases.append(self._case(episode, moment, steps - moment))
-        known = kinds_for(get_task(self._env.task))[kind]
+            moment = moments[episode.seed]
+            undisturbed = (moment.state, moment.action)
+            if not all(map(np.array_equal, _state_and_action(episode, moment.step), undisturbed)):
+                cases.append(self._case(episode, moment.step, moment.steps))
+        known = self._kinds[kind]
         return self._row("action" if known.wrong else "state", kind, known.words, cases)
 
     def taken_over(self, policy: Path, trust: bool) -> Row:
@@ -124,8 +138,8 @@ class _Run:
     def _episodes(self, job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         for episode in self._engine.run(job, seeds):
             yield episode
-            if self._seen is not None:
-                self._seen(episode)
+            if self._on_episode is not None:
+                self._on_episode(episode)
 
     def _case(self, episode: Episode, moment: int, undisturbed: int | None = None) -> Case:
         solved = np.flatnonzero(episode.columns[schema.SUCCESS].ravel()[moment : moment + self._env.horizon])
@@ -141,3 +155,7 @@ class _Run:
 def draw_moment(seed: int, kind: str, steps: int) -> int:
     """Return one of the `steps` steps of an undisturbed run, for one kind of perturbation."""
     return int(rng_for(seed, f"moment of {kind}").integers(steps))
+
+
+def _state_and_action(episode: Episode, step: int) -> tuple[F64, F32]:
+    return episode.columns[schema.SIM_STATE][step].copy(), episode.columns[schema.EXECUTED_ACTION][step].copy()

@@ -1,4 +1,4 @@
-"""The phases that failed episodes ended in, and an evaluation's result in sentences."""
+"""The phases that failed episodes ended in, what failures depend on, and an evaluation's result in sentences."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from manip_il.mdp import F64
 from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import NO_PHASE
 
+MIN_EPISODES = 9  # that are split into thirds
+SAME_PLACE = 0.005  # coordinates that differ by less are one: what settled on the table rests there [m]
+THIRDS = ("lowest third", "middle third", "highest third")
 NOT_RECORDED = "not recorded"
 _NO_PHASE = "not even the expert can continue: an object is off the table, or something is out of reach"
 
@@ -117,11 +120,6 @@ def _factor_fact(factors: Sequence[Factor]) -> str:
 
 def _spaced(phase: str) -> str:
     return phase.replace("_", " ")
-
-
-MIN_EPISODES = 9  # that are split into thirds
-SAME_PLACE = 0.005  # coordinates that differ by less are one: what settled on the table rests there [m]
-THIRDS = ("lowest third", "middle third", "highest third")
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ Frames = Sequence[NDArray[np.uint8]]
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
     """Return the episode of one seed, the same as in an evaluation of `job`, with its states."""
-    return next(iter(run_job(replace(job, label="last"), [seed])))
+    return next(run_job(replace(job, label="last"), [seed]))
 
 
 def film(
@@ -47,13 +47,11 @@ def film(
 ) -> list[NDArray[np.uint8]]:
     """Return one picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
 
-    drawn: what the episode draws.
-
-    Raises `RenderError` where there is no off-screen OpenGL, `UnknownName` for the camera.
+    drawn: what the episode draws. Raises `RenderError` without off-screen OpenGL, `UnknownName` for the camera.
     """
     states = episode.columns[schema.SIM_STATE][: filmed_steps(episode, env_config.control_hz) : every]
-    seen = render_states(env_config, CameraConfig((camera,), *size, FILM), states, drawn)
-    return list(seen[schema.IMAGES + camera])
+    pictures = render_states(env_config, CameraConfig((camera,), *size, FILM), states, drawn)
+    return list(pictures[schema.IMAGES + camera])
 
 
 def filmed_steps(episode: Episode, fps: int) -> int:

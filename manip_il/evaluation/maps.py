@@ -77,9 +77,9 @@ class DrawnMark(NamedTuple):
     """A mark in one view [px]. end: None where there is none inside the picture."""
 
     mark: MapMark
-    start: tuple[float, float]
-    goal: tuple[float, float]
-    end: tuple[float, float] | None
+    start: Sequence[float]
+    goal: Sequence[float]
+    end: Sequence[float] | None
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class FailureMap:
         places = np.array([place for mark in self.marks for place in (mark.start, mark.goal)], dtype=np.float64)
         views = [fit_view(places, 0, up, MAP_HEIGHT) for up in (1, 2)]
         kept = _thinned(self.marks)
-        return [(view, [_draw(mark, view) for mark in kept]) for view in views]
+        return [(view, _draw(kept, view)) for view in views]
 
     @property
     def failed(self) -> int:
@@ -190,12 +190,16 @@ def _thinned(marks: Sequence[MapMark]) -> list[MapMark]:
     return [these[index] for these in layers for index in _evenly(len(these), MAX_MARKS)]
 
 
-def _draw(mark: MapMark, view: View) -> DrawnMark:
-    start, goal, end = view.project(np.array([mark.start, mark.goal, mark.end or mark.goal]))
+def _draw(marks: Sequence[MapMark], view: View) -> list[DrawnMark]:
+    places = np.array([(mark.start, mark.goal, mark.end or mark.goal) for mark in marks], dtype=np.float64)
+    pixels = view.project(places.reshape(-1, 3)).reshape(-1, 3, 2).tolist()
     edge = MARGIN / 2
-    inside = edge < end[0] < WIDTH - edge and edge < end[1] < view.height - edge
-    drawn_end = tuple(end) if mark.outcome != "solved" and mark.end is not None and inside else None
-    return DrawnMark(mark, tuple(start), tuple(goal), drawn_end)
+    drawn: list[DrawnMark] = []
+    for mark, (start, goal, (x, y)) in zip(marks, pixels, strict=True):
+        inside = edge < x < WIDTH - edge and edge < y < view.height - edge
+        has_end = mark.outcome != "solved" and mark.end is not None and inside
+        drawn.append(DrawnMark(mark, start, goal, (x, y) if has_end else None))
+    return drawn
 
 
 def _evenly(count: int, most: int) -> list[int]:

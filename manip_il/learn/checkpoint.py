@@ -244,10 +244,5 @@ def publish(temporary: Path, final: Path) -> None:
 
 def write_own_files(checkpoint: Path, meta: CheckpointMeta, step: Mapping[str, Any]) -> None:
     """Write what LeRobot's checkpoints have not: the meta, and the step with the resume key."""
-    write_json(checkpoint / PRETRAINED_MODEL / META_FILE, asdict(meta))
-    write_json(checkpoint / TRAINING_STATE / STEP_FILE, step)
-
-
-def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values as a file of JSON that people can read."""
-    path.write_text(json.dumps(values, indent=2) + "\n")
+    for path, values in ((f"{PRETRAINED_MODEL}/{META_FILE}", asdict(meta)), (f"{TRAINING_STATE}/{STEP_FILE}", step)):
+        (checkpoint / path).write_text(json.dumps(values, indent=2) + "\n")

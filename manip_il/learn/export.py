@@ -77,8 +77,8 @@ class PolicyFunction(nn.Module):
     @override
     def forward(self, observation: dict[str, Tensor]) -> Tensor:
         pictures = [to_float(observation[key].permute(0, 3, 1, 2)) for key in self.cameras]
-        seen = [encoder(picture) for encoder, picture in zip(self.encoders, pictures, strict=True)]
-        return self.network.actions(torch.cat([*(observation[key] for key in self.numbers), *seen], dim=1))
+        keypoints = [encoder(picture) for encoder, picture in zip(self.encoders, pictures, strict=True)]
+        return self.network.actions(torch.cat([*(observation[key] for key in self.numbers), *keypoints], dim=1))
 
 
 class _InOrder(nn.Module):

@@ -33,6 +33,15 @@ _FEW = 12  # names that one line of an error may list
 
 
 @dataclass(frozen=True)
+class MLPOptions:
+    """The options of the mlp that change most; `MLPConfig` has them all."""
+
+    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
+    width: int = option(256, "units per layer")
+    depth: int = option(3, "hidden layers")
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 
@@ -122,25 +131,6 @@ class FitConfig:
     def peak_lr(self) -> float | None:
         """Peak learning rate; None for that of the optimiser's preset."""
         return MLP_LR if self.lr is None and self.is_mlp else self.lr
-
-    @property
-    def plan_length(self) -> int:
-        """Actions that the policy plans at once: 1 for one that maps a state to an action."""
-        indices = self._lerobot_option("action_delta_indices")
-        return len(indices) if indices else 1
-
-    @property
-    def dropped_frames(self) -> int:
-        """Frames at an episode's end that the policy does not learn from."""
-        return self._lerobot_option("drop_n_last_frames") or 0
-
-    def _lerobot_option(self, name: str) -> Any:
-        """An attribute of the policy's configuration, which imports LeRobot; None for the mlp."""
-        if self.is_mlp:
-            return None
-        from manip_il.learn.lerobot_config import policy_config
-
-        return getattr(policy_config(self.policy, trust=self.trust), name, None)
 
 
 @cache

@@ -206,8 +206,8 @@ def policy_features(
         if key not in features:
             what = "pictures" if key == IMAGES else key
             raise ManipError(f"observation {observation!r}: the dataset has no {what}; {_LACKING[key]}")
-    chosen = dataset_to_policy_features({key: features[key] for key in (*wanted, ACTION)})
-    typed = {key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in chosen.items()}
+    typed = dataset_to_policy_features({key: features[key] for key in (*wanted, ACTION)})
+    typed = {key: PolicyFeature(feature.type, tuple(feature.shape)) for key, feature in typed.items()}
     return {key: typed[key] for key in wanted}, {ACTION: typed[ACTION]}
 
 

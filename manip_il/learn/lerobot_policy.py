@@ -86,10 +86,10 @@ class EpisodePolicy:
             self._memories[episode] = copy.deepcopy(self.module, dict(self._shared)), itertools.count()
         policy, steps = self._memories[episode]
         with _drawing(episode, next(steps), self._device):
-            seen = self._before({**row, "task": [self._task]})
+            observation = self._before({**row, "task": [self._task]})
             # mixed precision where the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if policy.config.use_amp else contextlib.nullcontext():
-                action = policy.select_action(seen)
+                action = policy.select_action(observation)
             return self._after(action)
 
 

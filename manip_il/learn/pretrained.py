@@ -137,26 +137,26 @@ def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ..
         checks.text("name of a feature", key, checks.LONGEST_NAME)
         feature = checks.mapping(key, value)
         shape = checks.array(f"shape of {key}", feature.get("shape"), 4)
-        sides = tuple(checks.whole(f"a side of {key}", side, 1, _LONGEST_SIDE) for side in shape)
-        found[key] = checks.text(f"type of {key}", feature.get("type"), checks.LONGEST_NAME), sides
+        sizes = tuple(checks.whole(f"a side of {key}", side, 1, _LONGEST_SIDE) for side in shape)
+        found[key] = checks.text(f"type of {key}", feature.get("type"), checks.LONGEST_NAME), sizes
     return found
 
 
 def check_interface(interface: Interface, spec: RobotTaskSpec) -> None:
-    """Raise `MismatchError` naming both sides unless an environment of `spec` has every input and takes the action."""
-    who = f"{spec.robot}/{spec.task}"
+    """Raise `MismatchError` naming both unless an environment of `spec` has every input and takes the action."""
+    environment = f"{spec.robot}/{spec.task}"
     have = {STATE: len(spec.joint_names), ENVIRONMENT_STATE: len(spec.environment_state_names)}
     known = [*have, *spec.image_keys]
     if any(key not in known for key in interface.columns):
-        raise MismatchError("inputs", "the policy", ", ".join(interface.columns), who, ", ".join(known))
+        raise MismatchError("inputs", "the policy", ", ".join(interface.columns), environment, ", ".join(known))
     for key, width in interface.numbers.items():
         if width != have[key]:
-            raise MismatchError(f"width of {key}", "the policy", width, who, have[key])
+            raise MismatchError(f"width of {key}", "the policy", width, environment, have[key])
     if interface.action != have[STATE]:
-        raise MismatchError("width of the action", "the policy", interface.action, who, have[STATE])
+        raise MismatchError("width of the action", "the policy", interface.action, environment, have[STATE])
     for camera, size in interface.pictures.items():
         if size != spec.image_size:
-            raise MismatchError(f"size of the pictures of {camera}", "the policy", size, who, spec.image_size)
+            raise MismatchError(f"size of the pictures of {camera}", "the policy", size, environment, spec.image_size)
 
 
 def check_processors(path: Path) -> None:

@@ -16,9 +16,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from manip_il.child_processes import bound_to_this_process
-from manip_il.data.lerobot_log import shorten_ffmpeg_warning
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, shorten_ffmpeg_warning
 from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot

@@ -22,6 +22,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.opcode import Opcode
+from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
@@ -53,22 +54,8 @@ SCALARS: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Schema:
-    """A message schema as MCAP registers it. encoding: `protobuf`, or `jsonschema` for JSON messages."""
-
-    name: str
-    encoding: str
-    data: bytes
-
-    @property
-    def message_encoding(self) -> str:
-        """Encoding of the messages themselves."""
-        return "json" if self.encoding == "jsonschema" else self.encoding
-
-
-@dataclass(frozen=True)
 class Channel:
-    """One topic. messages: encoded, one a frame; they can be taken once."""
+    """One topic. schema: its id is the writer's to give; messages: encoded, one a frame; they can be taken once."""
 
     topic: str
     schema: Schema
@@ -116,7 +103,7 @@ def scalars(topic: str, labels: Sequence[str], rows: Iterable[Sequence[float]]) 
     # filling a template is five times as fast as encoding a dict
     slots = (f'{{"label":{json.dumps(label).replace("%", "%%")},"value":%r}}' for label in labels)
     template = f'{{"scalars":[{",".join(slots)}]}}'
-    schema = Schema(SCALARS["title"], "jsonschema", json.dumps(SCALARS).encode())
+    schema = Schema(data=json.dumps(SCALARS).encode(), encoding="jsonschema", id=0, name=SCALARS["title"])
     return Channel(topic, schema, ((template % tuple(row)).encode() for row in rows))
 
 
@@ -176,7 +163,8 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
         schema = channel.schema
         if schema.name not in schema_ids:
             schema_ids[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
-        channel_ids.append(writer.register_channel(channel.topic, schema.message_encoding, schema_ids[schema.name]))
+        encoding = "json" if schema.encoding == "jsonschema" else schema.encoding
+        channel_ids.append(writer.register_channel(channel.topic, encoding, schema_ids[schema.name]))
     frames = zip(*(channel.messages for channel in channels), strict=True)
     for frame, (time, messages) in enumerate(zip(times, frames, strict=bool(channels))):
         for channel_id, message in zip(channel_ids, messages, strict=True):
@@ -237,7 +225,7 @@ def _protobuf_channel[Row](
 @functools.cache
 def _protobuf_schema(message: type[Message]) -> Schema:
     data = build_file_descriptor_set(message).SerializeToString(deterministic=True)
-    return Schema(message.DESCRIPTOR.full_name, "protobuf", data)
+    return Schema(data=data, encoding="protobuf", id=0, name=message.DESCRIPTOR.full_name)
 
 
 def _poses(states: dict[str, F64]) -> dict[str, tuple[F64, F64]]:

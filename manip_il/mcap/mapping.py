@@ -33,11 +33,11 @@ from typing import Any, Literal
 import yaml
 
 from manip_il import checks
+from manip_il.checks import read_yaml
 from manip_il.data.info import INDEX_FEATURES, NUMBERS
 from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mcap.path import FieldPath, parse_path
-from manip_il.yaml_file import read_yaml
 
 Method = Literal["nearest", "hold", "interpolate"]
 

@@ -1,0 +1,6 @@
+"""Robots: a YAML beside an MJCF each."""
+
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROBOTS = {"panda": HERE / "panda.yaml", "fetch": HERE / "fetch.yaml"}

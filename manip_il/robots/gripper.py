@@ -141,11 +141,8 @@ def _finger_geoms(model: mujoco.MjModel, body: str) -> tuple[int, ...]:
     for child in range(root + 1, model.nbody):
         if model.body_parentid[child] in bodies:
             bodies.add(child)
-    geoms = tuple(i for i in range(model.ngeom) if model.geom_bodyid[i] in bodies and _collides(model, i))
+    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = tuple(i for i in range(model.ngeom) if model.geom_bodyid[i] in bodies and touching[i])
     if not geoms:
         raise UsageError(f"finger {body!r} has no geom that can touch anything; expected at least one")
     return geoms
-
-
-def _collides(model: mujoco.MjModel, geom: int) -> bool:
-    return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])

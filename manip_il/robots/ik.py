@@ -22,6 +22,7 @@ _POSTURE_COST = 0.01  # [1/rad]; without it the label depends on the path that l
 _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
+_CONVERGED = 1e-4  # weighted pose error that is none [m]
 
 
 class ArmIK:
@@ -38,9 +39,8 @@ class ArmIK:
         posture = mink.PostureTask(model, cost=_POSTURE_COST)
         posture.set_target(home)
         self._tasks = [self._frame, posture]
-        free = np.array([not model.joint(name).limited[0] for name in robot.joints])
-        self.limits = np.array([model.joint(name).range for name in robot.joints])  # (arm, 2) [rad]
-        self.limits[free] = [-np.inf, np.inf]
+        joints = [model.joint(name) for name in robot.joints]
+        self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         self._limits = [mink.ConfigurationLimit(model)]
         self._qpos = np.zeros(model.nq)
 
@@ -81,9 +81,6 @@ class ArmIK:
         cosine = (float(data.site_xmat[self._site] @ rotation.ravel()) - 1) / 2
         angle = math.acos(min(1.0, max(-1.0, cosine)))
         return math.hypot(dx, dy, dz, _ORIENTATION_COST * angle)
-
-
-_CONVERGED = 1e-4
 
 
 def _solve(problem: qpsolvers.Problem) -> F64 | None:

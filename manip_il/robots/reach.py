@@ -22,7 +22,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots.robot import HERE, Robot
+from manip_il.robots import HERE
+from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
 if TYPE_CHECKING:

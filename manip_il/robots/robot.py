@@ -13,11 +13,10 @@ import mujoco
 import numpy as np
 
 from manip_il import checks
+from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
-from manip_il.yaml_file import read_yaml
+from manip_il.robots import ROBOTS
 
-HERE = Path(__file__).parent
-ROBOTS = {"panda": HERE / "panda.yaml", "fetch": HERE / "fetch.yaml"}
 SUFFIXES = (".yaml", ".yml")
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
 _MOST_JOINTS = 100
@@ -89,13 +88,11 @@ class Workspace:
     def read(cls, what: str, tree: Any) -> Self:
         """Make it of what YAML holds; `UsageError` names what is wrong."""
         tree = _tree(what, tree, cls)
-        sizes = (
-            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2) for name in _WORKSPACE_SIZES
+        half_width, height = (
+            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2)
+            for name in ("half_width", "height")
         )
-        return cls(_numbers(f"{what}.centre", tree["centre"], 2, _FURTHEST), *sizes)
-
-
-_WORKSPACE_SIZES = ("half_width", "height")
+        return cls(_numbers(f"{what}.centre", tree["centre"], 2, _FURTHEST), half_width, height)
 
 
 @dataclass(frozen=True)

@@ -66,9 +66,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._max_episode_steps = self.config.horizon
         self.task_description = self._task.instruction
         self.task = self.config.task
-        self._step = self._streak = 0
-        self._ever = False
-        self.action_space = _bounded(self.scene.actions.low, self.scene.actions.high)
+        limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
+        limits = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi)  # a joint that turns freely
+        self.action_space = gymnasium.spaces.Box(*limits.astype(np.float32), dtype=np.float32)
         self.observation_space = self._observation_space()
 
     @classmethod
@@ -110,14 +110,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         opening = rng.uniform(scene.gripper.least, scene.gripper.most)
         data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
-        self._step = self._streak = 0
-        self._ever = False
         world.update()
         mujoco.mj_forward(world.model, data)
 
     def _begin(self, seed: int, drawn: Drawn) -> None:
         """Make ready for an episode with these values."""
-        self.drawn = drawn
+        self.drawn, self._step, self._streak, self._ever = drawn, 0, 0, False
         self._events = Events.of(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
         self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
@@ -255,10 +253,3 @@ def environment_state_names(scene: Scene) -> tuple[str, ...]:
     for name, value in get_task(scene.task).observe(world).items():
         names += [f"{name}.{axis}" for axis in "xyz"] if np.ndim(value) else [name]
     return tuple(names)
-
-
-def _bounded(low: F64, high: F64) -> gymnasium.spaces.Box:
-    """The space of actions; a joint that turns freely is bounded by two turns."""
-    limits = np.vstack([low, high])
-    finite = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi).astype(np.float32)
-    return gymnasium.spaces.Box(finite[0], finite[1], dtype=np.float32)

@@ -9,8 +9,6 @@ from manip_il.errors import RenderError
 
 _BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}  # in order of preference -> shared library
 PACKAGES = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1"
-
-
 _KNOWN = ("egl", "osmesa", "glfw", "glx", "cgl", "wgl", "")
 _SWITCHES = ("enable", "enabled", "on", "true", "1", "disable", "disabled", "off", "false", "0")
 

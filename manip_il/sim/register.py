@@ -7,12 +7,11 @@ import gymnasium
 from manip_il.robots.robot import ROBOTS
 from manip_il.tasks.table import TASKS
 
-
-def _title(name: str) -> str:
-    return "".join(part.capitalize() for part in name.split("_"))
-
-
-ENV_IDS = {f"manip_il/{_title(robot)}{_title(task)}-v0": (robot, task) for robot in ROBOTS for task in TASKS}
+ENV_IDS = {
+    f"manip_il/{''.join(part.capitalize() for part in f'{robot}_{task}'.split('_'))}-v0": (robot, task)
+    for robot in ROBOTS
+    for task in TASKS
+}
 
 
 def register_envs() -> None:

@@ -83,7 +83,6 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         actions=_action_space(robot, joints, gripper),
         objects=objects,
         arm_q=np.array([joint.qposadr[0] for joint in joints], dtype=np.int64),
-        arm_v=np.array([joint.dofadr[0] for joint in joints], dtype=np.int64),
         arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
         ee_site=model.site(PREFIX + "ee").id,
         nominal=variation.nominal(model, objects),
@@ -129,12 +128,10 @@ def _add_look(spec: mujoco.MjSpec) -> None:
     spec.visual.quality.shadowsize = _SHADOW_SIZE
     spec.visual.map.znear = 0.01
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-    texture = mujoco.mjtTexture
-    builtin = mujoco.mjtBuiltin
     spec.add_texture(
         name="sky",
-        type=texture.mjTEXTURE_SKYBOX,
-        builtin=builtin.mjBUILTIN_GRADIENT,
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
         rgb1=[0.84, 0.88, 0.92],
         rgb2=[0.55, 0.62, 0.70],
         width=256,
@@ -203,11 +200,17 @@ def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArr
 
 def _add_front_camera(spec: mujoco.MjSpec, robot: Robot) -> None:
     x, y = robot.workspace.centre
-    _look_at(spec, "front", eye=(x + 0.85, y - 0.72, 0.66), at=(x - 0.10, y, 0.20), fovy=45)
+    eye, at = (x + 0.85, y - 0.72, 0.66), (x - 0.10, y, 0.20)
+    back = np.subtract(eye, at)
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+    spec.worldbody.add_camera(name="front", pos=eye, quat=quat, fovy=45)
 
 
 def _add_wrist_camera(spec: mujoco.MjSpec) -> None:
-    hand = spec.site("ee").parent
     site = spec.site("ee")
     offset = np.array([0.10, 0.0, -0.08])  # in the ee frame: beside the hand, behind the fingertips [m]
     rotation = np.zeros(9)
@@ -219,14 +222,4 @@ def _add_wrist_camera(spec: mujoco.MjSpec) -> None:
     axes = np.stack([np.array([0.0, 1.0, 0.0]), np.cross(back, [0.0, 1.0, 0.0]), back], axis=1)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, (rotation @ axes).flatten())
-    hand.add_camera(name="wrist", pos=np.asarray(site.pos) + rotation @ offset, quat=quat, fovy=70)
-
-
-def _look_at(spec: mujoco.MjSpec, name: str, eye: tuple[float, ...], at: tuple[float, ...], fovy: float) -> None:
-    back = np.subtract(eye, at)
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right = right / np.linalg.norm(right)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
-    spec.worldbody.add_camera(name=name, pos=eye, quat=quat, fovy=fovy)
+    site.parent.add_camera(name="wrist", pos=np.asarray(site.pos) + rotation @ offset, quat=quat, fovy=70)

@@ -27,9 +27,8 @@ _LEAST_CELL = 0.008  # what a pixel spans at 128 x 128 [m]
 _PLAIN_FACES = 1_600  # meshes up to here stay as they are
 _PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
 _LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
-_OBJECT_AND_CAMERAS = ("geom_size", "geom_matid", "geom_rgba", "cam_pos", "cam_quat")
 _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
-_CHANGED = (*_OBJECT_AND_CAMERAS, "light_pos", "light_dir", *_LAMPS)
+_CHANGED = ("geom_size", "geom_matid", "geom_rgba", "cam_pos", "cam_quat", "light_pos", "light_dir", *_LAMPS)
 
 
 class ViewModel:

@@ -40,7 +40,7 @@ class Pose(NamedTuple):
 class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
-    task: its name. arm_q, arm_v, arm_ctrl: indices of the arm's joints into qpos, qvel and ctrl. objects: free bodies
+    task: its name. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies
     by name. ee_site: id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
     """
 
@@ -51,26 +51,14 @@ class Scene:
     actions: ActionSpace
     objects: Mapping[str, Object]
     arm_q: NDArray[np.int64]
-    arm_v: NDArray[np.int64]
     arm_ctrl: NDArray[np.int64]
     ee_site: int
     nominal: F64
 
     @cached_property
-    def qpos_slice(self) -> slice:
-        """Part of `State.physics` that is qpos."""
-        start = mujoco.mj_stateSize(self.model, int(mujoco.mjtState.mjSTATE_TIME))
-        return slice(start, start + self.model.nq)
-
-    @cached_property
     def state_size(self) -> int:
         """Length of `State.physics`."""
         return mujoco.mj_stateSize(self.model, STATE_KIND)
-
-    @cached_property
-    def reach(self) -> Reach:
-        """Map of the points that the hand, pointing down, gets to."""
-        return reach_of(self.robot)
 
     @property
     def name(self) -> str:
@@ -204,10 +192,10 @@ class World:
         geoms = (self.scene.objects[name].geom,)
         return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
 
-    @property
+    @cached_property
     def reach(self) -> Reach:
         """Map of the points that the hand, pointing down, gets to."""
-        return self.scene.reach
+        return reach_of(self.scene.robot)
 
     @cached_property
     def has_goal(self) -> bool:

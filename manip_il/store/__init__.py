@@ -34,7 +34,8 @@ version; otherwise `ConflictError` tells the user to push again.
 
 `push` and `pull` are the two procedures, for any `remote.Remote`. One is the Hub (`hub`, on top of `hub_repo`,
 `hub_session` and `hub_http`); the other is `object_store`, on top of any store of plain files (`Blobs`): `s3_store`,
-`sftp_store`, `file_store`. `cards` and `card_dataset` make what the Hub shows of a folder.
+`sftp_store`, `file_store`. `schemes` opens the one that a URL names; the others know nothing of each other. `folder`
+lists what is pushed; `cards` and `card_dataset` make what the Hub shows of it.
 
-Importing this package does nothing; each remote's library is imported when a URL of its kind is opened.
+Importing this package does nothing; each remote's library is imported when a URL of its scheme is opened.
 """

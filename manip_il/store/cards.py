@@ -15,14 +15,15 @@ from typing import Any, cast
 from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
 from manip_il import checks
+from manip_il.checks import parse_yaml
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_read import dataset_info
 from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.errors import ManipError
+from manip_il.store.card_dataset import dataset_fields, draw_picture
 from manip_il.store.errors import redact
+from manip_il.store.folder import CARD, CONFIG, journals_of, policy_folder
 from manip_il.store.manifest import Kind
-from manip_il.store.push import CARD, CONFIG, journals_of, policy_folder
-from manip_il.yaml_file import parse_yaml
 
 PICTURE = "assets/episodes.png"
 _MADE_BY = "| made by | manip_il"  # a row of every card of ours
@@ -58,8 +59,6 @@ def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
     place = found[1] if found else _REPOSITORY
     if kind == "policy":
         return {} if is_kept else {CARD: _policy_card(root, place)}
-    from manip_il.store.card_dataset import dataset_fields, draw_picture
-
     picture = draw_picture(root)
     files = {PICTURE: picture} if picture else {}
     if not is_kept:

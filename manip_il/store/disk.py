@@ -19,6 +19,7 @@ from manip_il.store.remote import Advance
 if TYPE_CHECKING:
     from _hashlib import HASH  # what hashlib's constructors return
 
+HASHERS = 4  # threads: hashlib lets go of Python's lock
 CHUNK = 2**20  # of what is copied or hashed at a time [bytes]
 _START = 2  # SYNC_FILE_RANGE_WRITE
 _WORTH_A_THREAD = 2**17  # of a chunk that is hashed beside the writing [bytes]

@@ -10,6 +10,7 @@ import itertools
 import os
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -115,8 +116,9 @@ class FileBlobs:
         now, found = time.time(), dict[str, Stored]()
         for key in keys:
             with contextlib.suppress(OSError):
-                stat = self._path(key).lstat()
-                found[key] = Stored(stat.st_size, now - stat.st_mtime)
+                status = self._path(key).lstat()
+                if stat.S_ISREG(status.st_mode):  # what else has the name is replaced
+                    found[key] = Stored(status.st_size, now - status.st_mtime)
         return found
 
     def list(self) -> dict[str, Stored]:

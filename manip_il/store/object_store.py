@@ -194,17 +194,14 @@ class ObjectRemote:
         """Replace the manifest; return its token."""
         replaced = sorted(before.manifest.keys - manifest.keys) if before else []
         data = replace(manifest, replaced=tuple(replaced)).to_json()
-        tries = 0
 
         def swap() -> str:
-            nonlocal tries
-            tries += 1
             token = self.blobs.swap(data, before.token if before else None, sizes)
             if token is not None:
                 return token
-            found = self.blobs.manifest() if tries > 1 else None
+            found = self.blobs.manifest()
             if found and found[0] == data:
-                return found[1]  # an earlier try had worked, only its answer was lost
+                return found[1]  # an earlier try, maybe of the HTTP client's own, had worked: only its answer was lost
             raise ConflictError(self.name)
 
         token = self.retry(swap)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from manip_il.data import atomic
 from manip_il.errors import FolderExistsError, UsageError
-from manip_il.store.disk import Download, is_whole, sync_disk
+from manip_il.store.disk import HASHERS, Download, is_whole, sync_disk
 from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
+from manip_il.store.folder import CHECKPOINTS, JOURNALS, LAST, journals_of, newest, without_root_copies
 from manip_il.store.manifest import FileEntry, Manifest
 from manip_il.store.object_store import in_threads
-from manip_il.store.push import CHECKPOINTS, HASHERS, JOURNALS, LAST, Progress, journals_of, newest, without_root_copies
-from manip_il.store.remote import Remote, RemoteUrl, Snapshot
+from manip_il.store.remote import Progress, Remote, RemoteUrl, Snapshot
 
 RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -20,11 +20,6 @@ FORMS = {  # scheme -> how it is written
     "sftp": "sftp://[USER@]HOST[:PORT]/FOLDER",
     "file": "file://FOLDER",
 }
-_BLOBS = {  # scheme -> module and class of its `Blobs`; imported when it is needed
-    "s3": ("manip_il.store.s3_store", "S3Blobs"),
-    "sftp": ("manip_il.store.sftp_store", "SftpBlobs"),
-    "file": ("manip_il.store.file_store", "FileBlobs"),
-}
 _HUB_NAME = re.compile(r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?")
 _REVISION = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._/-]{0,254}")
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,253}")
@@ -35,6 +30,7 @@ _SFTP = re.compile(
 )
 
 Advance = Callable[[int], None]  # so many bytes more are done
+Progress = Callable[[int, str], AbstractContextManager[Advance]]  # total [bytes] and what it is of
 
 
 class Sink(Protocol):
@@ -147,15 +143,6 @@ class RemoteUrl:
         user, port = f"{self.user}@" if self.user else "", f":{self.port}" if self.port else ""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"sftp://{user}{host}{port}{self.place}"
-
-
-def open_remote(url: RemoteUrl, *, private: bool = False) -> Remote:
-    """Return the remote of a URL, without connecting yet. private: of a repository that a push creates on the Hub."""
-    if url.scheme == "hf":
-        return importlib.import_module("manip_il.store.hub").HubRemote(url, private)
-    module, name = _BLOBS[url.scheme]
-    make = getattr(importlib.import_module(module), name)
-    return importlib.import_module("manip_il.store.object_store").ObjectRemote(make(url))
 
 
 def secrets_in(word: str) -> list[str]:

@@ -1,7 +1,8 @@
 """Upload of a large file in parts, several at a time, each compared with what the store says that it received.
 
-An upload that was cut stays on the store, and the next try continues it. boto3's transfer manager would not do: it
-aborts an upload that fails, and cannot continue one that a killed process left.
+An upload that was cut stays on the store, and the next try continues it. boto3's transfer manager is quicker (200 MB to
+moto in 0.7 of the time, median of 8 pairs) but never lists uploads or parts (s3transfer 0.19, `tasks.py`): it aborts an
+upload that fails, and sends a file whose upload was killed again from its start, while the killed one's parts stay.
 """
 
 from __future__ import annotations

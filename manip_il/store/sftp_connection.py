@@ -1,8 +1,10 @@
 """One ssh connection with an sftp channel for each thread, made again when it is cut, and pipelined reads.
 
 It uses paramiko itself: fsspec's wrapper trusts any host key and cannot make a file only where there is none. Reads are
-our own, as paramiko's `prefetch` would not do: it asks from a second thread, and when the reader overtakes that one,
-the rest of the file is read one request at a time and everything is sent twice.
+our own, as paramiko's `prefetch` (and `getfo`) sends its requests from a second thread: when the reader overtakes that
+one, the rest of the file is read one request at a time and sent twice (3 of 10 reads of 256 MB over loopback), and the
+median speed is 0.5 to 0.7 of ours. With requests of 128 kB in place of 32 kB it is as quick; but at the first
+answer of a server that sends less, it takes all the others into memory, and reads the file one request at a time.
 """
 
 from __future__ import annotations

@@ -41,18 +41,21 @@ def test_the_expert_drives_all_of_round_0_and_never_more_later(text: str):
     assert all(0 <= later <= earlier <= 1 for earlier, later in pairwise(betas))
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        *((text, f"beta is '{text}'; expected") for text in ("linear:0", "linear:-3", "constant:1.1")),
+        *((text, f"beta is '{text}'; expected") for text in ("exponential:-0.1", "constant:nan")),
+        ("linear", "beta is 'linear'; expected linear:NUMBER"),
+        ("constant:", "beta is 'constant:'; expected constant:NUMBER"),
+        ("exponential:half", "beta is 'exponential:half'; expected exponential:NUMBER"),
+    ],
+)
+def test_a_parameter_that_is_missing_or_out_of_range_is_refused_and_shown_how(text: str, says: str):
+    with pytest.raises(UsageError, match=says):
+        BetaSchedule.parse(text)
+
+
 def test_an_unknown_schedule_answers_with_the_nearest():
     with pytest.raises(UnknownName, match="did you mean 'linear'"):
         BetaSchedule.parse("linaer:5")
-
-
-@pytest.mark.parametrize("text", ["linear:0", "linear:-3", "constant:1.1", "exponential:-0.1", "constant:nan"])
-def test_a_parameter_out_of_range_is_refused(text: str):
-    with pytest.raises(UsageError, match=f"beta is '{text}'; expected"):
-        BetaSchedule.parse(text)
-
-
-@pytest.mark.parametrize("text", ["linear", "constant:", "exponential:half"])
-def test_a_schedule_without_a_number_is_refused_and_shown_how(text: str):
-    with pytest.raises(UsageError, match=f"beta is '{text}'; expected {text.split(':')[0]}:NUMBER"):
-        BetaSchedule.parse(text)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels
+from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels, plan_of
 from manip_il.algorithms.table import check_method
 from manip_il.engine.drivers import QueryRule
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.config import CameraConfig
 
+LIKELIHOOD = QueryRule("likelihood", -2)
+FRONT = CameraConfig(("front",))
 CNN = FitConfig({"type": "cnn"})
 ACT = FitConfig({"type": "act", "chunk_size": 8, "n_action_steps": 4})
 DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
@@ -38,52 +40,34 @@ def test_options_that_contradict_each_other_are_refused(options, says: str):
 
 
 @pytest.mark.parametrize(
-    ("options", "says"),
+    ("check", "options", "says"),
     [
+        (check_labels, {"fit": ACT, "query_rule": QueryRule("one")}, "act learns from 8 in a row; use label=branch"),
         (
-            {"fit": ACT, "query_rule": QueryRule("one")},
-            "act learns from 8 in a row; use label=branch",
+            check_labels,
+            {"fit": DIFFUSION, "label": "branch", "branch_steps": 4},
+            "diffusion leaves out the last 7 frames",
         ),
-        ({"fit": DIFFUSION, "label": "branch", "branch_steps": 4}, "diffusion leaves out the last 7 frames"),
-        ({"query_rule": QueryRule("likelihood", -2)}, "--policy.type=mlp with --policy.loss=mixture or categorical"),
-        ({"fit": FitConfig({"loss": "gaussian"}), "query_rule": QueryRule("likelihood", -2)}, "mixture or categorical"),
-        ({"fit": ACT, "label": "branch", "query_rule": QueryRule("likelihood", -2)}, "--policy.type=mlp"),
+        (check_labels, {"query_rule": LIKELIHOOD}, "--policy.type=mlp with --policy.loss=mixture or categorical"),
+        (check_labels, {"fit": FitConfig({"loss": "gaussian"}), "query_rule": LIKELIHOOD}, "mixture or categorical"),
+        (check_labels, {"fit": ACT, "label": "branch", "query_rule": LIKELIHOOD}, "--policy.type=mlp"),
+        (check_method, {"method": "daggr"}, "unknown method 'daggr' .did you mean 'dagger'"),
+        (check_method, {"method": "cloning", "label": "branch"}, "the expert drive throughout"),
+        (check_method, {"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
+        (check_method, {"method": "dart", "fit": CNN, "cameras": FRONT}, "not for a policy on images"),
+        (check_cameras, {"fit": CNN}, "give --cameras=front,wrist"),
+        (check_cameras, {"cameras": FRONT}, "the policy takes none"),
+        (check_cameras, {"fit": ACT, "cameras": FRONT}, "the policy takes none"),
     ],
 )
-def test_labels_that_the_policy_cannot_use_are_refused(options, says: str):
+def test_options_that_are_not_for_the_policy_or_the_method_are_refused(check, options, says: str):
+    config = RunConfig(**options)
     with pytest.raises(UsageError, match=says):
-        check_labels(RunConfig(**options))
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"method": "daggr"}, "unknown method 'daggr' .did you mean 'dagger'"),
-        ({"method": "cloning", "label": "branch"}, "the expert drive throughout"),
-        ({"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
-        ({"method": "dart", "fit": CNN, "cameras": CameraConfig(("front",))}, "not for a policy on images"),
-    ],
-)
-def test_options_that_are_not_for_the_method_are_refused(options, says: str):
-    with pytest.raises(UsageError, match=says):
-        check_method(RunConfig(**options))
-
-
-@pytest.mark.parametrize(
-    ("fit", "cameras", "says"),
-    [
-        (CNN, (), "give --cameras=front,wrist"),
-        (FitConfig(), ("front",), "the policy takes none"),
-        (ACT, ("front",), "the policy takes none"),
-    ],
-)
-def test_pictures_are_rendered_exactly_where_the_policy_takes_them(fit, cameras, says: str):
-    with pytest.raises(UsageError, match=says):
-        check_cameras(RunConfig(fit=fit, cameras=CameraConfig(cameras) if cameras else None))
+        check(config)
 
 
 def test_a_branch_is_as_long_as_the_policy_needs_for_a_whole_plan():
-    assert [fit.plan_length for fit in (FitConfig(), ACT, DIFFUSION)] == [1, 8, 16]
+    assert [plan_of(fit) for fit in (FitConfig(), ACT, DIFFUSION)] == [(1, 0), (8, 0), (16, 7)]
     lengths = [RunConfig(fit=fit, label="branch").steps_of_branch for fit in (FitConfig(), ACT, DIFFUSION)]
     assert lengths == [1, 8, 16 + 7]
 

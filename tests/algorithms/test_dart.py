@@ -19,10 +19,10 @@ class Wrong:
     def __init__(self, table: dict[str, np.ndarray], errors: np.ndarray):
         self.actions = table["action"] + errors
         self.states = table["observation.state"]
-        self.asked: list[list[int]] = []
+        self.episodes: list[list[int]] = []
 
     def act(self, states, environment_states, images, episodes):
-        self.asked.append(list(episodes))
+        self.episodes.append(list(episodes))
         rows = [int(np.flatnonzero((self.states == state).all(axis=1))[0]) for state in states]
         return self.actions[rows]
 
@@ -54,9 +54,9 @@ def test_noise_is_the_mean_outer_product_of_the_errors_where_labels_are_sound(ta
     np.testing.assert_allclose(fitted, expected, atol=1e-6)
 
 
-def test_a_policy_is_asked_in_the_order_of_time(table, monkeypatch):
+def test_a_policy_is_episodes_in_the_order_of_time(table, monkeypatch):
     _, policy = noise(table, np.zeros((6, 2)), monkeypatch)
-    assert policy.asked == [[0, 1], [0, 1], [0], [0]]
+    assert policy.episodes == [[0, 1], [0, 1], [0], [0]]
 
 
 def test_without_a_sound_label_there_is_nothing_to_measure(table, monkeypatch):

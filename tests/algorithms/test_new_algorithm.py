@@ -17,7 +17,7 @@ from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
-from .trees import files, is_data
+from .trees import check_same_data
 
 pytestmark = pytest.mark.slow
 
@@ -52,34 +52,28 @@ def follow(algorithm, folder: Path, watch: Watch | None = None) -> list[RoundRes
     return list(run.follow(algorithm(run, CONFIG)))
 
 
-@pytest.mark.parametrize(("algorithm", "rounds"), [(expert_only, 1), (halves, 3)])
-def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorithm, rounds, tmp_path, monkeypatch):
-    whole = follow(algorithm, tmp_path / "whole")
+@pytest.mark.parametrize(("algorithm", "betas"), [(expert_only, [1.0]), (halves, [1.0, 0.5, 0.5])])
+def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorithm, betas, tmp_path, monkeypatch):
+    whole, rounds = follow(algorithm, tmp_path / "whole"), len(betas)
     assert [result.round for result in whole] == list(range(rounds))
+    assert [result.beta for result in whole] == betas
+    assert [result.episodes for result in whole] == [2, 4, 6][:rounds]
+    assert [result.labels for result in whole] == sorted({result.labels for result in whole})
     assert dataset_info(tmp_path / "whole/dataset").episodes == 2 * rounds
-    seen = 0
+    count = 0
 
     def stop(episode: Episode) -> None:
-        nonlocal seen
-        seen += 1
-        if seen == 3 * rounds:  # in the last round's validation
+        nonlocal count
+        count += 1
+        if count == 3 * rounds:  # in the last round's validation
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         follow(algorithm, tmp_path / "again", Watch(on_episode=stop))
     again = follow(algorithm, tmp_path / "again")
     assert [result.validation for result in again] == [result.validation for result in whole]
-    mine, theirs = files(tmp_path / "again"), files(tmp_path / "whole")
-    assert mine.keys() == theirs.keys()
-    assert {name: mine[name] for name in mine if is_data(name)} == {n: theirs[n] for n in theirs if is_data(n)}
+    check_same_data(tmp_path / "again", tmp_path / "whole")
 
     monkeypatch.setattr(Engine, "run", None)  # nothing is left to do
     third = follow(algorithm, tmp_path / "again")
     assert [replace(result, seconds={}) for result in third] == [replace(result, seconds={}) for result in again]
-
-
-def test_a_new_algorithm_counts_what_it_used(tmp_path):
-    results = follow(halves, tmp_path)
-    assert [result.beta for result in results] == [1.0, 0.5, 0.5]
-    assert [result.episodes for result in results] == [2, 4, 6]
-    assert [result.labels for result in results] == sorted({result.labels for result in results})

@@ -26,7 +26,7 @@ from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig
 
 from ..learn.tiny_policies import ACT
-from .trees import files, is_data
+from .trees import check_same_data, files
 
 pytestmark = pytest.mark.slow  # every test here waits for a whole run
 
@@ -51,18 +51,19 @@ def datasets(folder: Path, last: int) -> list[Path]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> tuple[Path, list[RoundResult], list[Episode]]:
     """One whole run: its folder, its rounds, and every episode that it made."""
-    folder, seen = tmp_path_factory.mktemp("dagger"), list[Episode]()
-    results = list(run_algorithm(CONFIG, folder, Engine(), Watch(on_episode=seen.append)))
-    return folder, results, seen
+    folder, made = tmp_path_factory.mktemp("dagger"), list[Episode]()
+    results = list(run_algorithm(CONFIG, folder, Engine(), Watch(on_episode=made.append)))
+    return folder, results, made
 
 
-def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation(run):
+def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation_and_the_run_its_best_policy(run):
     folder, results, _ = run
     for round_, episodes in enumerate((4, 2)):
         here = round_folder(folder, round_)
         assert dataset_info(here / "dataset").episodes == episodes
         assert (results[round_].policy / "model.safetensors").is_file()
         assert EvalResult.read(here / "eval.json") == results[round_].validation
+    assert files(folder / "best" / "pretrained_model") == files(best_round(results).policy)
 
 
 def test_the_numbers_of_a_round_are_those_of_its_data(run):
@@ -81,20 +82,14 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
 
 
 def test_every_seed_is_from_its_own_stream(run):
-    folder, _, seen = run
+    folder, _, made = run
     for round_, stream, count in ((0, "demonstrations", 4), (1, "round/1", 2)):
         table = read_table(round_folder(folder, round_) / "dataset", ("seed", "round", "beta"))
         assert set(table["seed"].ravel()) == set(stream_seeds(stream, count))
         assert set(table["round"].ravel()) == {round_}
-    made = {episode.seed for episode in seen}
+    seeds = {episode.seed for episode in made}
     streams = [("demonstrations", 4), ("round/1", 2), ("validation", 2)]
-    assert made == {seed for stream, count in streams for seed in stream_seeds(stream, count)}
-
-
-def test_best_is_the_round_with_the_best_validation(run):
-    folder, results, _ = run
-    best = best_round(results)
-    assert files(folder / "best" / "pretrained_model") == files(best.policy)
+    assert seeds == {seed for stream, count in streams for seed in stream_seeds(stream, count)}
 
 
 def test_of_equally_good_rounds_the_later_is_best(run):
@@ -155,9 +150,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(run, tmp_path, episode
         list(run_algorithm(CONFIG, tmp_path, Engine(), Watch(on_episode=stop)))
     again = list(run_algorithm(CONFIG, tmp_path, Engine()))
     assert [result.validation for result in again] == [result.validation for result in results]
-    mine, theirs = files(tmp_path), files(whole)
-    assert mine.keys() == theirs.keys()
-    assert {name: mine[name] for name in mine if is_data(name)} == {n: theirs[n] for n in theirs if is_data(n)}
+    check_same_data(tmp_path, whole)
 
 
 def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypatch):

@@ -12,6 +12,9 @@ def files(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
-def is_data(name: str) -> bool:
-    """Whether a file's bytes must not depend on where and when it was made."""
-    return name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))
+def check_same_data(run: Path, other: Path) -> None:
+    """Check that two runs have the same files, of which those of data have the same bytes."""
+    ours, theirs = files(run), files(other)
+    assert ours.keys() == theirs.keys()
+    data = [name for name in ours if name.endswith((".parquet", ".mcap", ".safetensors", "eval.json"))]
+    assert [ours[name] for name in data] == [theirs[name] for name in data]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.errors import RenderError
+from manip_il.evaluation import runner
 
 from .made_runs import make_policy
 
@@ -36,6 +37,20 @@ def error(capsys) -> Callable[[], str]:
 def policy(tmp_path_factory) -> Path:
     """A policy for panda reach that acts, badly; not to be changed."""
     return make_policy(tmp_path_factory.mktemp("made") / "policy")
+
+
+@pytest.fixture
+def evaluated(monkeypatch) -> list[str]:
+    """The policies that were evaluated, by name."""
+    names: list[str] = []
+    real = runner.evaluate
+
+    def counted(engine, job, seeds, name, *rest, **named):
+        names.append(name)
+        return real(engine, job, seeds, name, *rest, **named)
+
+    monkeypatch.setattr(runner, "evaluate", counted)
+    return names
 
 
 @pytest.fixture

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from manip_il.cli.common_options import EnvGroup, TaskGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import append_jsonl, save_options
+from manip_il.data import schema
+from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
+from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
+from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 
 ENV = EnvConfig("panda", "reach", horizon=8)
@@ -28,6 +33,19 @@ def files(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
+def make_episode(spec: RobotTaskSpec, seed: int, length: int) -> Episode:
+    """A solved one: right columns, random numbers."""
+    rng = np.random.default_rng(seed)
+    columns = {}
+    for key, feature in schema.features(spec).items():
+        shape = (length, *feature["shape"])
+        drawn = rng.normal(size=shape) if "float" in feature["dtype"] else rng.integers(0, 2, shape)
+        columns[key] = drawn.astype(feature["dtype"])
+    columns[schema.SEED][:], columns[schema.SUCCESS][:] = seed, True
+    columns[schema.DONE][:, 0] = np.arange(length) == length - 1
+    return Episode(seed, columns, True, True)
+
+
 def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
     """A policy that acts, badly."""
     spec = env_spec(env)
@@ -36,8 +54,7 @@ def make_policy(folder: Path, env: EnvConfig = ENV) -> Path:
 
 def mark(policy: Path, words: str) -> Path:
     """Make a policy another one, that acts the same."""
-    path = policy / META_FILE
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"options": {"mark": words}}))
+    edit_json(policy / META_FILE, lambda meta: meta.update(options={"mark": words}))
     return policy
 
 

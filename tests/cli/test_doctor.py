@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from manip_il.cli.main import main
 from manip_il.data import lerobot_layout as layout
-from manip_il.data import schema as s
 from manip_il.data.build import build
 from manip_il.data.journal import write_episode
 from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
 
+from ..damage import edit_json
+from .made_runs import make_episode
+
 ENV = EnvConfig("panda", "reach", 20)
-
-
-def episode(seed: int, length: int = 6) -> Episode:
-    columns: dict[str, np.ndarray] = {}
-    rng = np.random.default_rng(seed)
-    for key, feature in s.features(env_spec(ENV)).items():
-        shape = (length, *feature["shape"])
-        columns[key] = rng.integers(0, 2, shape).astype(feature["dtype"])
-    columns[s.SEED][:], columns[s.SUCCESS][:] = seed, True
-    columns[s.DONE][:, 0] = np.arange(length) == length - 1
-    return Episode(seed, columns, True, True)
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for seed in (1, 2):
-        write_episode(tmp_path / "d.journals", episode(seed), env_spec(ENV), env_fingerprint(ENV))
+        write_episode(
+            tmp_path / "d.journals", make_episode(env_spec(ENV), seed, 6), env_spec(ENV), env_fingerprint(ENV)
+        )
     build(tmp_path / "d.journals", tmp_path / "d")
     return tmp_path / "d"
 
@@ -83,10 +73,8 @@ def test_what_stays_wrong_exits_1(root, capsys):
 
 
 def test_the_robots_joints_are_compared(root, capsys):
-    ours = json.loads((root / layout.OURS).read_text())
-    ours["spec"]["joint_names"][0] = "elbow"
-    ours["fingerprint"]["model_sha256"] = "0" * 64
-    (root / layout.OURS).write_text(json.dumps(ours))
+    edit_json(root / layout.OURS, lambda ours: ours["spec"]["joint_names"].__setitem__(0, "elbow"))
+    edit_json(root / layout.OURS, lambda ours: ours["fingerprint"].update(model_sha256="0" * 64))
     assert main(["doctor", str(root)]) == 1
     out = capsys.readouterr().out
     assert "error    meta/manip_il.json: joint_names is elbow, " in out
@@ -94,9 +82,7 @@ def test_the_robots_joints_are_compared(root, capsys):
 
 
 def test_a_robot_that_is_not_known_is_said(root, capsys):
-    for name, key in ((layout.OURS, "robot"), (layout.INFO, "robot_type")):
-        data = json.loads((root / name).read_text())
-        (data["spec"] if name == layout.OURS else data)[key] = "so100"
-        (root / name).write_text(json.dumps(data))
+    edit_json(root / layout.OURS, lambda ours: ours["spec"].update(robot="so100"))
+    edit_json(root / layout.INFO, lambda info: info.update(robot_type="so100"))
     assert main(["doctor", str(root)]) == 0
     assert "is for so100 reach, which is not known here" in capsys.readouterr().out

@@ -19,6 +19,7 @@ from manip_il.sim.conditions import NOMINAL, draw
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
 
+from ..damage import edit_json
 from ..learn.tiny_policies import write_checkpoint
 from .made_runs import make_policy, make_run, mark
 
@@ -41,17 +42,14 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
         assert suite_conditions(suite, "pick_place", sees=True)
     assert {name for names in SUITES.values() for name in names} == set(CONDITIONS)
     assert suite_conditions("nominal", "reach", sees=False) == (NOMINAL,)
+    [knocked] = suite_conditions("knocked", "pick_place", sees=False)
+    assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
     names = [one.name for one in suite_conditions("all", "pick_place", sees=True)]
     assert names == ["nominal", "knocked", "sensing", "object", "view"]
     assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == names[:-1]
     assert [one.name for one in suite_conditions("all", "reach", sees=False)] == names[:-2]
     with pytest.raises(UsageError, match="changes nothing for reach"):
         suite_conditions("object", "reach", sees=True)
-
-
-def test_knocked_is_the_disturbance_that_dagger_collects_under():
-    [knocked] = suite_conditions("knocked", "pick_place", sees=False)
-    assert knocked.ranges == STANDARD.ranges
 
 
 def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch):
@@ -70,19 +68,14 @@ def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch)
 def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
     assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=8", *SMALL) == 0
     data = json.loads(Path("e/eval.json").read_text())
-    assert {name: one["n_episodes"] for name, one in data["by_condition"].items()} == {
-        "nominal": 2,
-        "knocked": 2,
-        "sensing": 2,
-        "object": 2,
-    }
     conditions = suite_conditions("all", "pick_place", sees=False)
+    counts = {name: one["n_episodes"] for name, one in data["by_condition"].items()}
+    assert counts == {one.name: 2 for one in conditions}
     for episode in data["episodes"]:
         assert episode["drawn"] == dict(draw(conditions, episode["seed"]).values)
     assert data["settings"]["suite"] == "all"
     out = capsys.readouterr().out
-    for name in data["by_condition"]:
-        assert f"|  {name} " in out
+    assert all(f"|  {name} " in out for name in data["by_condition"])
     assert Path("e/report.html").read_text().count("<video") == 0
 
 
@@ -127,8 +120,6 @@ def test_parts_on_seeds_of_their_own_merge_into_the_whole(here, capsys, error):
     capsys.readouterr()
     assert main(["merge", "a", "whole", "--output_dir=c"]) == 1
     assert "seed 4000000 is in a and in whole" in error()
-    assert main(["merge", "a", "b", "--output_dir=ab"]) == 2
-    assert "--overwrite=true" in error()
     assert not Path("c").exists()
 
 
@@ -146,8 +137,6 @@ def test_a_resumed_evaluation_is_the_whole_one(here, capsys, error):
     capsys.readouterr()
     assert evaluate("e", *REACH, "--eval.n_episodes=6", "--suite=sensing", "--resume=true") == 1
     assert "--suite differs" in error()
-    assert evaluate("e", *REACH, "--eval.n_episodes=4") == 2
-    assert "--resume=true" in error()
 
 
 def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, error):
@@ -160,16 +149,12 @@ def test_resuming_with_another_policy_of_the_same_name_is_refused(here, capsys, 
     assert "policy_sha256 (e was started with another; --overwrite=true starts over) differs" in error()
 
 
-def test_a_folder_that_cannot_be_written_to_is_said_before_the_first_episode(here, monkeypatch, error):
+def test_no_room_for_the_result_or_the_workers_is_said_before_the_first_episode(here, monkeypatch, error):
     monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
     Path("file").touch()
     for folder in ("/proc/nothing/here", "file/below"):
         assert evaluate(folder, *REACH, "--eval.n_episodes=1") == 1
         assert f"{folder} cannot be written to" in error()
-
-
-def test_too_little_memory_is_said_before_the_first_episode(here, monkeypatch, error):
-    monkeypatch.setattr("manip_il.sim.env.ManipEnv.advance", None)
     monkeypatch.setattr("manip_il.engine.local.needed_memory", lambda *_, **__: 10**15)
     assert evaluate("e", *REACH, "--eval.n_episodes=1") == 1
     assert "memory" in error()
@@ -203,11 +188,8 @@ def test_every_line_of_eval_json_can_be_replayed_alone(suite, act, here, capsys)
 
 def test_a_replay_that_comes_out_otherwise_says_so(act, here, capsys, error):
     assert evaluate("e", f"--policy.path={act}", "--suite=sensing", "--eval.n_episodes=2", *SMALL) == 0
-    path = Path("e/eval.json")
-    data = json.loads(path.read_text())
-    data["episodes"][0] |= {"success": True, "return": 3.0}
-    data["episodes"][1]["drawn"]["delay"] = 77
-    path.write_text(json.dumps(data))
+    edit_json(Path("e/eval.json"), lambda data: data["episodes"][0].update({"success": True, "return": 3.0}))
+    edit_json(Path("e/eval.json"), lambda data: data["episodes"][1]["drawn"].update(delay=77))
     capsys.readouterr()
     assert main(["replay", "e", "--episode=0"]) == 1
     line = error()

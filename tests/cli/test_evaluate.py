@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
 from manip_il.cli.main import main
+from manip_il.data.schema import STATE
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
 
+from ..damage import edit_json
 from ..learn.tiny_policies import edit_config, write_checkpoint
 from .made_runs import make_policy
 
@@ -40,11 +41,6 @@ def seeing(tmp_path) -> Path:
     return write_checkpoint(tmp_path / "policy", "act", spec, "images", meta=meta)
 
 
-def change_meta(policy: Path, **changes: object) -> None:
-    path = policy / META_FILE
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-
-
 def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, capsys):
     assert evaluate(act, tmp_path / "e") == 0
     out, err = capsys.readouterr()
@@ -67,7 +63,7 @@ def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
 
 @pytest.mark.gl
 def test_pictures_in_another_light_than_the_checkpoints_are_warned_of(seeing, tmp_path, capsys):
-    change_meta(seeing, look=None)
+    edit_json(seeing / META_FILE, lambda meta: meta.update(look=None))
     assert evaluate(seeing, tmp_path / "e") == 0
     [line] = [line for line in capsys.readouterr().err.splitlines() if "size and look" in line]
     for fingerprint in (env_fingerprint(ENV, DIM), env_fingerprint(ENV, replace(DIM, look=Look()))):
@@ -86,40 +82,37 @@ def test_without_opengl_the_word_comes_before_the_first_episode(seeing, tmp_path
     assert not (tmp_path / "e").exists()
 
 
-def spoil(policy: Path, how: str) -> None:
-    state, action = {"type": "STATE", "shape": [8]}, {"type": "ACTION", "shape": [8]}
-    if how == "no weights":
-        (policy / "model.safetensors").unlink()
-    elif how == "a pickle":
-        (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N.")
-    elif how == "unknown type":
-        edit_config(policy, type="akt")
-    elif how == "a camera that is not there":
-        picture = {"type": "VISUAL", "shape": [3, 32, 32]}
-        edit_config(policy, input_features={"observation.state": state, "observation.images.top": picture})
-    elif how == "an input that is not there":
-        edit_config(policy, input_features={"observation.state": state, "observation.effort": state})
-    elif how == "another action":
-        edit_config(policy, output_features={"action": action | {"shape": [7]}})
-    elif how == "another state":
-        edit_config(policy, input_features={"observation.state": state | {"shape": [6]}})
+def feature(kind: str, *shape: int) -> dict[str, object]:
+    return {"type": kind, "shape": list(shape)}
 
 
 @pytest.mark.parametrize(
-    ("how", "code", "words"),
+    ("change", "code", "words"),
     [
-        ("no weights", 1, "no model.safetensors in"),
-        ("a pickle", 1, "pytorch_model.bin is a pickle"),
-        ("unknown type", 2, "did you mean 'act'?"),
-        ("a camera that is not there", 1, "top, the environment has front, wrist"),
-        ("an input that is not there", 1, "observation.effort, panda/reach has observation.state"),
-        ("another action", 1, "the policy has 7, panda/reach has 8"),
-        ("another state", 1, "the policy has 6, panda/reach has 8"),
+        (lambda policy: (policy / "model.safetensors").unlink(), 1, "no model.safetensors in"),
+        (lambda policy: (policy / "pytorch_model.bin").write_bytes(b"\x80\x04N."), 1, "pytorch_model.bin is a pickle"),
+        ({"type": "akt"}, 2, "did you mean 'act'?"),
+        (
+            {"input_features": {STATE: feature("STATE", 8), "observation.images.top": feature("VISUAL", 3, 32, 32)}},
+            1,
+            "top, the environment has front, wrist",
+        ),
+        (
+            {"input_features": {STATE: feature("STATE", 8), "observation.effort": feature("STATE", 8)}},
+            1,
+            "observation.effort, panda/reach has observation.state",
+        ),
+        ({"output_features": {"action": feature("ACTION", 7)}}, 1, "the policy has 7, panda/reach has 8"),
+        ({"input_features": {STATE: feature("STATE", 6)}}, 1, "the policy has 6, panda/reach has 8"),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_bad_checkpoint_is_one_line_before_the_first_step(how, code, words, act, tmp_path, monkeypatch, error):
+def test_a_bad_checkpoint_is_one_line_before_the_first_step(change, code, words, act, tmp_path, monkeypatch, error):
     monkeypatch.setattr(ManipEnv, "advance", None)
-    spoil(act, how)
+    if callable(change):
+        change(act)
+    else:
+        edit_config(act, **change)
     assert evaluate(act, tmp_path / "e") == code
     assert words in error()
     assert not (tmp_path / "e").exists()

@@ -10,18 +10,14 @@ import pytest
 from manip_il.cli.interrupt import Interrupted, StopRequest, resume_command
 
 
-def hit(number: int = signal.SIGINT) -> None:
-    signal.raise_signal(number)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_is_a_request_and_the_second_stops(number, capfd):
     with StopRequest() as stop:
         assert not stop.requested
-        hit(number)
+        signal.raise_signal(number)
         assert stop.requested
         with pytest.raises(KeyboardInterrupt):
-            hit(number)
+            signal.raise_signal(number)
     assert capfd.readouterr().err.count("stopping after the step in hand (Ctrl-C again to stop at once)") == 1
 
 
@@ -35,7 +31,7 @@ def test_the_handlers_before_are_restored():
 def test_an_outer_one_learns_of_an_inner_ones_request():
     with StopRequest() as outer:
         with StopRequest() as inner:
-            hit()
+            signal.raise_signal(signal.SIGINT)
         assert inner.requested
         assert outer.requested
         with StopRequest() as late:

@@ -10,8 +10,9 @@ import pytest
 from manip_il.cli.main import main
 from manip_il.data.lerobot_read import read_table
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.data.schema import RobotTaskSpec, features
-from manip_il.mdp import Episode
+from manip_il.data.schema import RobotTaskSpec
+
+from .made_runs import make_episode
 
 SPEC = RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
 
@@ -19,14 +20,7 @@ SPEC = RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 3, "do it")
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("mcap") / "d"
-    rng = np.random.default_rng(0)
-    episodes = []
-    for seed in range(2):
-        table = features(SPEC).items()
-        columns = {key: rng.normal(size=(4, *f["shape"])).astype(f["dtype"]) for key, f in table}
-        columns["seed"][:] = seed
-        columns["next.success"][:] = True
-        episodes.append(Episode(seed, columns, True, True))
+    episodes = [make_episode(SPEC, seed, 4) for seed in range(2)]
     write_dataset(episodes, root, SPEC, repo_id="local/d", fingerprint={})
     return root
 

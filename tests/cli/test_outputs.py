@@ -62,57 +62,48 @@ def test_a_run_that_was_killed_before_it_wrote_its_options_can_be_gone_on_with(t
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    ("name", "content", "is_ours"),
     [
-        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options\nseed: 0\n"),
-        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}})),
-        ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}})),
+        ("config.yaml", f"{CONFIG_HEADER} 0.1.0: resolved options\nseed: 0\n", True),
+        ("meta/info.json", json.dumps({"features": {"action": {}, "executed_action": {}, "sim_state": {}}}), True),
+        ("eval.json", json.dumps({"success_rate": 1.0, "fingerprint": {}}), True),
+        ("config.yaml", "seed: 0\n", False),
+        ("meta/info.json", json.dumps({"features": {"action": {}}}), False),
+        ("meta/info.json", "{", False),
+        ("eval.json", "[]", False),
+        ("thesis.tex", "years of work", False),
     ],
 )
-def test_overwrite_deletes_what_this_program_made(tmp_path, name, content):
-    folder = tmp_path / "run"
-    atomic_write(folder / name, content)
-    overwrite(folder)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("config.yaml", "seed: 0\n"),
-        ("meta/info.json", json.dumps({"features": {"action": {}}})),
-        ("meta/info.json", "{"),
-        ("eval.json", "[]"),
-        ("thesis.tex", "years of work"),
-    ],
-)
-def test_overwrite_refuses_what_others_made(tmp_path, name, content):
+def test_overwrite_deletes_what_this_program_made_and_nothing_else(tmp_path, name, content, is_ours):
     atomic_write(tmp_path / "run" / name, content)
-    with pytest.raises(UsageError, match="did not make"):
+    if is_ours:
         overwrite(tmp_path / "run")
-    assert (tmp_path / "run" / name).read_text() == content
+        assert list(tmp_path.iterdir()) == []
+    else:
+        with pytest.raises(UsageError, match="did not make"):
+            overwrite(tmp_path / "run")
+        assert (tmp_path / "run" / name).read_text() == content
 
 
 def test_overwrite_spares_the_current_folder_home_checkouts_and_links(ours, monkeypatch, tmp_path):
-    inside = ours / "inside"
+    inside, link = ours / "inside", tmp_path / "link"
     inside.mkdir()
+    link.symlink_to(ours)
+
+    def refused(folder: Path, why: str) -> None:
+        with pytest.raises(UsageError, match=why):
+            overwrite(folder)
+
+    refused(Path("/"), "will not delete")
+    refused(link, "is a link")
     with monkeypatch.context() as patch:
         patch.chdir(inside)
-        with pytest.raises(UsageError, match="current folder"):
-            overwrite(ours)
+        refused(ours, "current folder")
     with monkeypatch.context() as patch:
         patch.setenv("HOME", str(inside))
-        with pytest.raises(UsageError, match="home folder"):
-            overwrite(ours)
-    with pytest.raises(UsageError, match="will not delete"):
-        overwrite(Path("/"))
-    link = tmp_path / "link"
-    link.symlink_to(ours)
-    with pytest.raises(UsageError, match="is a link"):
-        overwrite(link)
+        refused(ours, "home folder")
     (inside / ".git").mkdir()
-    with pytest.raises(UsageError, match="git checkout"):
-        overwrite(ours)
+    refused(ours, "git checkout")
     assert (ours / "config.yaml").exists()
 
 
@@ -182,19 +173,27 @@ def here(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_that_holds_something_is_refused(command, here, error):
+    words = [command, *COMMANDS[command], f"--output_dir={here / 'full'}"]
+    atomic_write(here / "full" / "thesis.tex", "years of work")
+    assert main(words) == 2
+    assert "full exists already; " in error()
+    assert main([*words, "--overwrite=true"]) == 2
+    assert "did not make" in error()
+
+
 @pytest.mark.parametrize("how", ["", "--overwrite=true"])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_folder_that_is_in_use_is_refused(command, how, here, capsys):
+def test_a_folder_that_is_in_use_is_refused(command, how, here, error):
     if command == "compare":  # on the same episodes
         make_eval(here / "right.json", [False, False])
     out = here / "out"
     with exclusive(out):
         assert main([command, *COMMANDS[command], f"--output_dir={out}", *([how] if how else [])]) == 1
-        errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-        assert errors == [
-            f"manip-il: error: {out} is in use by process {os.getpid()}; wait until that is done, or choose another "
-            "folder"
-        ]
+        assert error().endswith(
+            f": {out} is in use by process {os.getpid()}; wait until that is done, or choose another folder"
+        )
         assert not out.exists()
 
 

@@ -27,7 +27,7 @@ def url(tmp_path: Path) -> str:
     return f"file://{tmp_path}/store"
 
 
-def test_there_and_back(run, url, tmp_path, capsys):
+def test_there_and_back_and_again_nothing_travels(run, url, tmp_path, capsys):
     assert main(["push", str(run), url]) == 0
     captured = capsys.readouterr()
     assert captured.out.splitlines() == [
@@ -42,11 +42,6 @@ def test_there_and_back(run, url, tmp_path, capsys):
     assert captured.out == f"{target}: a policy of 2 files, 1.51 kB, all verified\n"
     assert captured.err == ""
     assert (target / "metrics.jsonl").read_bytes() == b"x" * 1500
-
-
-def test_again_nothing_travels(run, url, capsys):
-    assert main(["push", str(run), url]) == 0
-    capsys.readouterr()
     assert main(["push", str(run), url]) == 0
     assert capsys.readouterr().out.splitlines()[0] == f"{url}: 2 files, all there already"
 
@@ -84,26 +79,16 @@ def test_a_folder_that_is_there_is_replaced_only_when_asked_and_ours(run, url, t
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        (["push", ".", "URL"], 2, "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
-        (
-            ["push", "RUN", "hf://datasets/me/x"],
-            2,
-            "hf://datasets/me/x is for a dataset; push it",
-        ),
+        (["push", "empty", "URL"], 2, "is neither a LeRobot dataset (meta/info.json) nor a run or policy"),
+        (["push", "RUN", "hf://datasets/me/x"], 2, "hf://datasets/me/x is for a dataset; push it"),
         (["pull", "URL", "got"], 1, "holds nothing that can be pulled"),
     ],
 )
-def test_wrong_words_and_empty_places(
-    words: list[str], code: int, says: str, run, url, tmp_path,
-    monkeypatch, capsys,
-) -> None:  # fmt: skip
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path / "empty")
+def test_wrong_words_and_empty_places(words, code, says, run, url, here, error):
+    (here / "empty").mkdir()
     names = {"RUN": str(run), "URL": url}
     assert main([names.get(word, word) for word in words]) == code
-    error = capsys.readouterr().err
-    assert says in error
-    assert error.count("\n") == 1
+    assert says in error()
 
 
 def test_a_hub_from_the_command_line(tmp_path, capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
+from manip_il.cli.outputs import atomic_write
 from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_read import dataset_info, read_episodes, read_provenance, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
@@ -58,25 +59,25 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
     assert cut.with_name(f"{cut.name}.damaged").exists()
 
 
-def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, capsys):
+def test_what_is_there_is_refused_or_replaced(recorded, tmp_path, error):
     words = ["build", str(journals_of(recorded)), str(tmp_path / "x")]
     assert main(words) == 0
     before = files(tmp_path / "x")
     assert main(words) == 2
-    assert "replace it with --overwrite=true" in capsys.readouterr().err
+    assert "replace it with --overwrite=true" in error()
     assert main([*words, "--overwrite=true", "--repo_id=you/demos"]) == 0
     assert {name for name, data in files(tmp_path / "x").items() if data != before[name]} == {"meta/manip_il.json"}
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.tex").touch()
-    assert main([*words[:2], str(tmp_path / "mine"), "--overwrite=true"]) == 2
-    assert (tmp_path / "mine" / "thesis.tex").exists()
+    mine = tmp_path / "mine" / "thesis.tex"
+    atomic_write(mine, "")
+    assert main([*words[:2], str(mine.parent), "--overwrite=true"]) == 2
+    assert mine.exists()
 
 
-def test_no_journals_are_an_error(tmp_path, capsys):
-    (tmp_path / "empty.journals").mkdir()
-    assert main(["build", str(tmp_path / "empty.journals"), str(tmp_path / "x")]) == 1
-    assert "holds no readable episode" in capsys.readouterr().err
-    assert not (tmp_path / "x").exists()
+def test_no_journals_are_an_error(here, error):
+    Path("empty.journals").mkdir()
+    assert main(["build", "empty.journals", "x"]) == 1
+    assert "holds no readable episode" in error()
+    assert not Path("x").exists()
 
 
 @pytest.mark.slow
@@ -106,8 +107,7 @@ ENV = EnvConfig("panda", "reach", horizon=6, success_steps=1)
 
 
 @pytest.fixture
-def demos(tmp_path, monkeypatch) -> Path:
-    monkeypatch.chdir(tmp_path)
+def demos(here) -> Path:
     episodes = run_job(RolloutJob(ENV, "expert"), range(3))
     write_dataset(episodes, Path("demos"), env_spec(ENV), repo_id="local/demos", fingerprint=env_fingerprint(ENV))
     return Path("demos")
@@ -145,30 +145,22 @@ def test_two_workers_write_the_bytes_of_one(demos):
         (["demos", "full", "--overwrite=true"], 2, "full holds something that manip-il did not make"),
     ],
 )
-def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, capsys, words, code, message):
-    Path("full").mkdir()
-    Path("full/thesis.txt").touch()
+def test_wrong_words_are_answered_with_one_line_and_nothing_changes(demos, error, words, code, message):
+    atomic_write(Path("full/thesis.txt"), "")
     before = files(Path())
     assert main(["render", *words]) == code
-    errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 1
-    assert message in errors[0]
+    assert message in error()
     assert files(Path()) == before
 
 
-@pytest.fixture
-def no_context(monkeypatch):
+def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):
     def broken(*_: object) -> None:
         raise ImportError("cannot load libEGL.so.1")
 
     render.close()
     monkeypatch.setattr("mujoco.gl_context.GLContext", broken)
-
-
-@pytest.mark.usefixtures("no_context")
-def test_without_opengl_what_was_there_stays(demos, capsys):
     shutil.copytree("demos", "x")
     before = files(Path())
     assert main(["render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1
-    assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); on Debian: apt" in capsys.readouterr().err
+    assert "no off-screen OpenGL (ImportError: cannot load libEGL.so.1); on Debian: apt" in error()
     assert files(Path()) == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.lerobot_config import LeRobotFit
 
+from ..damage import edit_json
 from .made_runs import ENV, make_eval, make_policy, make_run
 
 COMMANDS = ("train", "dagger", "eval", "replay", "compare", "study", "certify")
@@ -34,10 +36,7 @@ REQUIRED = {
 def hostile(tmp_path) -> Path:
     """A policy of which a processor's step fetches a tokenizer by name."""
     policy = make_policy(tmp_path / "hostile")
-    path = policy / "policy_preprocessor.json"
-    values = json.loads(path.read_text())
-    values["steps"].append(STEP)
-    path.write_text(json.dumps(values))
+    edit_json(policy / "policy_preprocessor.json", lambda values: values["steps"].append(STEP))
     return policy
 
 
@@ -53,23 +52,19 @@ def named(tmp_path) -> Path:
     return folder
 
 
-def refused(words: list[str], capsys) -> None:
-    assert main(words) == 1
-    [line] = [line for line in capsys.readouterr().err.splitlines() if line.startswith("manip-il: error:")]
-    assert "evil/x" in line
-    assert "add --trust=true" in line
-
-
-def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, policy, tmp_path, capsys):
-    out = f"--output_dir={tmp_path / 'out'}"
+def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, policy, tmp_path, error):
+    out, file = f"--output_dir={tmp_path / 'out'}", make_eval(tmp_path / "e" / "eval.json", [True, False])
     words = ["--env.horizon=8", "--workers=1", out]
-    refused(["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words], capsys)
-    refused(["certify", f"--policy.path={hostile}", "--cases=1", *words], capsys)
-    refused(["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words], capsys)
-    file = make_eval(tmp_path / "e" / "eval.json", [True, False])
-    refused(["replay", str(file), "--episode=0", f"--policy.path={hostile}"], capsys)
-    refused(["dagger", f"--policy.path={named}", out], capsys)
-    refused(["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out], capsys)
+    for command in (
+        ["eval", f"--policy.path={hostile}", "--eval.n_episodes=1", *words],
+        ["certify", f"--policy.path={hostile}", "--cases=1", *words],
+        ["compare", str(policy), str(hostile), "--eval.n_episodes=1", *words],
+        ["replay", str(file), "--episode=0", f"--policy.path={hostile}"],
+        ["dagger", f"--policy.path={named}", out],
+        ["dagger", "--policy.type=gaussian_actor", "--policy.vision_encoder_name=evil/x", out],
+    ):
+        assert main(command) == 1
+        assert re.search(r"evil/x.*add --trust=true", error())
     with pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         LeRobotFit(parse(load("train"), ["--dataset.root=x", f"--policy.path={named}"])._fit_config())  # pyright: ignore[reportAttributeAccessIssue]
     assert not (tmp_path / "out").exists()
@@ -110,23 +105,23 @@ def test_a_run_means_its_best_policy_else_its_newest(tmp_path, policy):
     run = make_run(tmp_path / "run", policy)
     assert find_policy(run) == run / "best" / "pretrained_model"
     shutil.rmtree(run / "best")
-    assert find_policy(run) == run / "round_002" / "policy" / "checkpoints" / "last" / "pretrained_model"
-    shutil.rmtree(run / "round_002")
-    assert find_policy(run) == run / "round_001" / "policy" / "checkpoints" / "last" / "pretrained_model"
+    for newest in ("round_002", "round_001"):
+        assert find_policy(run) == run / newest / "policy" / "checkpoints" / "last" / "pretrained_model"
+        shutil.rmtree(run / newest)
 
 
 def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path, policy):
+    checkpoints = tmp_path / "run" / "checkpoints"
     for step in ("000100", "020000", "001000"):
-        shutil.copytree(policy, tmp_path / "run" / "checkpoints" / step / "pretrained_model")
-    assert find_policy(tmp_path / "run") == tmp_path / "run" / "checkpoints" / "020000" / "pretrained_model"
-    (tmp_path / "run" / "checkpoints" / "last").symlink_to("001000")
-    assert find_policy(tmp_path / "run") == tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+        shutil.copytree(policy, checkpoints / step / "pretrained_model")
+    assert find_policy(tmp_path / "run") == checkpoints / "020000" / "pretrained_model"
+    (checkpoints / "last").symlink_to("001000")
+    assert find_policy(tmp_path / "run") == checkpoints / "last" / "pretrained_model"
 
 
 @pytest.mark.parametrize("command", ["train", "dagger"])
-def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, tmp_path, policy, monkeypatch):
-    run = make_run(tmp_path / "run", policy)
-    monkeypatch.chdir(tmp_path)
+def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, here, policy):
+    run = make_run(here / "run", policy)
     options = parse(load(command), [*REQUIRED.get(command, []), "--policy.path=run"])
     fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
     assert Path(LeRobotFit(fit).policy.pretrained_path).resolve() == find_policy(run).resolve()
@@ -134,15 +129,13 @@ def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, 
 
 @pytest.mark.parametrize("value", ["missing", "null", "5"])
 @pytest.mark.parametrize("command", ["train", "dagger"])
-def test_a_path_without_a_policy_is_one_line(command, value, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_a_path_without_a_policy_is_one_line(command, value, error):
     assert main([command, *REQUIRED.get(command, []), f"--policy.path={value}"]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "policy" in err
+    assert "policy" in error()
 
 
-def test_eval_on_another_task_than_the_policys_says_which(tmp_path, policy, capsys):
+def test_eval_on_another_task_than_the_policys_says_which(tmp_path, policy, error):
     words = [f"--policy.path={policy}", "--task.type=lift", "--eval.n_episodes=1", f"--output_dir={tmp_path / 'e'}"]
     assert main(["eval", *words]) == 1
-    assert "task differs: the policy has reach, the environment has lift" in capsys.readouterr().err
+    assert "task differs: the policy has reach, the environment has lift" in error()

@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,27 +31,23 @@ from manip_il.data.lerobot_write import new_dataset, write_dataset
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-from ..damage import digests
+from ..damage import DATA, cut, digests, edit_json
+from ..pictures import assert_comes_back
 
-MakeEpisode = Callable[..., Episode]
 FINGERPRINT = {"mujoco": "3.11.0"}
 HERE = Path(__file__).parent
 OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": FINGERPRINT}
+ORIGIN = {"recorded": 3, "failed": 1}
 
 
 @pytest.fixture
 def root(tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
-    write_dataset(episodes, tmp_path / "lift", spec, provenance={"recorded": 3, "failed": 1}, **OPTIONS)
+    write_dataset(episodes, tmp_path / "lift", spec, provenance=ORIGIN, **OPTIONS)
     return tmp_path / "lift"
 
 
 def test_episodes_come_back_bit_for_bit(root, episodes):
-    for mine, yours in zip(read_episodes(root), episodes, strict=True):
-        assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
-        assert list(mine.columns) == list(yours.columns)
-        for key, values in yours.columns.items():
-            assert mine.columns[key].dtype == values.dtype
-            np.testing.assert_array_equal(mine.columns[key], values)
+    assert_comes_back(root, episodes)
 
 
 def test_a_table_holds_whole_columns(root, episodes, spec):
@@ -75,19 +70,17 @@ def test_a_table_can_be_of_some_columns_and_episodes(root, episodes):
 
 def test_scalars_may_be_columns_without_width(root, tmp_path, episodes, spec):
     flat = [
-        dataclasses.replace(
-            episode, columns={key: v[:, 0] if v.shape[1] == 1 else v for key, v in episode.columns.items()}
-        )
-        for episode in episodes
+        dataclasses.replace(one, columns={key: v[:, 0] if v.shape[1] == 1 else v for key, v in one.columns.items()})
+        for one in episodes
     ]
-    write_dataset(flat, tmp_path / "flat", spec, provenance={"recorded": 3, "failed": 1}, **OPTIONS)
+    write_dataset(flat, tmp_path / "flat", spec, provenance=ORIGIN, **OPTIONS)
     assert digests(tmp_path / "flat") == digests(root)
 
 
 def test_what_a_dataset_says_of_itself(root, spec):
     assert read_spec(root) == spec
     assert read_fingerprint(root) == FINGERPRINT
-    assert read_provenance(root) == {"recorded": 3, "failed": 1}
+    assert read_provenance(root) == ORIGIN
     info = dataset_info(root)
     assert (info.robot, info.task, info.fps, info.episodes, info.frames) == ("panda", "lift", 20, 3, 20)
     assert (info.success, info.success_at_end) == (2, 2)
@@ -102,19 +95,15 @@ def test_success_at_some_time_and_at_the_end_are_told_apart(tmp_path, make_episo
     assert [episode.success_at_end for episode in read_episodes(tmp_path / "lift")] == [False, True]
 
 
-def test_the_same_episodes_give_the_same_bytes(root, tmp_path, episodes, spec):
+def test_episodes_come_one_by_one_nothing_is_there_before_the_last_and_the_bytes_are_the_same(
+    root, tmp_path, episodes, spec
+):
     again = tmp_path / "elsewhere" / "again"
-    write_dataset(iter(episodes), again, spec, provenance={"recorded": 3, "failed": 1}, **OPTIONS)
-    assert digests(again) == digests(root)
-
-
-def test_episodes_may_come_one_by_one_and_nothing_is_there_before_the_last(root, tmp_path, episodes, spec):
-    again = tmp_path / "again"
     with new_dataset(again, spec, **OPTIONS) as writer:
         for episode in episodes:
             writer.add(episode)
             assert not again.exists()
-        info = writer.finish({"recorded": 3, "failed": 1})
+        info = writer.finish(ORIGIN)
         assert not again.exists()
         with pytest.raises(ManipError, match="is finished"):
             writer.add(episodes[0])
@@ -144,8 +133,9 @@ def test_statistics_do_not_depend_on_how_much_memory_they_may_use(root, tmp_path
         values = table[key].astype(np.float64)
         assert stats["count"] == [20]
         np.testing.assert_allclose(stats["std"], np.atleast_1d(values.std(axis=0)), rtol=1e-12, atol=1e-12)
-        expected = np.quantile(values, 0.9, axis=0, method="inverted_cdf")
-        np.testing.assert_array_equal(stats["q90"], np.atleast_1d(expected))
+        for name, share in layout.QUANTILES.items():
+            expected = np.quantile(values, share, axis=0, method="inverted_cdf")
+            np.testing.assert_array_equal(stats[name], np.atleast_1d(expected))
 
 
 def test_a_merge_equals_writing_all_episodes(tmp_path, make_episode, spec):
@@ -198,18 +188,20 @@ def test_nan_is_refused_with_episode_and_frame(tmp_path, make_episode, spec):
     assert list(tmp_path.iterdir()) == []
 
 
-def without(episode: Episode, key: str) -> Episode:
-    return dataclasses.replace(episode, columns={k: v for k, v in episode.columns.items() if k != key})
-
-
-def with_column(episode: Episode, key: str, values: np.ndarray) -> Episode:
-    return dataclasses.replace(episode, columns={**episode.columns, key: values})
+def with_column(episode: Episode, key: str, values: np.ndarray | None) -> Episode:
+    """None: without it."""
+    columns = episode.columns | {key: values}
+    return dataclasses.replace(episode, columns={k: v for k, v in columns.items() if v is not None})
 
 
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (lambda e: without(e, s.BETA), MismatchError, "column 'beta' differs: episode with seed 9 has no such column"),
+        (
+            lambda e: with_column(e, s.BETA, None),
+            MismatchError,
+            "column 'beta' differs: episode with seed 9 has no such column",
+        ),
         (lambda e: with_column(e, "acton", e.columns[s.ACTION]), UnknownName, "did you mean 'act"),
         (lambda e: with_column(e, s.ACTION, e.columns[s.ACTION].astype(np.float64)), MismatchError, "float64"),
         (lambda e: with_column(e, s.ACTION, e.columns[s.ACTION][:, :2]), MismatchError, r"\(9, 2\)"),
@@ -242,15 +234,13 @@ def test_what_is_not_there_is_named(root, tmp_path):
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
 def test_a_truncated_data_file_is_named(root, keep):
-    path = next(root.glob(layout.DATA_FILES))
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
-    with pytest.raises(ManipError, match=path.name):
+    cut(root / DATA, keep)
+    with pytest.raises(ManipError, match=Path(DATA).name):
         read_table(root)
 
 
 def test_broken_json_and_other_versions_are_named(root):
-    info = json.loads((root / layout.INFO).read_text())
-    (root / layout.INFO).write_text(json.dumps(info | {"codebase_version": "v2.1"}))
+    edit_json(root / layout.INFO, lambda info: info.update(codebase_version="v2.1"))
     with pytest.raises(ManipError, match=r"version v2\.1"):
         read_table(root)
     (root / layout.INFO).write_text("{")
@@ -285,8 +275,7 @@ sys.exit(", ".join(heavy & set(sys.modules)))
     ],
 )
 def test_a_column_of_another_kind_or_with_gaps_is_named(root, key, column):
-    path = next(root.glob(layout.DATA_FILES))
-    table = pq.read_table(path)
-    pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), path)
+    table = pq.read_table(root / DATA)
+    pq.write_table(table.set_column(table.column_names.index(key), key, pa.array(column)), root / DATA)
     with pytest.raises(ManipError, match=f"column '{key}' "):
         read_table(root, [key])

@@ -7,9 +7,8 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from ..damage import edit_json
 from ..pictures import encoded, numbered_episodes, numbers_of, picture, store_pictures, write
 from .test_video import largest_file
 
-MakeEpisode = Callable[..., Episode]
 FRONT, WRIST = KEYS = ["observation.images.front", "observation.images.wrist"]
 BYTES = 21 * 3 * 72 * 96  # one camera's, of three episodes
 PLENTY = 10 * BYTES
@@ -168,22 +166,15 @@ def test_what_is_in_use_stays(tmp_path, folder, make_episode, filmed, two):
 
 def test_of_two_at_once_one_decodes(root, folder):
     told: list[int] = []
-    results: list[dict[str, Any]] = []
 
     def slowly(count: int) -> None:
         told.append(count)
         time.sleep(0.2)
 
-    threads = [
-        threading.Thread(target=lambda: results.append(opened(root, folder, on_frames=slowly))) for _ in range(3)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(3) as pool:
+        results = pool.map(lambda _: opened(root, folder, on_frames=slowly), range(3))
+        assert [shown(frames[WRIST]) for frames in results] == 3 * [list(range(21, 42))]
     assert sum(told) == 42
-    assert len(results) == 3
-    assert all(shown(frames[WRIST]) == list(range(21, 42)) for frames in results)
 
 
 KILLED = """

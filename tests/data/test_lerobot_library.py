@@ -1,9 +1,11 @@
-"""LeRobot's unmodified library is the judge of what we write, with cameras and without; it imports torch."""
+"""LeRobot's unmodified library judges what we write, with cameras and without: its writer, its reader and its tools."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,14 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import read_episodes, read_frames, read_spec, read_table
-from manip_il.data.video import VideoConfig
+from manip_il.data.lerobot_read import dataset_info, read_frames, read_spec, read_table
+from manip_il.data.video_config import VideoConfig
+from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES
-from ..pictures import numbered_episodes, numbers_of, write
+from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"
@@ -72,6 +75,27 @@ def load(root: Path, **options: Any) -> Any:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     return LeRobotDataset(REPO, root=root, **options)
+
+
+def assert_loads(root: Path, episodes: list[Episode]) -> None:
+    """LeRobot's reader gives every frame of these episodes, pictures by the number that they show."""
+    import torch
+
+    dataset = load(root)
+    assert dataset.num_episodes == len(episodes)
+    frames = [(number, t, episode) for number, episode in enumerate(episodes) for t in range(len(episode))]
+    for index, (item, (number, t, episode)) in enumerate(zip(dataset, frames, strict=True)):
+        for key, values in episode.columns.items():
+            if key.startswith(s.IMAGES):
+                seen = item[key].permute(1, 2, 0).numpy() * 255
+                assert numbers_of(seen[None]) == numbers_of(values[t : t + 1])
+                continue
+            if key == s.SIM_STATE:  # LeRobot makes float32 of a float64 vector; `read_table` does not
+                values = values.astype(np.float32)
+            assert item[key].dtype == torch.from_numpy(values).dtype, key
+            np.testing.assert_array_equal(item[key].numpy(), values[t])
+        assert (item["episode_index"], item["frame_index"], item["index"]) == (number, t, index)
+        assert item["timestamp"] == pytest.approx(t / dataset.fps)
 
 
 def test_the_layout_is_the_librarys(spec):
@@ -147,81 +171,36 @@ def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precisi
                 np.testing.assert_allclose(left[key][name], table[name], rtol=1e-4, atol=1e-3, err_msg=f"{key} {name}")
 
 
-def test_pictures_equal_those_of_lerobots_writer(films, two):
+def test_pictures_equal_those_of_lerobots_writer(films, filmed, two):
+    assert read_spec(films[1]).image_keys == two.image_keys
     for key in two.image_keys:
-        for episode in range(3):
-            ours, theirs = (read_frames(root, key, episode) for root in films)
+        for number, episode in enumerate(filmed):
+            ours, theirs = (read_frames(root, key, number) for root in films)
             np.testing.assert_array_equal(ours, theirs)
-
-
-def test_quantiles_of_a_dataset_are_those_of_all_its_frames(ours, episodes):
-    stats = json.loads((ours / layout.STATS).read_text())
-    actions = np.concatenate([episode.columns[s.ACTION] for episode in episodes]).astype(np.float64)
-    for name, share in layout.QUANTILES.items():
-        expected = np.quantile(actions, share, axis=0, method="inverted_cdf")
-        np.testing.assert_array_equal(stats[s.ACTION][name], expected)
+            assert numbers_of(theirs) == numbers_of(episode.columns[key])
 
 
 def test_every_frame_that_lerobot_loads_is_the_one_written(ours, episodes, spec):
-    import torch
-
+    assert_loads(ours, episodes)
     dataset = load(ours)
-    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 20, spec.fps)
-    assert dataset.meta.robot_type == spec.robot
-    frames = ((number, episode, t) for number, episode in enumerate(episodes) for t in range(len(episode)))
-    for index, (number, episode, t) in enumerate(frames):
-        item = dataset[index]
-        for key, values in episode.columns.items():
-            if key == s.SIM_STATE:  # LeRobot makes float32 of a float64 vector; `read_table` does not
-                values = values.astype(np.float32)
-            assert item[key].dtype == torch.from_numpy(values).dtype, key
-            np.testing.assert_array_equal(item[key].numpy(), values[t])
-        assert (item["episode_index"], item["frame_index"], item["index"]) == (number, t, index)
-        assert item["timestamp"] == pytest.approx(t / spec.fps)
-        assert item["task"] == spec.instruction
+    assert (dataset.fps, dataset.meta.robot_type) == (spec.fps, spec.robot)
+    assert all(item["task"] == spec.instruction for item in dataset)
 
 
 @pytest.mark.parametrize("backend", ["pyav", "torchcodec"])
 @pytest.mark.parametrize("file_size", [200.0, 0.001])
 def test_lerobot_decodes_the_right_pictures(tmp_path, make_episode, two, backend, file_size):
     episodes = numbered_episodes(make_episode, two, 6)
-    root = tmp_path / "film"
-    write(episodes, root, two, video_files_size_in_mb=file_size)
+    root = write(episodes, tmp_path / "film", two, video_files_size_in_mb=file_size)
     assert (len(list(root.rglob("*.mp4"))) > 2) == (file_size < 1)
     step = 1 / two.fps
     dataset = load(root, video_backend=backend, delta_timestamps={key: [-step, 0] for key in two.image_keys})
-    index = 0
-    for episode in episodes:
-        for t in range(len(episode)):
-            item = dataset[index]
-            for key in two.image_keys:
-                expected = numbers_of(episode.columns[key][[max(t - 1, 0), t]])
-                seen = (item[key].permute(0, 2, 3, 1).numpy() * 255).round()
-                assert numbers_of(seen) == expected, (index, key)
-            index += 1
-    assert index == len(dataset)
-
-
-def test_windows_in_time_stop_at_an_episodes_borders(ours, episodes, spec):
-    step = 1 / spec.fps
-    dataset = load(ours, delta_timestamps={s.ACTION: [0, step, 2 * step], s.STATE: [-step, 0]})
-    action, state = episodes[0].columns[s.ACTION], episodes[0].columns[s.STATE]
-    last = dataset[len(episodes[0]) - 1]
-    np.testing.assert_array_equal(last[s.ACTION].numpy(), [action[-1]] * 3)
-    assert last["action_is_pad"].tolist() == [False, True, True]
-    np.testing.assert_array_equal(last[s.STATE].numpy(), state[-2:])
-    first = dataset[0]
-    np.testing.assert_array_equal(first[s.ACTION].numpy(), action[:3])
-    np.testing.assert_array_equal(first[s.STATE].numpy(), [state[0], state[0]])
-    assert first["observation.state_is_pad"].tolist() == [True, False]
-    middle = dataset[len(episodes[0])]  # the episode of one frame
-    assert middle["action_is_pad"].tolist() == [False, True, True]
-
-
-def test_a_selection_of_episodes_loads(ours, episodes):
-    dataset = load(ours, episodes=[2])
-    assert dataset.num_frames == 12
-    np.testing.assert_array_equal(dataset[0][s.ACTION].numpy(), episodes[2].columns[s.ACTION][0])
+    frames = [(episode, t) for episode in episodes for t in range(len(episode))]
+    for item, (episode, t) in zip(dataset, frames, strict=True):
+        for key in two.image_keys:
+            expected = numbers_of(episode.columns[key][[max(t - 1, 0), t]])
+            seen = (item[key].permute(0, 2, 3, 1).numpy() * 255).round()
+            assert numbers_of(seen) == expected, (item["index"], key)
 
 
 def test_many_small_files_load(tmp_path, episodes, spec):
@@ -234,18 +213,11 @@ def test_many_small_files_load(tmp_path, episodes, spec):
         assert number in pq.read_table(path)["episode_index"].to_pylist()
 
 
-def test_lerobots_own_dataset_reads_as_ours(theirs, ours):
-    left, right = read_table(theirs), read_table(ours)
+def test_lerobots_own_dataset_reads_as_ours(pair):
+    left, right = map(read_table, pair)
     assert left.keys() == right.keys()
     for key, values in left.items():
         np.testing.assert_array_equal(values, right[key])
-
-
-def test_lerobots_own_film_reads_as_ours(films, filmed, two):
-    assert read_spec(films[1]).image_keys == two.image_keys
-    for mine, yours in zip(read_episodes(films[1]), filmed, strict=True):
-        for key in two.image_keys:
-            assert numbers_of(mine.columns[key]) == numbers_of(yours.columns[key])
 
 
 def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
@@ -255,3 +227,81 @@ def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
     LeRobotDataset.create(REPO, fps=spec.fps, features=s.features(spec), root=root, use_videos=False)
     with pytest.raises(ManipError, match="no data"):
         read_table(root)
+
+
+@pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])
+def seen(request, spec) -> s.RobotTaskSpec:
+    return with_cameras(spec, *request.param)
+
+
+@pytest.fixture
+def recorded(tmp_path, make_episode, seen) -> tuple[Path, list[Episode]]:
+    episodes = numbered_episodes(make_episode, seen, 5)
+    return write(episodes, tmp_path / "lift", seen), episodes
+
+
+@pytest.fixture
+def edit(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """The command in this process: each of its own would import torch again."""
+    from lerobot.scripts.lerobot_edit_dataset import main
+
+    def call(*words: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *words])
+        main()
+
+    return call
+
+
+def assert_holds(root: Path, episodes: list[Episode]) -> None:
+    """The doctor finds it whole; for LeRobot's reader and for ours, numbers are equal and pictures the right ones."""
+    assert_comes_back(root, episodes)
+    assert all(count_frames(path) == rows for path, rows in video_rows(root).items())
+    assert not has_errors(examine_folder(root))
+    assert_loads(root, episodes)
+
+
+def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
+    from lerobot.datasets import dataset_tools
+
+    root, episodes = recorded
+    kept = tmp_path / "kept"
+    words = ("--operation.type", "delete_episodes", "--operation.episode_indices", "[1, 2]")
+    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
+    assert_holds(kept, [episodes[0], *episodes[3:]])
+    s.check_same_spec("before", seen, "after", read_spec(kept))  # LeRobot drops our file
+    assert (read_spec(kept).instruction, dataset_info(kept).success) == (seen.instruction, 3)
+    assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
+
+
+def test_a_dataset_split_and_merged_again_by_lerobots_command(tmp_path, recorded, edit):
+    root, episodes = recorded
+    splits = json.dumps({"train": [0, 1, 2], "rest": [3, 4]})
+    words = ("--operation.type", "split", "--operation.splits", splits)
+    edit("--repo_id", REPO, "--root", str(root), "--new_root", str(tmp_path / "split"), *words)
+    parts = [tmp_path / "split" / name for name in ("train", "rest")]
+    assert_holds(parts[0], episodes[:3])
+    assert_holds(parts[1], episodes[3:])
+    words = ("--operation.repo_ids", "['a/train', 'a/rest']", "--operation.roots", str([str(part) for part in parts]))
+    new = ("--new_repo_id", "a/all", "--new_root", str(tmp_path / "all"))
+    edit(*new, "--operation.type", "merge", *words)
+    assert_holds(tmp_path / "all", episodes)
+
+
+def test_lerobot_joins_ours_with_its_own(tmp_path, episodes, spec):
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    roots = [write(episodes, tmp_path / "ours", spec), write_by_lerobot(episodes, tmp_path / "theirs", spec)]
+    aggregate_datasets(["a/ours", "a/theirs"], "a/all", roots=roots, aggr_root=tmp_path / "all")
+    assert_holds(tmp_path / "all", episodes * 2)
+
+
+def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    _, episodes = recorded
+    root = write(episodes[:2], tmp_path / "resumed", seen)
+    dataset = LeRobotDataset.resume(REPO, root=root)
+    add_episode(dataset, episodes[2], seen)
+    dataset.finalize()
+    assert_holds(root, episodes[:3])
+    assert dataset_info(root).episodes == 3

@@ -15,7 +15,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_read import camera_keys
-from manip_il.data.video import VideoConfig
+from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -27,9 +27,12 @@ RECORDED = ("video", "image")
 
 
 @pytest.fixture(scope="module")
-def roots(
-    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.RobotTaskSpec
-) -> dict[str, Path]:
+def five(make_episode: Callable[..., Episode], two: s.RobotTaskSpec) -> list[Episode]:
+    return numbered_episodes(make_episode, two, 5)
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory: pytest.TempPathFactory, five: list[Episode], two: s.RobotTaskSpec) -> dict[str, Path]:
     """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
     from lerobot.datasets.aggregate import aggregate_datasets
 
@@ -37,7 +40,6 @@ def roots(
 
     folder = tmp_path_factory.mktemp("datasets")
     for codec in ("h264", "libsvtav1"):
-        five = numbered_episodes(make_episode, two, 5)
         write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
     os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
     for kind in RECORDED:
@@ -78,21 +80,28 @@ def test_the_cache_is_bit_equal_to_what_lerobot_gives(roots, name, tmp_path):
             np.testing.assert_array_equal(ours[key].numpy(), values[row], strict=True)
 
 
-def test_windows_of_pictures_stop_at_an_episodes_borders(roots, spec):
-    step = 1 / spec.fps
-    dataset = windows(roots["h264"], {FRONT: [-step, 0], s.ACTION: [0, step, 2 * step]})
-    sample = dataset[8]  # the first frame of the third episode
-    assert sample[FRONT].shape == (2, 3, 72, 96)
-    assert numbers_of(sample[FRONT].permute(0, 2, 3, 1).numpy()) == [8, 8]
-    assert sample[f"{FRONT}_is_pad"].tolist() == [True, False]
-    assert sample[s.ACTION].shape == (3, len(spec.joint_names))
+def test_windows_in_time_stop_at_an_episodes_borders(roots, five, two):
+    step = 1 / two.fps
+    dataset = windows(roots["h264"], {FRONT: [-step, 0], s.STATE: [-step, 0], s.ACTION: [0, step, 2 * step]})
+    state, action = five[2].columns[s.STATE], five[2].columns[s.ACTION]
+    first, last = dataset[8], dataset[20]
+    assert first[FRONT].shape == (2, 3, 72, 96)
+    assert numbers_of(first[FRONT].permute(0, 2, 3, 1).numpy()) == [8, 8]
     assert numbers_of(dataset[9][FRONT].permute(0, 2, 3, 1).numpy()) == [8, 9]
+    assert first[f"{FRONT}_is_pad"].tolist() == first[f"{s.STATE}_is_pad"].tolist() == [True, False]
+    np.testing.assert_array_equal(first[s.STATE].numpy(), [state[0], state[0]])
+    np.testing.assert_array_equal(first[s.ACTION].numpy(), action[:3])
+    np.testing.assert_array_equal(last[s.STATE].numpy(), state[-2:])
+    np.testing.assert_array_equal(last[s.ACTION].numpy(), [action[-1]] * 3)
+    one_frame = dataset[7]
+    assert one_frame["action_is_pad"].tolist() == last["action_is_pad"].tolist() == [False, True, True]
 
 
-def test_a_selection_of_episodes(roots):
+def test_a_selection_of_episodes(roots, five):
     dataset = windows(roots["h264"], episodes=[2])
     assert len(dataset) == 13
     assert numbers_of(dataset[0][FRONT].permute(1, 2, 0).numpy()[None]) == [8]
+    np.testing.assert_array_equal(dataset[0][s.ACTION].numpy(), five[2].columns[s.ACTION][0])
 
 
 def test_a_loader_with_processes_of_its_own(roots, tmp_path):

@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
@@ -29,47 +28,29 @@ from manip_il.data.lerobot_read import (
     read_table,
 )
 from manip_il.data.lerobot_stats import pixel_counts
-from manip_il.data.lerobot_write import new_dataset, write_dataset
-from manip_il.data.video import VideoConfig
+from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import digests
-from ..pictures import count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
 
-MakeEpisode = Callable[..., Episode]
-OPTIONS: dict[str, Any] = {"repo_id": "someone/lift", "fingerprint": {}}
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s.RobotTaskSpec) -> Path:
-    root = tmp_path_factory.mktemp("filmed") / "lift"
-    write_dataset(filmed, root, two, **OPTIONS)
-    return root
+    return write(filmed, tmp_path_factory.mktemp("filmed") / "lift", two)
 
 
-def assert_pictures_come_back(root: Path, episodes: list[Episode]) -> None:
-    for mine, yours in zip(read_episodes(root), episodes, strict=True):
-        assert list(mine.columns) == list(yours.columns)
-        for key, values in yours.columns.items():
-            if key in (FRONT, WRIST):
-                assert numbers_of(mine.columns[key]) == numbers_of(values)
-            else:
-                np.testing.assert_array_equal(mine.columns[key], values)
-
-
-def test_every_frame_comes_back_in_its_place(root, filmed):
-    assert_pictures_come_back(root, filmed)
+def test_every_frame_comes_back_in_its_place_nearly_as_it_was(root, filmed):
+    assert_comes_back(root, filmed)
     assert numbers_of(read_frames(root, FRONT, 2)) == list(range(8, 21))
     assert numbers_of(read_frames(root, WRIST, 1)) == [28]
-
-
-def test_compression_loses_little(root, filmed):
     frames = read_frames(root, FRONT, 0)
     assert frames.dtype == np.uint8
-    assert np.abs(frames.astype(float) - filmed[0].columns[FRONT]).mean() < 2
+    assert np.abs(frames.astype(float) - filmed[0].columns[FRONT]).mean() < 2  # of 255 levels
 
 
 def test_rows_equal_decoded_frames(root):
@@ -84,13 +65,12 @@ def test_a_new_file_starts_between_episodes(tmp_path, make_episode, two):
     assert sum(path.parts[-3] == FRONT for path in rows) > 2
     assert {path: count_frames(path) for path in rows} == rows
     assert sorted((tmp_path / "small").rglob("*.mp4")) == sorted(rows)
-    assert_pictures_come_back(tmp_path / "small", episodes)
+    assert_comes_back(tmp_path / "small", episodes)
 
 
-@pytest.mark.parametrize("g", [2, None])
-def test_h264_frames_come_back_too(tmp_path, filmed, two, g):
-    write(filmed, tmp_path / "lift", two, video=VideoConfig("h264", g=g, crf=20, preset="veryfast"))
-    assert_pictures_come_back(tmp_path / "lift", filmed)
+def test_frames_of_other_settings_come_back_too(tmp_path, filmed, two):
+    write(filmed, tmp_path / "lift", two, video=VideoConfig("h264", g=None, crf=20, preset="veryfast"))
+    assert_comes_back(tmp_path / "lift", filmed)
     feature = json.loads((tmp_path / "lift" / layout.INFO).read_text())["features"][FRONT]
     assert (feature["info"]["video.codec"], feature["info"]["video.preset"]) == ("h264", "veryfast")
 
@@ -133,7 +113,7 @@ def test_pixels_of_episodes_add_up(filmed):
 def test_a_queue_shorter_than_an_episode_only_slows(tmp_path, filmed, two, monkeypatch):
     monkeypatch.setattr(video, "QUEUE_BYTES", 1)
     write(filmed, tmp_path / "lift", two)
-    assert_pictures_come_back(tmp_path / "lift", filmed)
+    assert_comes_back(tmp_path / "lift", filmed)
 
 
 AV1 = {"vcodec": "libsvtav1"}
@@ -144,11 +124,7 @@ AV1 = {"vcodec": "libsvtav1"}
     [
         ({"vcodec": "libsvtav2"}, UnknownName, r"unknown video codec 'libsvtav2' \(did you mean 'libsvtav1'\?\)"),
         ({"g": 0}, UsageError, "g=0; expected 1 or more"),
-        (
-            {"vcodec": "libsvtav1", "crf": 99},
-            UsageError,
-            r"cannot encode 96 x 72 pictures .*crf=99.*'crf' out of range \[0 - 63\]",
-        ),
+        ({**AV1, "crf": 99}, UsageError, r"cannot encode 96 x 72 pictures .*crf=99.*'crf' out of range \[0 - 63\]"),
         ({**AV1, "preset": "slow"}, UsageError, "preset='slow'"),
         ({**AV1, "pix_fmt": "yuv444p"}, UsageError, "Specified pixel format yuv444p is not supported"),
         ({"pix_fmt": "gray"}, UsageError, "gray has no colour"),
@@ -156,11 +132,8 @@ AV1 = {"vcodec": "libsvtav1"}
     ],
 )
 def test_settings_that_cannot_be_are_refused_before_anything_is_written(tmp_path, two, settings, error, message):
-    with (
-        pytest.raises(error, match=message),
-        new_dataset(tmp_path / "lift", two, **OPTIONS, video=VideoConfig(**settings)),
-    ):
-        raise AssertionError("a writer was given")
+    with pytest.raises(error, match=message):
+        write([], tmp_path / "lift", two, video=VideoConfig(**settings))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -251,7 +224,5 @@ def test_a_dataset_with_cameras_tells_of_itself(tmp_path, root, filmed, two):
     assert read_spec(root) == two
     write(filmed, tmp_path / "lift", two)
     (tmp_path / "lift" / layout.OURS).unlink()  # as LeRobot's tools do
-    assert (read_spec(tmp_path / "lift").cameras, read_spec(tmp_path / "lift").image_size) == (
-        two.cameras,
-        two.image_size,
-    )
+    theirs = read_spec(tmp_path / "lift")
+    assert (theirs.cameras, theirs.image_size) == (two.cameras, two.image_size)

@@ -13,19 +13,30 @@ from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
 from manip_il.mdp import Episode
 
-from ..synthetic import episodes, make_episode, offline, spec
+from ..pictures import numbered_episodes, with_cameras
+from ..synthetic import MakeEpisode, episodes, make_episode, offline, spec
 
 __all__ = ["alone", "episodes", "journals", "make_episode", "offline", "root", "spec", "whole"]
+
+
+def build_from_journals(folder: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    for episode in episodes:
+        write_episode(folder / "lift.journals", episode, spec, environment_fingerprint(b"", {}))
+    build(folder / "lift.journals", folder / "lift")
+    return folder
 
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
     """A folder with a dataset, `lift`, and its journals, which no test changes."""
-    folder = tmp_path_factory.mktemp("whole")
-    for episode in episodes:
-        write_episode(folder / "lift.journals", episode, spec, environment_fingerprint(b"", {}))
-    build(folder / "lift.journals", folder / "lift")
-    return folder
+    return build_from_journals(tmp_path_factory.mktemp("whole"), episodes, spec)
+
+
+@pytest.fixture(scope="session")
+def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+    """The same of a dataset that has a camera."""
+    seen = with_cameras(spec, "front")
+    return build_from_journals(tmp_path_factory.mktemp("filmed"), numbered_episodes(make_episode, seen), seen)
 
 
 @pytest.fixture

@@ -23,29 +23,15 @@ from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.examine import examine, has_errors, verdict
+from manip_il.doctor.examine import examine, examine_folder, has_errors, verdict
 from manip_il.doctor.finding import Finding, error
-from manip_il.mdp import Episode
 
-from ..damage import DATA, EPISODES, cut, damage_at_random, edit_json, edit_table, findings, lines
-from ..pictures import numbered_episodes, with_cameras
+from ..damage import DATA, EPISODES, cut, damage_at_random, edit_json, edit_table, lines
 
-MakeEpisode = Callable[..., Episode]
 Change = Callable[[Path], Any]
 FINGERPRINT = environment_fingerprint(b"", {})
 VIDEO = "videos/observation.images.front/chunk-000/file-000.mp4"
 JOURNAL = "lift.journals/episode-000000000006.mcap"
-
-
-@pytest.fixture(scope="module")
-def filmed_once(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
-    """A folder with a dataset that has a camera, and its journals."""
-    folder, seen = tmp_path_factory.mktemp("filmed"), with_cameras(spec, "front")
-    episodes = numbered_episodes(make_episode, seen)
-    write_dataset(episodes, folder / "lift", seen, repo_id="someone/lift", fingerprint=FINGERPRINT)
-    for episode in episodes:
-        write_episode(folder / "lift.journals", episode, seen, FINGERPRINT)
-    return folder
 
 
 @pytest.fixture
@@ -129,7 +115,7 @@ def never_closed(root: Path) -> None:
     (root / VIDEO).write_bytes(content[: content.index(b"moov") - 4])  # which an encoder writes last
 
 
-def test_a_whole_dataset_has_no_findings(root: Path, journals: Path, filmed_once: Path) -> None:
+def test_a_whole_dataset_has_no_findings(root, journals, filmed_once):
     dataset = Dataset(root)
     assert list(examine(dataset)) == []
     assert verdict(dataset, []) == f"{root}: 3 episodes, 20 frames: whole"
@@ -137,16 +123,14 @@ def test_a_whole_dataset_has_no_findings(root: Path, journals: Path, filmed_once
     assert lines(filmed_once / "lift") == []
 
 
-def test_a_dataset_of_many_files_has_no_findings(
-    tmp_path: Path, episodes: list[Episode], spec: s.RobotTaskSpec
-) -> None:
+def test_a_dataset_of_many_files_has_no_findings(tmp_path, episodes, spec):
     root = tmp_path / "small"
     write_dataset(episodes * 4, root, spec, repo_id="a/b", fingerprint=FINGERPRINT, data_files_size_in_mb=0.01)
     assert len(list(root.glob(layout.DATA_FILES))) > 1
     assert lines(root) == []
 
 
-def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_dataset(tmp_path):
     assert said(tmp_path, "meta/info.json ... is missing ... not a LeRobot dataset")
 
 
@@ -155,12 +139,9 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
     [
         (info(codebase_version="v2.1"), "'v2.1'; expected 'v3.0'; LeRobot converts"),
         (info(fps=0), "fps is 0; expected a number of at least 1"),
-        (info(fps="20"), "fps is '20'"),
         (info(total_frames=-1), "total_frames is -1; expected a count"),
         (info(features=[]), "features is []"),
         (info(features={"action": {"dtype": "float32"}}), "feature 'action'"),
-        (info(data_path="../{chunk_index}"), "data_path is"),
-        (info(data_path="{chunk_index.__class__}"), "data_path is"),
         (info(total_episodes=4), "total_episodes is 4; meta/episodes holds 3"),
         (info(total_frames=21), "total_frames is 21; the data files hold 20 rows"),
         (info(total_tasks=2), "total_tasks is 2; meta/tasks.parquet holds 1"),
@@ -168,7 +149,7 @@ def test_a_folder_that_is_no_dataset(tmp_path: Path) -> None:
         (lambda root: cut(root / layout.INFO, 0.5), ": cannot be read"),
     ],
 )
-def test_info_that_is_wrong(alone: Path, change: Change, text: str) -> None:
+def test_info_that_is_wrong(alone, change, text):
     change(alone)
     assert said(alone, f"meta/info.json ... {text}")
 
@@ -254,7 +235,7 @@ _NO_FOOTER = "has no footer: its writer died before it closed the file, or the f
         (ours(lambda ours: ours["spec"].pop("fps")), ["meta/manip_il.json: cannot be read ... fps missing or unknown"]),
     ],
 )
-def test_files_and_rows_that_are_wrong(alone: Path, change: Change, texts: list[str]) -> None:
+def test_files_and_rows_that_are_wrong(alone, change, texts):
     change(alone)
     assert said(alone, *texts)
 
@@ -282,7 +263,7 @@ _OF_ACTION = "meta/stats.json: action ..."
         (delete(layout.STATS), "meta/stats.json: is missing"),
     ],
 )
-def test_statistics_that_are_wrong(alone: Path, change: Change, text: str) -> None:
+def test_statistics_that_are_wrong(alone, change, text):
     change(alone)
     assert said(alone, text)
 
@@ -311,14 +292,14 @@ def test_statistics_that_are_wrong(alone: Path, change: Change, text: str) -> No
         ("../.lift.abc.partial/meta/info.json", "../.lift.abc.partial ... killed writer"),
     ],
 )
-def test_what_harms_nothing_is_only_a_warning(alone: Path, change: Change | str, text: str) -> None:
+def test_what_harms_nothing_is_only_a_warning(alone, change, text):
     if isinstance(change, str):  # a file that does not belong there
         (alone / change).parent.mkdir(parents=True, exist_ok=True)
         (alone / change).write_bytes(b"x")
     else:
         change(alone)
     assert said(alone, text, kind="warning")
-    assert not has_errors(findings(alone))
+    assert not has_errors(examine_folder(alone))
 
 
 _CAMERA = "videos/observation.images.front"
@@ -344,12 +325,12 @@ _START = f"{_CAMERA}/from_timestamp"
         (cell(_START, 1, 0.0, EPISODES), [f"meta/episodes: {_CAMERA} ... of episode 1 span 8 frames; it has 1"]),
     ],
 )
-def test_a_video_that_is_wrong(filmed: Path, change: Change, texts: list[str]) -> None:
+def test_a_video_that_is_wrong(filmed, change, texts):
     change(filmed)
     assert said(filmed, *(text if text.startswith("meta/") else f"{VIDEO} ... {text}" for text in texts))
 
 
-def test_a_writer_that_lives_is_no_leftover(alone: Path) -> None:
+def test_a_writer_that_lives_is_no_leftover(alone):
     partial = alone.with_name(".lift.abc.partial")
     partial.mkdir()
     with descriptor(partial) as handle:
@@ -358,7 +339,7 @@ def test_a_writer_that_lives_is_no_leftover(alone: Path) -> None:
     assert said(alone, "../.lift.abc.partial", kind="warning")
 
 
-def test_a_journal_cut_or_changed_anywhere_is_named(root: Path, journals: Path) -> None:
+def test_a_journal_cut_or_changed_anywhere_is_named(root, journals):
     path = root.parent / JOURNAL
     content = path.read_bytes()
     for place in np.linspace(0, len(content) - 1, 40).astype(int):
@@ -369,25 +350,21 @@ def test_a_journal_cut_or_changed_anywhere_is_named(root: Path, journals: Path) 
         assert said(root, JOURNAL)
 
 
-def test_journals_that_the_dataset_does_not_hold(
-    root: Path, journals: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_journals_that_the_dataset_does_not_hold(root, journals, make_episode, spec):
     write_episode(journals, make_episode(77), spec, FINGERPRINT)
     (journals / ".episode-000000000078.mcap.x.partial").write_bytes(b"x")
     lacks = "the dataset lacks 1 episode of the journals (seed 77)"
     assert said(root, lacks, ".episode-000000000078.mcap.x.partial", kind="warning")
 
 
-def test_failed_episodes_that_the_recording_leaves_out_are_not_missed(
-    root: Path, journals: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec
-) -> None:
+def test_failed_episodes_that_the_recording_leaves_out_are_not_missed(root, journals, make_episode, spec):
     write_episode(journals, make_episode(77, success=False), spec, FINGERPRINT)
     write_episode(journals, make_episode(6, 1, success=True), spec, FINGERPRINT)
     Recording("a/b", only_successes=True).write(journals)
     assert lines(root) == []
 
 
-def test_a_check_that_fails_hides_no_other(alone: Path) -> None:
+def test_a_check_that_fails_hides_no_other(alone):
     def breaks(dataset: Dataset) -> Iterator[Finding]:
         yield error("here", "first")
         raise RuntimeError("torn")
@@ -399,38 +376,36 @@ def test_a_check_that_fails_hides_no_other(alone: Path) -> None:
     assert texts == ["first", "breaks could not be finished: RuntimeError: torn", "second"]
 
 
-def test_a_finding_is_one_printable_line_and_frozen() -> None:
+def test_a_finding_is_one_printable_line_and_frozen():
     assert str(error("a\x1b[31m", "b\nc")).isprintable()
     with pytest.raises(dataclasses.FrozenInstanceError):
         error("a", "b").text = "c"  # type: ignore[misc]
 
 
-def test_looking_changes_nothing(root: Path, journals: Path) -> None:
+def test_looking_changes_nothing(root, journals):
     before = {path: path.stat().st_mtime_ns for path in root.parent.rglob("*")}
-    findings(root)
+    examine_folder(root)
     assert {path: path.stat().st_mtime_ns for path in root.parent.rglob("*")} == before
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_no_damage_stops_the_doctor_and_none_that_counts_goes_unseen(
-    filmed_once: Path, tmp_path: Path, seed: int
-) -> None:
+def test_no_damage_stops_the_doctor_and_none_that_counts_goes_unseen(filmed_once, tmp_path, seed):
     rng = np.random.default_rng(seed)
     for _ in range(20):
         shutil.rmtree(tmp_path / "copy", ignore_errors=True)
         shutil.copytree(filmed_once, tmp_path / "copy")
         way, path = damage_at_random(tmp_path / "copy", rng)
-        found = findings(tmp_path / "copy" / "lift")
+        found = examine_folder(tmp_path / "copy" / "lift")
         assert not any("could not be finished" in finding.text for finding in found), (way, path, found)
         if way in ("cut", "delete"):
             assert found, (way, path)
 
 
-def test_many_damages_at_once(filmed_once: Path, tmp_path: Path) -> None:
+def test_many_damages_at_once(filmed_once, tmp_path):
     rng, found = np.random.default_rng(0), list[Finding]()
     shutil.copytree(filmed_once, tmp_path / "torn")
     for _ in range(15):
         damage_at_random(tmp_path / "torn", rng)
-        found = findings(tmp_path / "torn" / "lift")
+        found = examine_folder(tmp_path / "torn" / "lift")
         assert not any("could not be finished" in finding.text for finding in found), found
     assert has_errors(found)

@@ -13,9 +13,9 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.examine import repair
+from manip_il.doctor.examine import examine_folder, repair
 
-from ..damage import DATA, EPISODES, cut, edit_json, edit_table, findings, lines
+from ..damage import DATA, EPISODES, cut, edit_json, edit_table, lines
 from ..warm import Warm
 
 pytestmark = pytest.mark.slow
@@ -52,12 +52,12 @@ def load(root: Path) -> Any:
 
 
 @pytest.mark.parametrize("kind", [*KINDS, MATRIX])
-def test_what_lerobot_records_is_clean(recorded: Path, kind: str) -> None:
+def test_what_lerobot_records_is_clean(recorded, kind):
     assert lines(recorded / kind) == []
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_lerobots_tools_make_of_it_has_no_errors(recorded: Path, tmp_path: Path, kind: str) -> None:
+def test_what_lerobots_tools_make_of_it_has_no_errors(recorded, tmp_path, kind):
     from lerobot.datasets import dataset_tools
     from lerobot.datasets.aggregate import aggregate_datasets
 
@@ -73,7 +73,7 @@ def test_what_lerobots_tools_make_of_it_has_no_errors(recorded: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_recorder_killed_before_finalize_is_named(record: Record, tmp_path: Path, kind: str) -> None:
+def test_a_recorder_killed_before_finalize_is_named(record, tmp_path, kind):
     record(tmp_path / "dead", kind, episodes=12, end="kill")
     found = lines(tmp_path / "dead")
     first = found[0]
@@ -88,18 +88,18 @@ def test_a_recorder_killed_before_finalize_is_named(record: Record, tmp_path: Pa
     assert any("8 pictures that LeRobot's recorder" in line for line in found) == (kind != "state")
 
 
-def test_a_recorder_killed_before_its_list_of_episodes_was_begun(record: Record, tmp_path: Path) -> None:
+def test_a_recorder_killed_before_its_list_of_episodes_was_begun(record, tmp_path):
     record(tmp_path / "dead", "state", episodes=3, end="kill")
     assert "had saved 3 episodes, 48 frames, but the rows of 3 episodes are lost" in lines(tmp_path / "dead")[0]
 
 
-def test_a_recorder_killed_in_its_first_episode(record: Record, tmp_path: Path) -> None:
+def test_a_recorder_killed_in_its_first_episode(record, tmp_path):
     record(tmp_path / "dead", "video", episodes=0, end="kill")
     text = "a recorder was started here, but no episode was saved; pictures of episode-000000"
     assert text in lines(tmp_path / "dead")[0]
 
 
-def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record: Record, recorded: Path, tmp_path: Path) -> None:
+def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record, recorded, tmp_path):
     """What the advice says makes a dataset of it again."""
     root = shutil.copytree(recorded / "state", tmp_path / "resumed")
     record(root, "state", episodes=11, end="resume")
@@ -110,12 +110,12 @@ def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record: Record, reco
         assert name in first
         (root / name).unlink()
     edit_json(root / layout.INFO, lambda info: info.update(total_episodes=4, total_frames=66, splits={"train": "0:4"}))
-    list(repair(Dataset(root), findings(root)))
+    list(repair(Dataset(root), examine_folder(root)))
     assert not any(line.startswith("error") for line in lines(root))
     assert load(root).num_frames == 66
 
 
-def test_a_picture_that_cannot_be_decoded(recorded: Path, tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_decoded(recorded, tmp_path):
     root = shutil.copytree(recorded / "image", tmp_path / "image")
     key = "observation.images.front"
 
@@ -129,27 +129,27 @@ def test_a_picture_that_cannot_be_decoded(recorded: Path, tmp_path: Path) -> Non
     assert any("is 64 x 96 (height x width)" in line and "says 64 x 64" in line for line in lines(root))
 
 
-def test_a_matrix_is_held_against_its_statistics(recorded: Path, tmp_path: Path) -> None:
+def test_a_matrix_is_held_against_its_statistics(recorded, tmp_path):
     """LeRobot has those of a matrix over its last axis."""
     root = shutil.copytree(recorded / MATRIX, tmp_path / MATRIX)
     edit_json(root / layout.STATS, lambda stats: stats["grid"]["mean"].__setitem__(2, 7.0))
     assert any("meta/stats.json: grid: mean[2] is 7; the data's is" in line for line in lines(root))
 
 
-def test_names_in_a_dictionary_are_counted(recorded: Path, tmp_path: Path) -> None:
+def test_names_in_a_dictionary_are_counted(recorded, tmp_path):
     root = shutil.copytree(recorded / "state", tmp_path / "state")
     edit_json(root / layout.INFO, lambda info: info["features"]["action"]["names"]["motors"].append("z"))
     assert lines(root) == ["error    meta/info.json: action: 3 names for shape [2]; expected 2"]
 
 
-def test_statistics_of_a_column_far_from_zero_pass(recorded: Path) -> None:
+def test_statistics_of_a_column_far_from_zero_pass(recorded):
     """LeRobot's standard deviation is a difference of squares in float32: what that costs is no fault."""
     values = np.array(pq.read_table(recorded / MATRIX / DATA)["observation.state"].to_pylist())
     assert np.std(values) < 1e-2 * np.mean(values)
     assert lines(recorded / MATRIX) == []
 
 
-def test_a_cut_video_of_theirs(recorded: Path, tmp_path: Path) -> None:
+def test_a_cut_video_of_theirs(recorded, tmp_path):
     root = shutil.copytree(recorded / "video", tmp_path / "video")
     name = "videos/observation.images.wrist/chunk-000/file-000.mp4"
     cut(root / name, 0.6)

@@ -40,18 +40,21 @@ class DeadlyKeep:
     seeds: tuple[int, ...]
     times: int
 
+    @classmethod
+    def of(cls, folder: Path, job: RolloutJob, *seeds: int, times: int = 1000) -> DeadlyKeep:
+        (folder / "deaths").mkdir()
+        return cls(journal(folder / "journals", job), folder / "deaths", seeds, times)
+
     def pack(self, episode: Episode) -> bytes:
-        """Die, or make the file's content."""
-        if episode.seed in self.seeds and self._deaths(episode.seed) < self.times:
+        if episode.seed in self.seeds and self.deaths(episode.seed) < self.times:
             (self.folder / f"{episode.seed}-{os.getpid()}").touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return self.journals.pack(episode)
 
     def store(self, seed: int, packed: bytes) -> None:
-        """Write the file."""
         self.journals.store(seed, packed)
 
-    def _deaths(self, seed: int) -> int:
+    def deaths(self, seed: int | str = "*") -> int:
         return len(list(self.folder.glob(f"{seed}-*")))
 
 
@@ -60,9 +63,7 @@ class FailingKeep:
     """Cannot store anything."""
 
     def pack(self, episode: Episode) -> bytes:
-        """Nothing."""
         return b"x"
 
     def store(self, seed: int, packed: bytes) -> None:
-        """Fail as a disk does."""
         raise OSError(28, "No space left on device", f"episode of seed {seed}")

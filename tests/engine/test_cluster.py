@@ -65,14 +65,13 @@ def test_a_policy_acts_the_same_on_a_cluster(cluster, checkpoint):
 
 
 def test_a_seed_that_kills_its_worker_is_left_out_there_too(cluster, tmp_path, expected):
-    (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    keep = DeadlyKeep.of(tmp_path, JOB, SEEDS[2])
     with Engine(2, "ray") as engine:
         done = {episode.seed for episode in engine.run(JOB, SEEDS[:5], keep)}
         assert engine.given_up == [SEEDS[2]]
     assert done == {SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]}
     assert contents(tmp_path / "journals").items() <= expected.items()
-    assert len(list((tmp_path / "deaths").iterdir())) == 3
+    assert keep.deaths() == 3
 
 
 def test_what_the_work_raises_comes_home(cluster):

@@ -1,13 +1,30 @@
-"""Who drives, and that the labels are the expert's whoever does."""
+"""Who drives, and when the expert is queried: each driver's and each gate's rule."""
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import numpy as np
 import pytest
+from kept import written
 
 from manip_il.data.episodes import group_rollouts, to_episode
-from manip_il.engine.drivers import ExpertDriver, LearnerDriver, MixtureDriver, RandomDriver
-from manip_il.errors import ManipError
+from manip_il.engine.drivers import (
+    ExpertDriver,
+    LearnerDriver,
+    MixtureDriver,
+    QueryRule,
+    RandomDriver,
+    action_gap,
+    at_drawn_step,
+    by_chance,
+    drawn_step,
+    on_disagreement,
+    on_gap,
+    on_low_likelihood,
+)
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.expert import Expert
 from manip_il.mdp import Actor, Episode, Label, Observation, State
 from manip_il.rollout import Rules, Turn, rollout
@@ -18,6 +35,7 @@ from manip_il.sim.scene import build_scene
 SEEDS = stream_seeds("certificate", 5)
 STATE = State(np.zeros(4), np.zeros(3))
 RULES = Rules(horizon=15)
+SCALE = np.array([0.1, 0.1, 0.08])
 
 
 class Wave:
@@ -49,47 +67,59 @@ class Diary(Wave):
         self.notes.append(("reset", list(episodes)))
 
 
-def run(driver, envs: int = 1, seeds=SEEDS, robot: str = "fetch") -> dict[int, Episode]:
-    environments = [ManipEnv(robot) for _ in range(envs)]
-    transitions = rollout(environments, seeds, driver, RULES, Expert(environments[0].scene))
-    return {frames[0].seed: to_episode(frames) for frames in group_rollouts(transitions)}
+class Teacher:
+    """An expert of one answer, which counts its queries."""
+
+    def __init__(self, *action: float):
+        self.action, self.queries = np.array(action), 0
+
+    def label(self, state: State) -> Label:
+        self.queries += 1
+        return Label(self.action, 5, True, 0.0)
 
 
-def same(left: dict[int, Episode], right: dict[int, Episode]) -> bool:
-    def written(episodes: dict[int, Episode]) -> dict[int, dict[str, bytes]]:
-        return {seed: {k: v.tobytes() for k, v in episode.columns.items()} for seed, episode in episodes.items()}
+class Constant:
+    """A policy of one answer."""
 
-    return written(left) == written(right)
+    cameras = ()
 
+    def __init__(self, *action: float):
+        self.action, self.begun = np.array(action), []
 
-def drivers() -> dict:
-    actions = build_scene("fetch", "reach").actions
-    return {"random": RandomDriver(actions), "mixture": MixtureDriver(Wave(), 0.5), "learner": LearnerDriver(Wave())}
+    def act(self, states, environment_states, images, episodes):
+        return np.tile(self.action, (len(states), 1))
 
-
-@pytest.mark.parametrize("name", drivers())
-def test_labels_are_the_experts_whoever_drove(name: str):
-    expert = Expert(ManipEnv("fetch").scene)
-    for episode in run(drivers()[name]).values():
-        labels = [expert.label(State.from_vector(row)) for row in episode.columns["sim_state"]]
-        wanted = np.array([label.action for label in labels]).astype(np.float32)
-        np.testing.assert_array_equal(episode.columns["action"], wanted)
-        np.testing.assert_array_equal(episode.columns["expert_phase"].ravel(), [label.phase for label in labels])
-        by_learner = episode.columns["actor"].ravel() == Actor.LEARNER
-        assert by_learner.any()
-        assert (episode.columns["executed_action"][by_learner] != wanted[by_learner]).any()
+    def reset(self, episodes) -> None:
+        self.begun += list(episodes)
 
 
-def test_a_mixture_of_all_expert_is_the_experts_run():
-    assert same(run(MixtureDriver(Wave(), 1.0)), run(ExpertDriver()))
+class Doubtful:
+    """Finds an action the less likely, the larger the state."""
+
+    cameras = ()
+
+    def log_prob(self, states, environment_states, images, actions):
+        return -actions.shape[1] * states[:, 0].astype(np.float64)
 
 
-def test_a_mixture_of_no_expert_is_the_learners_run():
-    assert same(run(MixtureDriver(Wave(), 0.0)), run(LearnerDriver(Wave())))
+def run(driver, robot: str = "fetch") -> list[Episode]:
+    env = ManipEnv(robot)
+    return [to_episode(frames) for frames in group_rollouts(rollout([env], SEEDS, driver, RULES, Expert(env.scene)))]
+
+
+def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
+    images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
+    observation = Observation(np.full(3, value, np.float32), np.zeros(2, np.float32), images)
+    return Turn(seed, step, observation, STATE, teacher)
+
+
+@pytest.mark.parametrize(("beta", "alone"), [(1.0, ExpertDriver()), (0.0, LearnerDriver(Wave()))])
+def test_a_mixture_of_one_alone_is_its_run(beta: float, alone):
+    assert written(run(MixtureDriver(Wave(), beta))) == written(run(alone))
 
 
 def test_a_mixture_executes_either_the_label_or_the_learners_action():
-    for episode in run(MixtureDriver(Wave(), 0.5)).values():
+    for episode in run(MixtureDriver(Wave(), 0.5)):
         columns = episode.columns
         by_expert = columns["actor"].ravel() == Actor.EXPERT
         assert 0 < by_expert.sum() < len(episode)
@@ -101,30 +131,15 @@ def test_a_mixture_executes_either_the_label_or_the_learners_action():
 @pytest.mark.parametrize("beta", [0.2, 0.8])
 def test_beta_is_the_experts_share_of_the_steps(beta: float):
     driver = MixtureDriver(Wave(), beta)
-    seen = Observation(np.zeros(8, np.float32), np.zeros(3, np.float32))
-    label = Label(np.ones(8), 5, True, 0.0)
-    turns = [Turn(seed, 0, seen, STATE, label=label) for seed in range(20)]
+    turns = [turn(seed, teacher=Teacher(1.0, 1.0, 1.0)) for seed in range(20)]
     actors = [actor for _ in range(50) for _, actor in driver.act(turns)]
     share = np.mean([actor == Actor.EXPERT for actor in actors])
     assert share == pytest.approx(beta, abs=5 * np.sqrt(beta * (1 - beta) / len(actors)))
 
 
-@pytest.mark.parametrize("name", drivers())
-def test_five_in_lockstep_are_the_same_bits_as_one_by_one(name: str):
-    assert same(run(drivers()[name], envs=5), run(drivers()[name], envs=1))
-
-
-@pytest.mark.parametrize("name", ["random", "mixture"])
-def test_a_seed_is_its_episode_and_another_seed_another(name: str):
-    one, other = run(drivers()[name], seeds=SEEDS[:1]), run(drivers()[name], seeds=SEEDS[1:2])
-    assert same(one, {SEEDS[0]: run(drivers()[name])[SEEDS[0]]})
-    executed = [episode.columns["executed_action"] for episode in (one[SEEDS[0]], other[SEEDS[1]])]
-    assert not np.array_equal(*executed)
-
-
 def test_a_random_driver_stays_within_its_reach():
     actions = build_scene("panda", "reach").actions
-    for episode in run(RandomDriver(actions), robot="panda").values():
+    for episode in run(RandomDriver(actions), robot="panda"):
         step = np.subtract(episode.columns["executed_action"], episode.columns["observation.state"])
         assert (np.abs(step) <= actions.scale + 1e-6)[:, actions.arm].all()
         openings = episode.columns["executed_action"][:, actions.gripper]
@@ -136,17 +151,10 @@ def test_a_random_driver_stays_within_its_reach():
 def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras(make):
     diary = Diary()
     driver = make(diary)
-    label = Label(np.ones(8), 5, True, 0.0)
-
-    def turn(seed: int, step: int) -> Turn:
-        images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
-        return Turn(
-            seed, step, Observation(np.zeros(8, np.float32), np.zeros(3, np.float32), images), STATE, label=label
-        )
-
-    driver.act([turn(10, 0), turn(20, 4)])
-    driver.act([turn(10, 1), turn(20, 0)])
-    driver.act([turn(10, 2)])
+    taught = partial(turn, teacher=Teacher(1.0, 1.0, 1.0))
+    driver.act([taught(10, 0), taught(20, 4)])
+    driver.act([taught(10, 1), taught(20, 0)])
+    driver.act([taught(10, 2)])
     assert diary.notes == [
         ("reset", [10]),
         ([10, 20], {"front": [10, 24]}),
@@ -160,3 +168,78 @@ def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras
 def test_an_expert_that_drives_must_be_there_to_ask(driver):
     with pytest.raises(ManipError, match=rf"episode {SEEDS[0]}: nobody to ask for a label at step 0"):
         list(rollout([ManipEnv("panda", "reach")], SEEDS[:1], driver, Rules(horizon=6, query="driver")))
+
+
+@pytest.mark.parametrize("text", ["every", "one", "probability:0.1", "ensemble:0.2", "likelihood:-2", "safety:0.5"])
+def test_a_rule_is_written_as_it_is_read(text: str):
+    assert str(QueryRule.parse(text)) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("evry", "did you mean 'every'"),
+        ("every:1", "expected every alone"),
+        ("probability", "expected probability:NUMBER"),
+        ("probability:0", "more than 0, at most 1"),
+        ("probability:1.5", "more than 0, at most 1"),
+        ("safety:-1", "0 or more"),
+        ("ensemble:nan", "0 or more"),
+        ("likelihood:inf", "finite"),
+        ("likelihood:", "NUMBER"),
+    ],
+)
+def test_a_rule_that_cannot_be_is_refused_with_what_can(text: str, says: str):
+    with pytest.raises((UsageError, UnknownName), match=says):
+        QueryRule.parse(text)
+
+
+def test_differences_are_measured_in_steps_of_the_worst_dimension():
+    left, right = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), np.array([[0.05, 0.02, 0.0], [0.1, 0.0, 0.08]])
+    assert action_gap(left, right, SCALE) == pytest.approx([0.5, 1.0])
+
+
+def test_safety_queries_where_expert_and_learner_differ_by_more_than_the_bound():
+    teacher = Teacher(0.0, 0.0, 0.08)
+    turns = [turn(teacher=teacher), turn(teacher=teacher)]
+    gate = on_gap(0.5, SCALE)
+    assert gate(turns, [np.array([0.04, 0.0, 0.08]), np.array([0.06, 0.0, 0.08])]) == [False, True]
+    assert [one.label for one in turns] == [None, None]  # knowing is not keeping
+
+
+def test_an_ensemble_queries_where_its_members_spread():
+    others = [Constant(0.0, 0.0, 0.08), Constant(0.0, 0.0, 0.08)]
+    gate = on_disagreement(0.2, others, SCALE)
+    agreed, alone = np.array([0.0, 0.0, 0.08]), np.array([0.09, 0.0, 0.08])
+    assert gate([turn(7), turn(8, step=3)], [agreed, alone]) == [False, True]
+    assert [member.begun for member in others] == [[7], [7]]  # a policy with a memory must know who begins
+
+
+def test_an_unsure_learner_queries():
+    assert on_low_likelihood(-1.0, Doubtful())([turn(value=0.5), turn(value=2.0)], [np.zeros(3)] * 2) == [False, True]
+
+
+def test_chance_queries_in_its_share_of_the_steps_and_the_same_for_a_seed():
+    def queried(seeds) -> np.ndarray:
+        gate = by_chance(0.3)
+        return np.array([gate([turn(seed, step) for seed in seeds], []) for step in range(200)])
+
+    both = queried([1, 2])
+    assert both.mean() == pytest.approx(0.3, abs=5 * math.sqrt(0.3 * 0.7 / both.size))
+    assert np.array_equal(queried([2])[:, 0], both[:, 1])
+
+
+def test_one_step_of_an_episode_is_drawn_evenly():
+    drawn = [drawn_step(seed, 10) for seed in range(2_000)]
+    assert np.bincount(drawn, minlength=10) == pytest.approx(200, abs=5 * math.sqrt(180))
+    gate = at_drawn_step(10)
+    assert [gate([turn(3, step)], []) for step in range(10)].index([True]) == drawn[3]
+
+
+def test_a_turn_queries_once_and_only_where_there_is_an_expert():
+    teacher = Teacher(0.0, 0.0, 0.0)
+    one = turn(teacher=teacher)
+    assert one.query() is one.query() is one.label
+    assert teacher.queries == 1
+    with pytest.raises(ManipError, match="episode 4: nobody to ask for a label at step 9"):
+        turn(4, 9).query()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +18,9 @@ from manip_il.errors import ManipError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
+from ..faults.child import living
+from ..test_child_processes import wait_for
+
 SEEDS = stream_seeds("certificate", 6)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=3)
 
@@ -31,12 +31,6 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("here")
     assert len(list(Engine().run(JOB, SEEDS, journal(folder, JOB)))) == len(SEEDS)
     return contents(folder)
-
-
-@pytest.fixture(scope="module")
-def two_processes() -> Iterator[Engine]:
-    with Engine(2) as engine:
-        yield engine
 
 
 @pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (60, 2), (200, 3)])
@@ -58,32 +52,29 @@ def test_an_episode_is_on_disk_before_it_arrives(two_processes, tmp_path, expect
 
 @pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_its_seed_runs_again(two_processes, tmp_path, expected):
-    (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[1], SEEDS[4]), times=2)
+    keep = DeadlyKeep.of(tmp_path, JOB, SEEDS[1], SEEDS[4], times=2)
     episodes = list(two_processes.run(JOB, SEEDS, keep))
     assert sorted(episode.seed for episode in episodes) == list(SEEDS)
     assert contents(tmp_path / "journals") == expected
-    assert len(list((tmp_path / "deaths").iterdir())) == 4
+    assert keep.deaths() == 4
     assert two_processes.given_up == []
 
 
 @pytest.mark.slow
 def test_a_seed_that_kills_its_worker_three_times_is_left_out_and_named(tmp_path, expected):
-    (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", (SEEDS[2],), times=1000)
+    keep = DeadlyKeep.of(tmp_path, JOB, SEEDS[2])
     with Engine(2) as engine:
         episodes = list(engine.run(JOB, SEEDS, keep))
         assert engine.given_up == [SEEDS[2]]
         assert [*engine.run(JOB, [SEEDS[2]], keep)] == []  # known by now
     assert sorted(episode.seed for episode in episodes) == [seed for seed in SEEDS if seed != SEEDS[2]]
-    assert len(list((tmp_path / "deaths").iterdir())) == 3
+    assert keep.deaths() == 3
 
 
 @pytest.mark.slow
 def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tmp_path):
     job = RolloutJob(EnvConfig(horizon=10), "policy", policy=checkpoint, label="per_state")
-    (tmp_path / "deaths").mkdir()
-    keep = DeadlyKeep(journal(tmp_path / "journals", job), tmp_path / "deaths", (SEEDS[0],), times=1000)
+    keep = DeadlyKeep.of(tmp_path, job, SEEDS[0])
     with Engine(2) as engine:
         done = {episode.seed for episode in engine.run(job, SEEDS, keep)}
         assert engine.given_up == [SEEDS[0]]
@@ -92,9 +83,8 @@ def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tm
 
 @pytest.mark.slow
 def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
-    (tmp_path / "deaths").mkdir()
     seeds = stream_seeds("certificate", 40)
-    keep = DeadlyKeep(journal(tmp_path / "journals", JOB), tmp_path / "deaths", tuple(seeds), times=1000)
+    keep = DeadlyKeep.of(tmp_path, JOB, *seeds)
     with Engine(2) as engine, pytest.raises(ManipError, match=r"rollout workers died one after the other.*SIGKILL"):
         list(engine.run(JOB, seeds, keep))
 
@@ -112,7 +102,8 @@ def test_what_a_worker_raises_arrives_and_the_engine_goes_on(two_processes, tmp_
 def test_workers_end_with_the_process_that_started_them():
     code = (
         "from multiprocessing import forkserver, resource_tracker\n"
-        "from manip_il.engine.engine import *\n"
+        "from manip_il.engine.engine import Engine\n"
+        "from manip_il.engine.jobs import RolloutJob\n"
         "from manip_il.sim.env import EnvConfig\n"
         "engine = Engine(2)\n"
         "for episode in engine.run(RolloutJob(EnvConfig(), 'expert'), range(1000)):\n"
@@ -120,22 +111,9 @@ def test_workers_end_with_the_process_that_started_them():
         "    pids += [forkserver._forkserver._forkserver_pid, resource_tracker._resource_tracker._pid]\n"
         "    print(pids, flush=True)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert parent.stdout is not None
     pids = [int(pid) for pid in parent.stdout.readline().strip("[]\n").split(",")]
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    deadline = time.monotonic() + 120
-    while any(alive(pid) for pid in pids):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
-def alive(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as stat:
-            return stat.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-    finally:
-        os.sched_yield()
+    wait_for(lambda: not set(pids) & set(living(parent.pid)))

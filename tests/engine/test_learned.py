@@ -39,23 +39,16 @@ def act(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def seeing(tmp_path_factory) -> Path:
     """A policy of the front camera, in dim light."""
-    return seeing_policy(tmp_path_factory.mktemp("seeing"))
-
-
-def seeing_policy(folder: Path, cameras: CameraConfig = DIM) -> Path:
-    spec = env_spec(ENV, cameras)
-    look = {"brightness": cameras.look.brightness}
-    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, cameras), observation="images", look=look)
-    return write_checkpoint(folder, "act", spec, "images", meta=meta)
+    spec = env_spec(ENV, DIM)
+    meta = CheckpointMeta.of(spec, env_fingerprint(ENV, DIM), observation="images", look={"brightness": 0.5})
+    return write_checkpoint(tmp_path_factory.mktemp("seeing"), "act", spec, "images", meta=meta)
 
 
 def lerobots_rollout(checkpoint: Path, seed: int, cameras: CameraConfig | None = None) -> np.ndarray:
     """Actions of LeRobot's own evaluation loop over one environment, (T, n)."""
     policy = ACTPolicy.from_pretrained(checkpoint)
     before, after = make_pre_post_processors(policy.config, str(checkpoint))
-    env = ManipEnv(config=ENV)
-    if cameras is not None:
-        env = ManipEnv(config=ENV, cameras=cameras.names, image_size=cameras.size, look=cameras.look)
+    env = ManipEnv.of(ENV, cameras)
     policy.reset()
     observation, _ = env.reset(seed=seed)
     actions, over = [], False
@@ -74,21 +67,6 @@ def test_a_rollout_is_lerobots_own_loop_to_the_bit(act):
         assert np.array_equal(episode.columns["executed_action"], lerobots_rollout(act, episode.seed))
 
 
-@pytest.mark.parametrize("driver", ["policy", "mixture"])
-def test_an_episode_does_not_depend_on_its_company(driver, act):
-    job = RolloutJob(ENV, driver, policy=act, beta=0.5, hold=2)
-    together = written(run_job(job, SEEDS))
-    assert written(run_job(job, SEEDS[2:3])) == {SEEDS[2]: together[SEEDS[2]]}
-    assert written(run_job(job, SEEDS[::-1])) == together
-
-
-@pytest.mark.slow
-def test_two_processes_evaluate_as_one_does(act):
-    job = RolloutJob(ENV, "policy", policy=act, label="last")
-    with Engine(2) as engine:
-        assert evaluate(engine, job, SEEDS, "act") == evaluate(Engine(1), job, SEEDS, "act")
-
-
 @pytest.mark.gl
 def test_a_policy_sees_the_pictures_that_lerobot_would_show_it(seeing):
     [episode] = run_job(RolloutJob(ENV, "policy", policy=seeing, label="last"), SEEDS[:1])
@@ -99,13 +77,13 @@ def test_a_policy_sees_the_pictures_that_lerobot_would_show_it(seeing):
 
 @pytest.mark.gl
 def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing, tmp_path):
-    seen = RolloutJob(ENV, "mixture", policy=seeing, beta=0.5)
+    job = RolloutJob(ENV, "mixture", policy=seeing, beta=0.5)
     keep = JournalKeep(tmp_path, env_spec(ENV), env_fingerprint(ENV))
-    episodes = list(Engine(1).run(seen, SEEDS[:2], keep))
+    episodes = list(Engine(1).run(job, SEEDS[:2], keep))
     assert not [key for episode in episodes for key in episode.columns if key.startswith("observation.images")]
     assert [read_journal(path)[1].seed for path in list_episodes(tmp_path)] == list(SEEDS[:2])
     both = replace(DIM, names=("wrist", "front"))
-    recorded = list(run_job(replace(seen, cameras=both), SEEDS[:2]))
+    recorded = list(run_job(replace(job, cameras=both), SEEDS[:2]))
     assert recorded[0].columns["observation.images.wrist"].shape == (8, 32, 32, 3)
     assert written(episode.without_pictures() for episode in recorded) == written(episodes)
 
@@ -141,18 +119,17 @@ def test_pictures_that_no_environment_has_are_refused(seeing, tmp_path):
     features = {"observation.state": {"type": "STATE", "shape": [8]}}
 
     def look_at(**pictures: list[int]) -> None:
-        shown = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
-        edit_config(folder, input_features=features | shown)
+        visual = {f"observation.images.{name}": {"type": "VISUAL", "shape": shape} for name, shape in pictures.items()}
+        edit_config(folder, input_features=features | visual)
 
-    look_at(top=[3, 32, 32])
-    with pytest.raises(MismatchError, match=r"cameras .*top, the environment has front, wrist"):
-        policy_cameras(folder)
-    look_at(front=[3, 32, 32], wrist=[3, 64, 64])
-    with pytest.raises(MismatchError, match="one size for all"):
-        policy_cameras(folder)
-    look_at(front=[3, 33, 32])
-    with pytest.raises(ManipError, match=r"height 33"):
-        policy_cameras(folder)
+    for pictures, kind, words in (
+        ({"top": [3, 32, 32]}, MismatchError, r"cameras .*top, the environment has front, wrist"),
+        ({"front": [3, 32, 32], "wrist": [3, 64, 64]}, MismatchError, "one size for all"),
+        ({"front": [3, 33, 32]}, ManipError, "height 33"),
+    ):
+        look_at(**pictures)
+        with pytest.raises(kind, match=words):
+            policy_cameras(folder)
 
 
 def test_a_policy_for_another_robot_is_refused_before_the_first_step(act, monkeypatch):

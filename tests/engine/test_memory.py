@@ -24,7 +24,7 @@ def machine(folder: Path, *, free: int | None, groups: str = "", own: int = 0) -
     return folder
 
 
-def group(folder: Path, version: int, *, limit: int | str, used: int, cached: int = 0) -> None:
+def group(folder: Path, version: int, limit: int | str, used: int, cached: int = 0) -> None:
     """A control group that holds `used` bytes, of which it only caches `cached`, half of it in use lately."""
     folder.mkdir(parents=True, exist_ok=True)
     names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
@@ -42,36 +42,30 @@ def groups(tmp_path) -> Path:
     return tmp_path / "cgroup"
 
 
-def test_without_limits_it_is_what_the_machine_has_free(tmp_path, groups):
-    proc = machine(tmp_path / "proc", free=8 * GB, groups="0::/user.slice\n")
-    group(groups / "user.slice", 2, limit="max", used=GB)
-    assert available_memory(proc, groups) == pytest.approx(8 * GB, abs=KIB)
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_a_containers_limit_counts_less_what_it_holds_but_not_what_it_caches(tmp_path, groups, version):
-    line, root = ("0::/\n", groups) if version == 2 else ("7:cpu:/\n4:memory:/\n", groups / "memory")
-    group(root, version, limit=4 * GB, used=3 * GB, cached=2 * GB)
-    assert available_memory(machine(tmp_path / "proc", free=64 * GB, groups=line), groups) == 3 * GB
-
-
-def test_within_a_container_the_hosts_path_leads_nowhere_and_the_root_counts(tmp_path, groups):
-    group(groups / "memory", 1, limit=2 * GB, used=GB)
-    proc = machine(tmp_path / "proc", free=64 * GB, groups="4:memory:/docker/0123456789ab\n0::/\n")
-    assert available_memory(proc, groups) == GB
-
-
-def test_the_tightest_of_nested_groups_counts(tmp_path, groups):
-    group(groups / "job", 2, limit=5 * GB, used=4 * GB)
-    group(groups / "job" / "step", 2, limit=3 * GB, used=GB)
-    group(groups / "job" / "step" / "task", 2, limit="max", used=GB)
-    proc = machine(tmp_path / "proc", free=64 * GB, groups="0::/job/step/task\n")
-    assert available_memory(proc, groups) == GB
-
-
-def test_a_group_beyond_its_limit_leaves_nothing(tmp_path, groups):
-    group(groups, 2, limit=GB, used=2 * GB)
-    assert available_memory(machine(tmp_path / "proc", free=64 * GB, groups="0::/\n"), groups) == 0
+@pytest.mark.parametrize(
+    ("lines", "held", "left"),
+    [
+        ("0::/user.slice\n", {"user.slice": (2, "max", GB)}, 64 * GB),  # no limit: what the machine has free
+        # A container's limit, less what it holds but does not merely cache.
+        ("0::/\n", {".": (2, 4 * GB, 3 * GB, 2 * GB)}, 3 * GB),
+        ("7:cpu:/\n4:memory:/\n", {"memory": (1, 4 * GB, 3 * GB, 2 * GB)}, 3 * GB),
+        # Within a container the host's path leads nowhere, and the root counts.
+        ("4:memory:/docker/0123456789ab\n0::/\n", {"memory": (1, 2 * GB, GB)}, GB),
+        # Of nested groups the tightest counts.
+        (
+            "0::/job/step/task\n",
+            {"job": (2, 5 * GB, 4 * GB), "job/step": (2, 3 * GB, GB), "job/step/task": (2, "max", GB)},
+            GB,
+        ),
+        ("0::/\n", {".": (2, GB, 2 * GB)}, 0),  # beyond its limit
+    ],
+    ids=["no limit", "version 2", "version 1", "host's path", "nested", "beyond"],
+)
+def test_the_least_that_machine_and_control_groups_leave(tmp_path, groups, lines: str, held: dict, left: int):
+    for folder, numbers in held.items():
+        group(groups / folder, *numbers)
+    proc = machine(tmp_path / "proc", free=64 * GB, groups=lines)
+    assert available_memory(proc, groups) == (pytest.approx(left, abs=KIB) if left == 64 * GB else left)
 
 
 def test_more_workers_cameras_networks_and_weights_each_need_more():

@@ -81,11 +81,10 @@ def test_two_workers_give_the_episodes_of_one_in_order(blind):
 @pytest.mark.gl
 @pytest.mark.slow
 def test_a_dataset_gains_pictures_and_keeps_everything_else(source, tmp_path):
-    seen: list[int] = []
-    info = render_dataset(
-        open_source(source), tmp_path / "seen", CAMERAS, repo_id="local/seen", on_episode=lambda e: seen.append(e.seed)
-    )
-    assert seen == [episode.seed for episode in read_episodes(source)]
+    written: list[Episode] = []
+    target = tmp_path / "pictured"
+    info = render_dataset(open_source(source), target, CAMERAS, repo_id="local/p", on_episode=written.append)
+    assert [episode.seed for episode in written] == [episode.seed for episode in read_episodes(source)]
     assert info.episodes == 3
     before, after = read_table(source), read_table(info.root)
     assert before.keys() == after.keys()
@@ -102,9 +101,9 @@ def test_a_dataset_gains_pictures_and_keeps_everything_else(source, tmp_path):
 @pytest.mark.gl
 @pytest.mark.slow
 def test_a_dataset_with_pictures_gets_other_ones(source, tmp_path):
-    seen, dim = tmp_path / "seen", CameraConfig(("wrist",), 32, 48, Look(brightness=0.5))
-    render_dataset(open_source(source), seen, CAMERAS, repo_id="local/seen")
-    info = render_dataset(open_source(seen), tmp_path / "dim", dim, repo_id="local/dim")
+    pictured, dim = tmp_path / "pictured", CameraConfig(("wrist",), 32, 48, Look(brightness=0.5))
+    render_dataset(open_source(source), pictured, CAMERAS, repo_id="local/p")
+    info = render_dataset(open_source(pictured), tmp_path / "dim", dim, repo_id="local/dim")
     assert read_spec(info.root) == env_spec(ENV, dim)
     assert read_fingerprint(info.root) == env_fingerprint(ENV, dim)
     for episode in read_episodes(info.root):
@@ -153,12 +152,8 @@ def test_states_of_an_unknown_world_are_refused(source, entry, kind, words):
         open_source(source)
 
 
-def test_a_dataset_that_does_not_name_its_task_is_refused(source):
+def test_what_does_not_name_its_task_or_is_no_dataset_is_refused(source, tmp_path):
     (source / "meta" / "manip_il.json").unlink()  # LeRobot's tools leave it out
-    with pytest.raises(ManipError, match=r"meta/manip_il\.json is missing"):
-        open_source(source)
-
-
-def test_a_folder_without_a_dataset_is_refused(tmp_path):
-    with pytest.raises(ManipError, match="is not a LeRobot dataset"):
-        open_source(tmp_path)
+    for folder, words in ((source, r"meta/manip_il\.json is missing"), (tmp_path, "is not a LeRobot dataset")):
+        with pytest.raises(ManipError, match=words):
+            open_source(folder)

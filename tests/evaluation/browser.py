@@ -45,13 +45,13 @@ def opened(browser: Browser, path: Path, width: int, scheme: Literal["light", "d
     """`path` in a window of this width [px], without a network."""
     context = browser.new_context(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme, offline=True)
     page = context.new_page()
-    seen, own = Opened(page), path.resolve().as_uri()
-    page.on("console", lambda message: seen.console.append(f"{message.type}: {message.text}"))
-    page.on("pageerror", lambda error: seen.console.append(str(error)))
-    page.on("request", lambda request: _note(seen.requests, request.url, own))
+    window, own = Opened(page), path.resolve().as_uri()
+    page.on("console", lambda message: window.console.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: window.console.append(str(error)))
+    page.on("request", lambda request: _note(window.requests, request.url, own))
     page.goto(own)
     try:
-        yield seen
+        yield window
     finally:
         context.close()
 

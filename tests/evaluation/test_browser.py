@@ -110,20 +110,20 @@ def file(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_opens_quietly_and_fits_the_window(
     browser: Browser, case: Case, file: Path, width: int, scheme: Literal["light", "dark"]
 ):
-    with opened(browser, file, width, scheme) as seen:
-        seen.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
-        wide, room = seen.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+    with opened(browser, file, width, scheme) as window:
+        window.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        wide, room = window.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
         assert wide <= room == width
-        assert too_wide(seen) == []
-        assert first_words(seen) == case.report.verdict
-        paper, ink = seen.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+        assert too_wide(window) == []
+        assert first_words(window) == case.report.verdict
+        paper, ink = window.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
         assert (brightness(paper) > brightness(ink)) == (scheme == "light")
-        assert (seen.console, seen.requests) == ([], [])
+        assert (window.console, window.requests) == ([], [])
 
 
 def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path):
-    with opened(browser, file, 1280) as seen:
-        films = seen.page.query_selector_all("video")
+    with opened(browser, file, 1280) as window:
+        films = window.page.query_selector_all("video")
         assert len(films) == len(case.films)
         for film, success, caption in zip(films, case.films, case.captions, strict=True):
             assert film.is_visible()
@@ -135,16 +135,16 @@ def test_every_film_plays_in_its_place(browser: Browser, case: Case, file: Path)
             assert caption in film.evaluate("film => film.closest('figure').innerText")
             heading = film.evaluate("film => film.closest('.films').previousElementSibling?.innerText")
             assert success is None or heading == ("Successes" if success else "Failures")
-        assert (seen.console, seen.requests) == ([], [])
+        assert (window.console, window.requests) == ([], [])
 
 
 def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, case: Case, file: Path):
-    with opened(browser, file, 1280) as seen:
-        for film in seen.page.query_selector_all("video"):
+    with opened(browser, file, 1280) as window:
+        for film in window.page.query_selector_all("video"):
             film.scroll_into_view_if_needed()  # browsers wait with those that are out of sight
-            assert seen.page.wait_for_function(STARTED, arg=film, timeout=60_000)
+            assert window.page.wait_for_function(STARTED, arg=film, timeout=60_000)
             assert film.evaluate(POSTER) == [64, 48]
-        assert (seen.console, seen.requests) == ([], [])
+        assert (window.console, window.requests) == ([], [])
 
 
 def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, case: Case, tmp_path: Path):
@@ -152,34 +152,34 @@ def test_the_page_runs_no_script_of_its_own_and_lets_none_in(browser: Browser, c
     slipped_in = html.replace("</main>", "<script>document.title = 'slipped in'</script></main>")
     assert slipped_in != html
     (tmp_path / "report.html").write_text(slipped_in)
-    with opened(browser, tmp_path / "report.html", 1280) as seen:
-        assert seen.page.title() != "slipped in"
-        assert any("Content Security Policy" in line for line in seen.console)
+    with opened(browser, tmp_path / "report.html", 1280) as window:
+        assert window.page.title() != "slipped in"
+        assert any("Content Security Policy" in line for line in window.console)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
 def test_the_failure_map_shows_the_marks_of_the_data(browser: Browser, tmp_path: Path, width: int):
     eval_case().report.write(tmp_path / "report.html")
-    with opened(browser, tmp_path / "report.html", width) as seen:
+    with opened(browser, tmp_path / "report.html", width) as window:
         for index in range(2):
-            assert marks_in(seen, index) == counted(failure_map(RESULT))
+            assert marks_in(window, index) == counted(failure_map(RESULT))
 
 
 def test_the_maps_of_a_comparison_show_what_one_side_alone_failed_in(browser: Browser, tmp_path: Path):
     CASES["compare"]().report.write(tmp_path / "report.html")
-    with opened(browser, tmp_path / "report.html", 1280) as seen:
+    with opened(browser, tmp_path / "report.html", 1280) as window:
         for arm, map_of_arm in enumerate(paired_maps(COMPARISON)):
-            assert marks_in(seen, 2 * arm) == marks_in(seen, 2 * arm + 1) == counted(map_of_arm)
-        assert marks_in(seen, 0)["failed"] > 0 == marks_in(seen, 2)["failed"]
+            assert marks_in(window, 2 * arm) == marks_in(window, 2 * arm + 1) == counted(map_of_arm)
+        assert marks_in(window, 0)["failed"] > 0 == marks_in(window, 2)["failed"]
 
 
 def counted(given: FailureMap) -> dict[str, int]:
     return {kind: sum(mark.outcome == kind for mark in given.marks) for kind in ("failed", "shared", "solved")}
 
 
-def marks_in(seen: Opened, index: int) -> dict[str, int]:
-    """How many marks of each kind one map has, all of them inside its frame and seen."""
-    return seen.evaluate(
+def marks_in(window: Opened, index: int) -> dict[str, int]:
+    """How many marks of each kind one map has, all of them inside its frame and large enough to be visible."""
+    return window.evaluate(
         """(index) => {
             const map = document.querySelectorAll('svg.map')[index], frame = map.getBoundingClientRect();
             const inside = (mark) => {
@@ -194,9 +194,9 @@ def marks_in(seen: Opened, index: int) -> dict[str, int]:
     )
 
 
-def first_words(seen: Opened) -> str:
+def first_words(window: Opened) -> str:
     """The first heading's words, which must stand in the first window without scrolling."""
-    words, bottom = seen.evaluate(
+    words, bottom = window.evaluate(
         """() => {
             const first = document.querySelector('h1, h2, h3, table, svg, video');
             return [first.innerText, first.getBoundingClientRect().top];
@@ -206,9 +206,9 @@ def first_words(seen: Opened) -> str:
     return str(words).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def too_wide(seen: Opened) -> list[str]:
+def too_wide(window: Opened) -> list[str]:
     """Words that stick out of the page's column."""
-    return seen.evaluate(
+    return window.evaluate(
         """() => {
             const main = document.querySelector('main').getBoundingClientRect();
             const parts = 'h1, h2, h3, p, li, td, th, dd, dt, summary, video, svg.map, .bar-line';

@@ -12,7 +12,6 @@ import pytest
 from manip_il.engine.drivers import drawn_step
 from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled, summary_lines
 from manip_il.evaluation.certify import certify, count_episodes, draw_moment
@@ -20,11 +19,11 @@ from manip_il.evaluation.intervals import wilson_interval
 from manip_il.expert import Expert
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.mdp import Episode
-from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import NOTICEABLE, Perturbation
 from manip_il.sim.scene import build_scene
 
+from ..engine.clones import clone
 from ..learn.tiny_policies import write_checkpoint
 
 HORIZON = 50
@@ -179,16 +178,16 @@ def policy(tmp_path_factory) -> Path:
 
 
 def test_the_expert_goes_on_from_where_a_learner_left_it(policy: Path):
-    env, seen = EnvConfig("fetch", "reach", horizon=60), list[Episode]()
-    made = certify(Engine(), env, 4, policy=policy, on_episode=seen.append)
+    env, episodes = EnvConfig("fetch", "reach", horizon=60), list[Episode]()
+    made = certify(Engine(), env, 4, policy=policy, on_episode=episodes.append)
     [learner] = made.of("learner")
     assert (len(learner.cases), learner.left_out) == (4, 0)
     assert [case.moment for case in learner.cases] == [drawn_step(case.seed, env.horizon) for case in learner.cases]
     assert learner.success.rate == 1
-    assert len(seen) == count_episodes(env, 4, policy)
-    episodes = {episode.seed: episode for episode in seen[-4:]}
+    assert len(episodes) == count_episodes(env, 4, policy)
+    taken_over = {episode.seed: episode for episode in episodes[-4:]}
     for case in learner.cases:
-        assert len(episodes[case.seed]) - case.moment == case.steps
+        assert len(taken_over[case.seed]) - case.moment == case.steps
     assert made.policy == str(policy)
 
 
@@ -211,16 +210,8 @@ MEAN_COST, COST_95 = 8.0, 36  # of a wrong action [control steps]: measured 4.5 
 @pytest.fixture(scope="module", params=["panda", "fetch"])
 def certified(request, tmp_path_factory) -> Certificate:
     """Beside perturbed states, those that a poor clone of the expert visits."""
-    from manip_il.learn.fit_config import FitConfig
-    from manip_il.learn.train import fit
-
     env = EnvConfig(request.param)
-    episodes = list(run_job(RolloutJob(env, "expert", hold=3), stream_seeds("demonstrations", 10)))
-    table = {key: np.concatenate([episode.columns[key] for episode in episodes]) for key in episodes[0].columns}
-    table["episode_index"] = np.repeat(np.arange(len(episodes)), [len(episode) for episode in episodes])
-    config = FitConfig({"width": 64}, steps=300, batch_size=32)
-    folder = fit(table, config, tmp_path_factory.mktemp("clone"), spec=env_spec(env))
-    return certify(Engine(), env, CASES, policy=folder)
+    return certify(Engine(), env, CASES, policy=clone(env, 10, tmp_path_factory.mktemp("clone"), steps=300, width=64))
 
 
 @pytest.mark.slow

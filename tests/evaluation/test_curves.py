@@ -15,10 +15,10 @@ from .test_report import CURVE, REPORT
 from .test_rounds import records
 
 
-def test_a_wide_span_of_labels_takes_a_logarithmic_axis():
-    assert not Axis.around([100, 1000]).log
-    assert Axis.around([100, 10_000]).log
-    assert not Axis.around([0, 10_000]).log
+def test_a_wide_span_of_labels_takes_a_logarithmic_axis_and_one_point_has_an_axis():
+    spans = ([100, 1000], [100, 10_000], [0, 10_000])
+    assert [Axis.around(span).log for span in spans] == [False, True, False]
+    assert 0 < Axis.around([500]).percent(500) < 100
 
 
 @pytest.mark.parametrize(
@@ -30,10 +30,6 @@ def test_ticks_are_few_lie_on_the_axis_and_keep_their_order(axis: Axis):
     assert 2 <= len(ticks) <= 6
     assert all(0 <= place <= 100 for place in places)
     assert places == sorted(places)
-
-
-def test_one_point_alone_has_an_axis():
-    assert 0 < Axis.around([500]).percent(500) < 100
 
 
 @pytest.mark.parametrize(

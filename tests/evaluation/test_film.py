@@ -29,8 +29,8 @@ def frames(count: int, height: int = 48, width: int = 64) -> list[np.ndarray]:
 
 
 def test_a_seed_run_again_is_the_episode_that_an_evaluation_saw(episode):
-    seen = {other.seed: other for other in run_job(JOB, range(SEED, SEED + 3))}[SEED]
-    assert np.array_equal(seen.columns[schema.SIM_STATE], episode.columns[schema.SIM_STATE])
+    evaluated = {other.seed: other for other in run_job(JOB, range(SEED, SEED + 3))}[SEED]
+    assert np.array_equal(evaluated.columns[schema.SIM_STATE], episode.columns[schema.SIM_STATE])
 
 
 def test_a_film_ends_a_second_after_success(episode):
@@ -69,9 +69,9 @@ def test_a_films_poster_is_its_last_frame():
 
 
 def test_a_strip_goes_from_the_first_to_the_last_frame():
-    shown = strip(frames(21), 10, count=6)
-    assert [seconds for seconds, _ in shown] == [0.0, 0.4, 0.8, 1.2, 1.6, 2.0]
-    pictures = [np.asarray(Image.open(io.BytesIO(png))) for _, png in shown]
+    pictures_at = strip(frames(21), 10, count=6)
+    assert [seconds for seconds, _ in pictures_at] == [0.0, 0.4, 0.8, 1.2, 1.6, 2.0]
+    pictures = [np.asarray(Image.open(io.BytesIO(png))) for _, png in pictures_at]
     assert [int(picture.mean()) for picture in pictures] == [0, 40, 80, 120, 160, 200]
     assert len(strip(frames(2), 10, count=6)) == 2
 

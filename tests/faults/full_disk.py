@@ -1,4 +1,4 @@
-"""A disk that is full after so many bytes: a mounted one where this is root, else a limit on every file."""
+"""A disk that is full after so many bytes, a mounted one where this is root, else a limit on every file; and errors."""
 
 from __future__ import annotations
 
@@ -46,3 +46,10 @@ def small_disk(folder: Path, size: int) -> Iterator[Disk]:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
+
+
+def the_error(printed: str) -> str:
+    """The error among what a command printed; there is no more than that one line of it."""
+    assert "Traceback" not in printed
+    (line,) = [line for line in printed.splitlines() if line.startswith("manip-il: error:")]
+    return line

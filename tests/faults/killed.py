@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
+from manip_il.data.journal import list_episodes
+
 from .child import living
 
 PATIENCE = 600.0  # for a command that is not killed, and for the end of one that is [s]
@@ -58,3 +60,8 @@ class Command:
             time.sleep(0.02)
         process.join(PATIENCE)
         return time.monotonic() - killed
+
+
+def contents(journals: Path) -> dict[str, bytes]:
+    """The bytes of every finished episode."""
+    return {path.name: path.read_bytes() for path in list_episodes(journals)}

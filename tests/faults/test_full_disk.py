@@ -8,8 +8,8 @@ import pytest
 
 from manip_il.cli.main import main
 
-from ..cli.made_runs import make_eval
-from .full_disk import small_disk
+from ..fuzz.files import make_evals
+from .full_disk import small_disk, the_error
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 REACH = ("--robot.type=fetch", "--task.type=reach", "--workers=1")
@@ -23,13 +23,10 @@ EVAL = ("eval", "--policy.type=expert", *REACH, "--eval.n_episodes=6", "--eval.f
 
 
 def error_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
-    """The error of a command that fails; there is one line of it."""
+    """The error of a command that fails."""
     capsys.readouterr()
     assert main([*words, "--quiet"]) == 1
-    printed = capsys.readouterr().err
-    assert "Traceback" not in printed
-    (line,) = [line for line in printed.splitlines() if line.startswith("manip-il: error:")]
-    return line
+    return the_error(capsys.readouterr().err)
 
 
 @pytest.mark.slow
@@ -55,13 +52,10 @@ def test_what_was_finished_is_kept_and_the_command_goes_on(words, size, place, t
         assert main([*words, f"--output_dir={out}", "--resume=true", "--quiet"]) == 0
 
 
-@pytest.mark.parametrize("words", [("merge", "left", "right"), ("compare", "left", "same")])
+@pytest.mark.parametrize("words", [("merge", "left", "more"), ("compare", "left", "right")])
 def test_evaluations_are_merged_and_compared_anew(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for folder, seed in (("left", 4_000_000), ("right", 4_001_000), ("same", 4_000_000)):
-        make_eval(Path(folder, "eval.json"), [True, False], seed)
-        text = Path(folder, "eval.json").read_text()
-        Path(folder, "eval.json").write_text(text.replace(f'"policy": "{folder}"', '"policy": "expert"'))
+    make_evals(tmp_path)
     with small_disk(tmp_path / "disk", 8_192) as disk:
         out = disk.folder / "out"
         line = error_of((*words, f"--output_dir={out}"), capsys)
@@ -78,14 +72,12 @@ def test_an_export_leaves_nothing_behind(tmp_path, capsys):
         assert list(disk.folder.iterdir()) == []
 
 
-@pytest.mark.parametrize("words", [("merge", "left", "right"), ("mcap", "export", str(SAMPLE))])
+@pytest.mark.parametrize(
+    "words", [("merge", "left", "more", "--output_dir=file/out"), ("mcap", "export", str(SAMPLE), "file/out")]
+)
 def test_a_path_through_a_file_is_named(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    make_eval(Path("left/eval.json"), [True])
-    make_eval(Path("right/eval.json"), [True], 4_001_000)
-    for path in Path().glob("*/eval.json"):
-        path.write_text(path.read_text().replace(f'"policy": "{path.parent}"', '"policy": "expert"'))
+    make_evals(tmp_path)
     Path("file").write_text("")
-    out = ("file/out",) if words[0] == "mcap" else ("--output_dir=file/out",)
-    assert "file" in error_of((*words, *out), capsys)
+    assert "file" in error_of(words, capsys)
     assert Path("file").read_text() == ""

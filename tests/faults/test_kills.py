@@ -14,7 +14,7 @@ from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import Severity
 
 from ..damage import digests
-from .killed import Command
+from .killed import Command, contents
 
 pytestmark = pytest.mark.slow
 
@@ -37,12 +37,12 @@ def test_no_kill_loses_a_finished_episode_or_leaves_a_dataset_that_cannot_be_rea
     while kills < KILLS:
         chain += 1
         again = recorder(tmp_path / f"chain_{chain}")
-        root = again.folder / "demos"
+        root, kept = again.folder / "demos", again.kept
         while kills < KILLS:
             finished: dict[str, bytes] = {}
-            look = partial(update_contents, finished, again.kept)
+            look = partial(lambda found, folder: found.update(contents(folder)), finished, kept)
             killed = again.kill(rng.uniform(0, seconds), before=look)
-            after = contents(again.kept)
+            after = contents(kept)
             assert finished.items() <= after.items()
             assert after.items() <= episodes.items()
             assert not root.exists() or digests(root) == expected
@@ -51,16 +51,8 @@ def test_no_kill_loses_a_finished_episode_or_leaves_a_dataset_that_cannot_be_rea
             kills += 1
         again.run()
         assert digests(root) == expected
-        assert contents(again.kept) == episodes
+        assert contents(kept) == episodes
         assert [one for one in examine_folder(root) if one.severity is Severity.ERROR] == []
         assert sorted(path.name for path in again.folder.iterdir()) == ["demos", "demos.journals", "log"]
     for path in list_episodes(calm.kept):
         read_episode(path)
-
-
-def contents(journals: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in list_episodes(journals)}
-
-
-def update_contents(found: dict[str, bytes], journals: Path) -> None:
-    found |= contents(journals)

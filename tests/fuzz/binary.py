@@ -1,4 +1,4 @@
-"""Mutations of bytes, and of MCAP, parquet, safetensors and npy files by their structure."""
+"""Mutations of MCAP, parquet, safetensors and npy files by their structure."""
 
 from __future__ import annotations
 
@@ -17,58 +17,11 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-_LENGTHS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 2**40, 2**63 - 1, 2**64 - 1)
-
-
-def damaged(rng: Random, data: bytes) -> bytes:
-    """The bytes with one to four changes: flipped, cut, doubled, spliced, overwritten by a length."""
-    for _ in range(rng.choice((1, 1, 2, 4))):
-        data = rng.choice(_DAMAGES)(rng, data)
-    return data
-
-
-def _flip(rng: Random, data: bytes) -> bytes:
-    place = rng.randrange(len(data) + 1)
-    return data[:place] + bytes([(data[place : place + 1] or b"\0")[0] ^ (1 << rng.randrange(8))]) + data[place + 1 :]
-
-
-def _cut(rng: Random, data: bytes) -> bytes:
-    place = rng.randrange(len(data) + 1)
-    return rng.choice((data[:place], data[place:], b""))
-
-
-def _repeat(rng: Random, data: bytes) -> bytes:
-    start = rng.randrange(len(data) + 1)
-    piece = data[start : start + rng.choice((1, 8, 200))]
-    return data[:start] + piece * rng.choice((2, 10, 1_000)) + data[start:]
-
-
-def _splice(rng: Random, data: bytes) -> bytes:
-    there, here, size = (rng.randrange(len(data) + 1) for _ in range(3))
-    piece = data[there : there + min(size, 500)]
-    return data[:here] + piece + data[here + len(piece) :]
-
-
-def _length(rng: Random, data: bytes) -> bytes:
-    size = rng.choice((1, 2, 4, 8))
-    value = rng.choice(_LENGTHS) % 2 ** (8 * size)
-    anywhere, head = rng.randrange(len(data) + 1), rng.randrange(min(len(data), 64) + 1)
-    place = rng.choice((anywhere, head, max(len(data) - rng.randrange(64), 0)))
-    return data[:place] + value.to_bytes(size, rng.choice(("little", "big"))) + data[place + size :]
-
-
-def _noise(rng: Random, data: bytes) -> bytes:
-    place = rng.randrange(len(data) + 1)
-    return data[:place] + rng.randbytes(rng.choice((1, 16, 300))) + data[place:]
-
-
-_DAMAGES = (_flip, _flip, _cut, _repeat, _splice, _length, _length, _noise)
+from .trees import LENGTHS, damaged, mutate_json, mutate_tree
 
 
 def mutate_safetensors(rng: Random, data: bytes) -> bytes:
     """Weights whose header says something else, mostly with the header's true length."""
-    from .trees import mutate_json
-
     size = struct.unpack("<Q", data[:8])[0]
     choice = rng.random()
     if choice < 0.3:
@@ -77,7 +30,7 @@ def mutate_safetensors(rng: Random, data: bytes) -> bytes:
     if choice < 0.9:
         header += b" " * (-len(header) % 8)
         return struct.pack("<Q", len(header)) + header + data[8 + size :]
-    return struct.pack("<Q", rng.choice(_LENGTHS)) + header + data[8 + size :]
+    return struct.pack("<Q", rng.choice(LENGTHS)) + header + data[8 + size :]
 
 
 def mutate_npy(rng: Random, data: bytes) -> bytes:
@@ -141,8 +94,6 @@ def mutate_mcap(rng: Random, data: bytes) -> bytes:
 
 def change_metadata(rng: Random, record: Metadata) -> Metadata:
     """Another name, or texts that say something else."""
-    from .trees import mutate_json, mutate_tree
-
     values: dict[str, Any] = dict(record.metadata)
     key = rng.choice(list(values) or [""])
     try:
@@ -169,8 +120,6 @@ def _attachment(rng: Random, record: Attachment) -> Attachment:
 
 
 def _message(rng: Random, record: Message) -> Message:
-    from .trees import mutate_json
-
     is_json = record.data[:1] == b"{"
     time = record.log_time if rng.random() < 0.7 else rng.choice((0, 1, 2**63, 2**64 - 1))
     try:
@@ -306,8 +255,6 @@ def _with_null(rng: Random, table: pa.Table) -> pa.Table:
 
 
 def _footer(rng: Random, table: pa.Table) -> pa.Table:
-    from .trees import mutate_json
-
     metadata = dict(table.schema.metadata or {b"huggingface": b'{"info": {"features": {}}}'})
     key = rng.choice(list(metadata))
     try:

@@ -5,19 +5,29 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from random import Random
-from typing import Any
 
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from mcap.writer import Writer
+from mcap_protobuf.schema import register_schema
+
+from manip_il.cli.inputs import check_dataset
 from manip_il.data import journal
+from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
 from manip_il.data.lerobot_read import dataset_info, read_episodes, read_fingerprint, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
+from manip_il.errors import ManipError
+from manip_il.learn.columns import LEARNING_COLUMNS, check_table, learning_rows
 from manip_il.mcap.importing import features_of, frames_of, list_files, read_import
 from manip_il.mcap.mapping import load_mapping
+from manip_il.mdp import Episode
 from manip_il.store.cards import card_for
 
+from ..pictures import encoded, with_cameras
 from .binary import mutate_mcap, mutate_parquet
-from .target import Target, command
-from .trees import mutate_json, mutate_yaml
+from .target import Target, runs
+from .trees import damaged, mutate_json, mutate_yaml
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 MAPPING = """\
@@ -56,29 +66,19 @@ def make_journals(folder: Path) -> None:
 
 def make_pictured_journals(folder: Path) -> None:
     """`demos.journals` of two short episodes with one camera."""
-    import numpy as np
-
-    from manip_il.data import schema as s
-    from manip_il.mdp import Episode
-
-    spec = s.RobotTaskSpec("toy", "lift", 20, ("a", "gripper"), ("ee.x", "ee.y", "ee.z"), 3, "Lift.")
-    spec = s.RobotTaskSpec(**{**spec.__dict__, "cameras": ("front",), "image_size": (32, 48)})
+    spec = with_cameras(
+        s.RobotTaskSpec("toy", "lift", 20, ("a", "gripper"), ("ee.x", "ee.y", "ee.z"), 3, "Lift."), "front"
+    )
     for seed in (1, 2):
-        rng = np.random.default_rng(seed)
-        columns: dict[str, Any] = {}
-        for key, one in s.features(spec).items():
-            shape = (4, *one["shape"])
-            if one["dtype"] == "video":
-                columns[key] = rng.integers(0, 256, shape).astype(np.uint8)
-            elif one["dtype"].startswith("float"):
-                columns[key] = rng.normal(size=shape).astype(one["dtype"])
-            else:
-                columns[key] = np.zeros(shape, one["dtype"])
+        columns = {
+            key: np.zeros((4, *one["shape"]), np.uint8 if one["dtype"] == "video" else one["dtype"])
+            for key, one in s.features(spec).items()
+        }
+        pictures = columns[s.IMAGES + "front"]
+        pictures[:] = np.random.default_rng(seed).integers(0, 256, pictures.shape)
         columns[s.SEED][:] = seed
-        columns[s.SUCCESS][-1] = True
-        columns[s.DONE][-1] = True
-        episode = Episode(seed, columns, True, True)
-        journal.write_episode(folder / "demos.journals", episode, spec, {"mujoco": "3.11.0"})
+        columns[s.SUCCESS][-1] = columns[s.DONE][-1] = True
+        journal.write_episode(folder / "demos.journals", Episode(seed, columns, True, True), spec, {"mujoco": "3.11.0"})
     Recording("local/demos", True, 2).write(folder / "demos.journals")
 
 
@@ -91,14 +91,6 @@ def make_pictured(folder: Path) -> None:
 
 def make_mcap(folder: Path) -> None:
     """`in.mcap` and the `mapping.yaml` that imports it."""
-    import io
-
-    import numpy as np
-    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-    from mcap.writer import Writer
-    from mcap_protobuf.schema import register_schema
-    from PIL import Image
-
     (folder / "mapping.yaml").write_text(MAPPING)
     with (folder / "in.mcap").open("wb") as stream:
         writer = Writer(stream)
@@ -110,9 +102,7 @@ def make_mcap(folder: Path) -> None:
             joints = [{"name": name, "position": tick / 3} for name in ("elbow", "wrist")]
             writer.add_message(numbers, stamp, json.dumps({"joints": joints, "count": tick}).encode(), stamp)
             writer.add_message(words, stamp, json.dumps({"text": f"word {tick}"}).encode(), stamp)
-            picture = io.BytesIO()
-            Image.fromarray(np.full((8, 8, 3), tick, np.uint8)).save(picture, "PNG")
-            message = CompressedImage(data=picture.getvalue(), format="png")
+            message = CompressedImage(data=encoded(np.full((8, 8, 3), tick, np.uint8)), format="png")
             writer.add_message(pictures, stamp, message.SerializeToString(), stamp)
         writer.finish()
 
@@ -131,27 +121,8 @@ def _card(folder: Path) -> None:
     card_for(folder / "dataset", "dataset", "hf://datasets/user/demos")
 
 
-def _doctor(folder: Path) -> None:
-    command("doctor", str(folder / "dataset"))
-
-
-def _repair(folder: Path) -> None:
-    command("doctor", str(folder / "dataset"), "--repair=true")
-
-
-def _push(folder: Path) -> None:
-    command("push", str(folder / "dataset"), f"file://{folder}/store")
-
-
-def _export(folder: Path) -> None:
-    command("mcap", "export", str(folder / "dataset"), str(folder / "mcap"))
-
-
 def _learn(folder: Path) -> None:
     """What `train` does with a dataset before it fits."""
-    from manip_il.cli.inputs import check_dataset
-    from manip_il.learn.columns import LEARNING_COLUMNS, check_table, learning_rows
-
     root = folder / "dataset"
     spec = read_spec(root)
     check_dataset(root, spec, read_fingerprint(root))
@@ -166,14 +137,8 @@ def _journals(folder: Path) -> None:
         journal.read_journal(path)
 
 
-def _build(folder: Path) -> None:
-    command("build", str(folder / "demos.journals"), str(folder / "built"))
-
-
 def _set_aside(folder: Path) -> None:
     if wrong := journal.set_aside_damaged(folder / "demos.journals"):
-        from manip_il.errors import ManipError
-
         raise ManipError(wrong[0])
 
 
@@ -184,14 +149,8 @@ def _import(folder: Path) -> None:
         list(frames_of(episode, mapping, features_of(mapping, episode)))
 
 
-def _import_command(folder: Path) -> None:
-    command("mcap", "import", str(folder / "in.mcap"), str(folder / "out"), f"--mapping={folder / 'mapping.yaml'}")
-
-
 def damaged_video(rng: Random, data: bytes) -> bytes:
     """A video with damage anywhere; half of it in its first or last kilobyte, where the container's tables are."""
-    from .binary import damaged
-
     if rng.random() < 0.5:
         return damaged(rng, data)
     if rng.random() < 0.5:
@@ -199,22 +158,28 @@ def damaged_video(rng: Random, data: bytes) -> bytes:
     return data[:-1_000] + damaged(rng, data[-1_000:])
 
 
-_READS = (_open, _episodes, _card, _doctor, _export, _learn, _push)
+_DOCTOR = runs("doctor", "{folder}/dataset")
+_REPAIR = runs("doctor", "{folder}/dataset", "--repair=true")
+_EXPORT = runs("mcap", "export", "{folder}/dataset", "{folder}/mcap")
+_PUSH = runs("push", "{folder}/dataset", "file://{folder}/store")
+_BUILD = runs("build", "{folder}/demos.journals", "{folder}/built")
+_IMPORT = runs("mcap", "import", "{folder}/in.mcap", "{folder}/out", "--mapping={folder}/mapping.yaml")
+_READS = (_open, _episodes, _card, _DOCTOR, _EXPORT, _learn, _PUSH)
 TARGETS = (
     Target("dataset info.json", make_dataset, "dataset/meta/info.json", mutate_json, _READS),
     Target("dataset manip_il.json", make_dataset, "dataset/meta/manip_il.json", mutate_json, _READS),
-    Target("dataset stats.json", make_dataset, "dataset/meta/stats.json", mutate_json, (*_READS, _repair)),
+    Target("dataset stats.json", make_dataset, "dataset/meta/stats.json", mutate_json, (*_READS, _REPAIR)),
     Target("dataset tasks", make_dataset, "dataset/meta/tasks.parquet", mutate_parquet, _READS),
     Target("dataset episodes", make_dataset, "dataset/meta/episodes/*/*.parquet", mutate_parquet, _READS),
     Target("dataset data", make_dataset, "dataset/data/*/*.parquet", mutate_parquet, _READS),
     Target(
-        "pictured info.json", make_pictured, "dataset/meta/info.json", mutate_json, (*_READS[:5], _repair), share=0.5
+        "pictured info.json", make_pictured, "dataset/meta/info.json", mutate_json, (*_READS[:5], _REPAIR), share=0.5
     ),
-    Target("video", make_pictured, "dataset/videos/*/*/*.mp4", damaged_video, (_episodes, _doctor), share=0.3),
-    Target("recording.json", make_journals, "demos.journals/recording.json", mutate_json, (_build,)),
-    Target("journal", make_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _build, _set_aside)),
-    Target("pictured journal", make_pictured_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _build)),
+    Target("video", make_pictured, "dataset/videos/*/*/*.mp4", damaged_video, (_episodes, _DOCTOR), share=0.3),
+    Target("recording.json", make_journals, "demos.journals/recording.json", mutate_json, (_BUILD,)),
+    Target("journal", make_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _BUILD, _set_aside)),
+    Target("pictured journal", make_pictured_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _BUILD)),
     Target("mcap", make_mcap, "in.mcap", mutate_mcap, (_import,)),
     Target("mcap mapping", make_mcap, "mapping.yaml", mutate_yaml, (_import,)),
-    Target("mcap import", make_mcap, "mapping.yaml", mutate_yaml, (_import_command,), share=0.1),
+    Target("mcap import", make_mcap, "mapping.yaml", mutate_yaml, (_IMPORT,), share=0.1),
 )

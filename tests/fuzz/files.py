@@ -7,11 +7,23 @@ from dataclasses import MISSING
 from pathlib import Path
 
 from manip_il.cli import quickstart
+from manip_il.cli.candidates import limit_of, read_candidate, run_history
+from manip_il.cli.eval_files import EpisodeJournal, ReplayOptions
 from manip_il.cli.main import COMMANDS, load
 from manip_il.cli.options import options_of
+from manip_il.cli.outputs import check_same_options
 from manip_il.cli.parsing import dump_yaml, parse
+from manip_il.cli.study_file import check_same_file, keep_file, read_plan
+from manip_il.cli.trials import suite_conditions
+from manip_il.engine.jobs import RolloutJob
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
+from manip_il.evaluation.rounds import Rule
+from manip_il.store.cards import command as command_of_card
 
-from .target import Read, Target, command
+from ..cli.made_runs import ENV, OPTIONS, make_eval
+from ..cli.made_runs import make_run as make_dagger_run
+from .remotes import make_small_policy
+from .target import Read, Target, command, runs
 from .trees import mutate_json, mutate_json_lines, mutate_yaml
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -47,36 +59,25 @@ def _copy_of(source: str, name: str):
 
 
 def _read_plan(folder: Path) -> None:
-    from manip_il.cli.study_file import read_plan
-
     read_plan(folder / "study.yaml", None)
 
 
 def make_study(folder: Path) -> None:
     """`study.yaml` as a study keeps it."""
-    from manip_il.cli.study_file import keep_file, read_plan
-
     keep_file(folder, read_plan(CONFIGS / "studies" / "chunk_labels.yaml", None).file)
 
 
 def _same_study(folder: Path) -> None:
-    from manip_il.cli.study_file import check_same_file, read_plan
-
     check_same_file(folder, read_plan(CONFIGS / "studies" / "chunk_labels.yaml", None).file)
 
 
 def _read_suite(folder: Path) -> None:
-    from manip_il.cli.trials import suite_conditions
-    from manip_il.evaluation.results import EvalSettings
-
     conditions = suite_conditions(str(folder / "suite.yaml"), "pick_place", sees=True)
     EvalSettings.from_json(EvalSettings(8, 0.02, conditions=conditions).to_json())
 
 
 def make_evals(folder: Path) -> None:
     """`left/eval.json` and `right/eval.json` on the same seeds, `more/eval.json` on others."""
-    from ..cli.made_runs import make_eval
-
     make_eval(folder / "left" / "eval.json", [True, False, True])
     make_eval(folder / "right" / "eval.json", [True, True, False])
     make_eval(folder / "more" / "eval.json", [True, True, False], seed=4_001_000)
@@ -85,19 +86,8 @@ def make_evals(folder: Path) -> None:
         path.write_text(text.replace('"policy": "more"', '"policy": "expert"'))
 
 
-def _merge(folder: Path) -> None:
-    command("merge", str(folder / "left"), str(folder / "more"), f"--output_dir={folder / 'merged'}")
-
-
-def _compare(folder: Path) -> None:
-    command("compare", str(folder / "left"), str(folder / "right"), f"--output_dir={folder / 'compared'}")
-
-
 def _replay(folder: Path) -> None:
     """What `replay` makes of an evaluation before it runs anything."""
-    from manip_il.cli.eval_files import ReplayOptions
-    from manip_il.evaluation.results import EvalResult
-
     result = EvalResult.read(folder / "left")
     ReplayOptions(folder / "left" / "eval.json", 0)._job(result)
     result.to_json()
@@ -105,19 +95,12 @@ def _replay(folder: Path) -> None:
 
 def make_kept(folder: Path) -> None:
     """`episodes.jsonl` of an evaluation that was stopped."""
-    from manip_il.evaluation.results import EpisodeResult
-
     kept = _kept(folder)
     for seed in range(5):
         kept.add(EpisodeResult(seed, True, False, 8, 1.5, "lifted", {"condition": "nominal", "steps_to_success": 3}))
 
 
 def _kept(folder: Path):
-    from manip_il.cli.eval_files import EpisodeJournal
-    from manip_il.engine.jobs import RolloutJob
-
-    from ..cli.made_runs import ENV
-
     return EpisodeJournal.open(folder, RolloutJob(ENV, "expert", label="last"), "nominal")
 
 
@@ -127,19 +110,14 @@ def _read_kept(folder: Path) -> None:
 
 def make_run(folder: Path) -> None:
     """`run`: a DAgger run of three rounds."""
-    from ..cli import made_runs
-
     policy = folder / "policy"
     policy.mkdir()
     (policy / "config.json").write_text('{"type": "act"}')
     (policy / "manip_il.json").write_text("{}")
-    made_runs.make_run(folder / "run", policy)
+    make_dagger_run(folder / "run", policy)
 
 
 def _side(folder: Path) -> None:
-    from manip_il.cli.candidates import limit_of, read_candidate
-    from manip_il.evaluation.rounds import Rule
-
     for at in ("end", "labels", "seconds"):
         rule = Rule.parse("best", at)
         for source in (side := read_candidate(folder / "run")).sources:
@@ -148,19 +126,12 @@ def _side(folder: Path) -> None:
 
 def _resume_dagger(folder: Path) -> None:
     """What `dagger --resume=true` reads before it goes on."""
-    from manip_il.cli.candidates import run_history
-    from manip_il.cli.outputs import check_same_options
-
-    from ..cli.made_runs import OPTIONS
-
     check_same_options(folder / "run", OPTIONS, ("output_dir", "resume", "rounds"))
     run_history(folder / "run")
 
 
 def _command_of_card(folder: Path) -> None:
-    from manip_il.store.cards import command as written
-
-    written(folder / "run" / "config.yaml")
+    command_of_card(folder / "run" / "config.yaml")
 
 
 def make_timings(folder: Path) -> None:
@@ -174,20 +145,14 @@ def _read_timings(folder: Path) -> None:
 
 def make_store(folder: Path) -> None:
     """`store`: a policy's folder, pushed."""
-    from .remotes import make_small_policy
-
     make_small_policy(folder / "policy")
     command("push", str(folder / "policy"), f"file://{folder}/store")
 
 
-def _pull(folder: Path) -> None:
-    command("pull", f"file://{folder}/store", str(folder / "pulled"))
-
-
-def _push(folder: Path) -> None:
-    command("push", str(folder / "policy"), f"file://{folder}/store")
-
-
+_MERGE = runs("merge", "{folder}/left", "{folder}/more", "--output_dir={folder}/merged")
+_COMPARE = runs("compare", "{folder}/left", "{folder}/right", "--output_dir={folder}/compared")
+_PULL = runs("pull", "file://{folder}/store", "{folder}/pulled")
+_PUSH = runs("push", "{folder}/policy", "file://{folder}/store")
 TARGETS = (
     *(
         Target(f"options of {name}", _make_config(name), "options.yaml", mutate_yaml, (_read_config(name),), share=0.3)
@@ -201,10 +166,10 @@ TARGETS = (
         )
         for name in ("knocked", "sensing", "object", "view")
     ),
-    Target("eval.json", make_evals, "left/eval.json", mutate_json, (_merge, _compare, _replay), share=1.5),
+    Target("eval.json", make_evals, "left/eval.json", mutate_json, (_MERGE, _COMPARE, _replay), share=1.5),
     Target("episodes.jsonl", make_kept, "episodes.jsonl", mutate_json_lines, (_read_kept,)),
     Target("metrics.jsonl", make_run, "run/metrics.jsonl", mutate_json_lines, (_side, _resume_dagger)),
     Target("config.yaml", make_run, "run/config.yaml", mutate_yaml, (_side, _resume_dagger, _command_of_card)),
     Target("timings", make_timings, "timings.json", mutate_json, (_read_timings,), share=0.3),
-    Target("manifest", make_store, "store/manip_il_manifest.json", mutate_json, (_pull, _push)),
+    Target("manifest", make_store, "store/manip_il_manifest.json", mutate_json, (_PULL, _PUSH)),
 )

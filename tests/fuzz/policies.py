@@ -6,8 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
+from manip_il.cli.inputs import check_policy, find_policy
+from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256
+from manip_il.learn.checkpoint import read_meta
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.pretrained import read_interface
+from manip_il.learn.train import fit
+from manip_il.store.cards import card_for
+
+from ..cli.made_runs import ENV, make_policy
 from .binary import mutate_safetensors
-from .target import Target, command
+from .target import Target, runs
 from .trees import mutate_json, mutate_json_lines
 
 ROWS = 40
@@ -15,8 +24,6 @@ ROWS = 40
 
 def make_act(folder: Path) -> None:
     """`run/best/pretrained_model`: a small ACT."""
-    from ..cli.made_runs import make_policy
-
     make_policy(folder / "run" / "best" / "pretrained_model")
 
 
@@ -26,12 +33,6 @@ def make_mlp(folder: Path) -> None:
 
 
 def _fit(folder: Path, *, resume: bool, init_from: Path | None = None) -> None:
-    from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.learn.fit_config import FitConfig
-    from manip_il.learn.train import fit
-
-    from ..cli.made_runs import ENV
-
     spec, rng = env_spec(ENV), np.random.default_rng(0)
     state = rng.normal(size=(ROWS, len(spec.joint_names))).astype(np.float32)
     table = {
@@ -53,21 +54,11 @@ def _resume(folder: Path) -> None:
 
 def _load(folder: Path) -> None:
     """What `eval` does with a policy before the first episode."""
-    from manip_il.cli.inputs import check_policy, find_policy
-    from manip_il.learn.checkpoint import read_meta
-
-    from ..cli.made_runs import ENV
-
     path = find_policy(folder / "run")
     check_policy(path, read_meta(path), ENV)
 
 
 def _describe(folder: Path) -> None:
-    from manip_il.cli.inputs import find_policy
-    from manip_il.engine.environments import policy_sha256
-    from manip_il.learn.pretrained import read_interface
-    from manip_il.store.cards import card_for
-
     path = find_policy(folder / "run")
     read_interface(path)
     policy_sha256(path)
@@ -78,13 +69,9 @@ def _warm_start(folder: Path) -> None:
     _fit(folder / "warm", resume=False, init_from=folder / _MLP)
 
 
-def _push(folder: Path) -> None:
-    command("push", str(folder / "run"), f"file://{folder}/store")
-
-
 _ACT, _MLP = "run/best/pretrained_model", "run/checkpoints/000002/pretrained_model"
 _STATE = "run/checkpoints/000002/training_state"
-_READS = (_load, _load, _describe, _push)
+_READS = (_load, _load, _describe, runs("push", "{folder}/run", "file://{folder}/store"))
 TARGETS = (
     Target("act config.json", make_act, f"{_ACT}/config.json", mutate_json, _READS, share=0.3),
     Target("act preprocessor", make_act, f"{_ACT}/policy_preprocessor.json", mutate_json, _READS, share=0.3),

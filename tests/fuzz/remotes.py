@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
-import threading
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from random import Random
 from typing import Any
 from unittest import mock
 
-from .binary import damaged
+import boto3
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from manip_il.store.pull import pull
+from manip_il.store.push import push
+
+from ..store.hub_use import POLICY, a_hub, do_pull, do_push
+from ..store.s3 import KEY, SECRET, running_moto, running_proxy, variables
+from ..store.trees import impatient, no_wait, unwatched, wait_little
+from ..store.wire import Answer
 from .target import Target
-from .trees import mutate_json
+from .trees import damaged, mutate_json
 
 STATUSES = (
     *(200, 201, 204, 206, 301, 302, 304, 307, 400, 401, 402, 403, 404, 408, 409, 412, 413, 416, 429, 500, 503, 507),
@@ -28,25 +38,8 @@ HEADERS = (
 )
 VALUES = (
     *("", "x", "0", "-1", "9" * 400, "../x", '"../../x"', "bytes 0-9/3", "bytes */0", "gzip", "br", "a" * 20_000),
-    *(
-        "http://127.0.0.1:9/x",
-        '</x>; rel="next"',
-        '<http://127.0.0.1:9/>; rel="next"',
-        "Thu, 99 Jan 9999",
-        "NaN",
-        "1e9",
-    ),
-    *(
-        "NaN",
-        "1e9",
-        "\x1b[31mred",
-        "text/html",
-        "0" * 40,
-        '"' + "0" * 64 + '"',
-        "RepoNotFound",
-        "GatedRepo",
-        "EntryNotFound",
-    ),
+    *("http://127.0.0.1:9/x", '</x>; rel="next"', '<http://127.0.0.1:9/>; rel="next"', "NaN", "1e9", "text/html"),
+    *("Thu, 99 Jan 9999", "\x1b[31mred", "0" * 40, f'"{64 * "0"}"', "RepoNotFound", "GatedRepo", "EntryNotFound"),
 )
 
 
@@ -63,23 +56,16 @@ class Script:
     at: int
     seed: int
     always: bool
-
-    def __post_init__(self) -> None:
-        self._count, self._lock = 0, threading.Lock()
+    answers: Iterator[int] = field(default_factory=itertools.count)
 
     @classmethod
     def read(cls, path: Path) -> Script:
         tree = json.loads(path.read_text())
         return cls(tree["at"], tree["seed"], tree["always"]) if "at" in tree else cls(-1, 0, False)
 
-    @property
-    def count(self) -> int:
-        return self._count
-
     def change(self, status: int, headers: dict[str, str], body: bytes) -> tuple[int, dict[str, str], bytes]:
         """What goes out in place of an answer."""
-        with self._lock:
-            number, self._count = self._count, self._count + 1
+        number = next(self.answers)
         if self.at < 0 or number < self.at or (number > self.at and not self.always):
             return status, headers, body
         rng = Random(f"{self.seed}/{number}")
@@ -104,9 +90,6 @@ def _changed_body(rng: Random, body: bytes) -> bytes:
 
 def make_small_policy(folder: Path) -> Path:
     """What is pushed and pulled: as few bytes as a policy has."""
-    import numpy as np
-    from safetensors.numpy import save_file
-
     folder.mkdir(parents=True)
     feature = {"type": "STATE", "shape": [2]}
     config = {"type": "mlp", "input_features": {"observation.state": feature}, "output_features": {"action": feature}}
@@ -132,12 +115,8 @@ class HubConversation(Conversation):
 
     @contextlib.contextmanager
     def around(self, folder: Path) -> Iterator[None]:
-        from huggingface_hub.utils import _http
-
-        from ..store.hub_use import POLICY, a_hub, do_push
-        from ..store.hub_wire import Answer
-
-        with a_hub(folder / "hub") as hub, _no_waiting(_http):
+        with a_hub(folder / "hub") as hub, pytest.MonkeyPatch.context() as patch:
+            wait_little(patch)  # huggingface_hub's own waits between tries cost seconds
             self._script, honest = Script(-1, 0, False), hub.answer
             do_push(make_small_policy(folder / "first"), POLICY)
 
@@ -151,14 +130,10 @@ class HubConversation(Conversation):
             yield
 
     def pull(self, folder: Path) -> None:
-        from ..store.hub_use import POLICY, do_pull
-
         self._script = Script.read(folder / "script.json")
         do_pull(folder / "pulled", POLICY)
 
     def push(self, folder: Path) -> None:
-        from ..store.hub_use import do_push
-
         self._script = Script.read(folder / "script.json")
         kept = {name: repo for name, repo in self._hub.repos.items() if name.endswith("/policy")}
         self._hub.repos.clear()
@@ -174,10 +149,6 @@ class S3Conversation(Conversation):
 
     @contextlib.contextmanager
     def around(self, folder: Path) -> Iterator[None]:
-        import boto3
-
-        from ..store.s3 import KEY, SECRET, running_moto, running_proxy, variables
-
         with running_moto() as moto, running_proxy(moto) as proxy, mock.patch.dict("os.environ", variables(proxy.url)):
             client = boto3.client("s3", endpoint_url=moto, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
             client.create_bucket(Bucket="fuzz")
@@ -187,10 +158,6 @@ class S3Conversation(Conversation):
             yield
 
     def pull(self, folder: Path) -> None:
-        from manip_il.store.pull import pull
-
-        from ..store.trees import impatient, no_wait, unwatched
-
         self._script = Script.read(folder / "script.json")
         url, remote = impatient("s3://fuzz/policy")
         pull(url, remote, folder / "pulled", unwatched, retry=no_wait())
@@ -200,21 +167,8 @@ class S3Conversation(Conversation):
         self._push_to(f"s3://fuzz/push-{self._pushes}", folder / "policy")
 
     def _push_to(self, url: str, source: Path) -> None:
-        from manip_il.store.push import push
-
-        from ..store.trees import impatient, unwatched
-
         parsed, remote = impatient(url)
         push(source, parsed, remote, unwatched)
-
-
-@contextlib.contextmanager
-def _no_waiting(module: Any) -> Iterator[None]:
-    """huggingface_hub's own waits between tries cost seconds."""
-    clock = mock.Mock(wraps=time)
-    clock.sleep = lambda seconds: None
-    with mock.patch.object(module, "time", clock):
-        yield
 
 
 _PULL, _PUSH, _S3_PULL, _S3_PUSH = HubConversation(12), HubConversation(30), S3Conversation(10), S3Conversation(20)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import shutil
 import time
 import traceback
@@ -21,10 +22,6 @@ LARGEST = 1024  # [MB] beyond what the process held before
 Read = Callable[[Path], object]
 
 
-def _no_server(folder: Path) -> AbstractContextManager[object]:
-    return nullcontext()
-
-
 @dataclass(frozen=True)
 class Target:
     """A file of a folder, and who reads it.
@@ -39,19 +36,21 @@ class Target:
     file: str
     mutate: Callable[[Random, bytes], bytes]
     reads: tuple[Read, ...]
-    around: Callable[[Path], AbstractContextManager[object]] = _no_server
+    around: Callable[[Path], AbstractContextManager[object]] = lambda folder: nullcontext()
     share: float = 1.0
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of one input. problem: empty, or what is wrong with how it ended, a traceback behind it."""
+    """What came of one input. line: of its refusal, empty where it was accepted.
 
-    accepted: bool
+    problem: empty, or what is wrong with how it ended, a traceback behind it.
+    """
+
     line: str
     seconds: float
     megabytes: float
-    problem: str = ""
+    problem: str
 
 
 def command(*words: str) -> None:
@@ -60,6 +59,11 @@ def command(*words: str) -> None:
     options = parse(load(name), list(words[len(name.split()) :]))
     with contextlib.redirect_stdout(io.StringIO()):
         options.run()
+
+
+def runs(*words: str) -> Read:
+    """A command; `{folder}` in its words is where the files are."""
+    return lambda folder: command(*(word.format(folder=folder) for word in words))
 
 
 class Bench:
@@ -81,19 +85,21 @@ class Bench:
         shutil.copytree(self.base, self.work, symlinks=True)
         (self.work / self.file).write_bytes(data)
         read = self.target.reads[number % len(self.target.reads)]
-        before, started = _reset_peak(), time.perf_counter()
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # forget the process' peak of memory
+        before, started = _memory("VmRSS"), time.perf_counter()
         line, problem = "", ""
         try:
             with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
                 read(self.work)
+        except KeyboardInterrupt:
+            raise
         except BaseException as error:
-            if isinstance(error, KeyboardInterrupt):
-                raise
             line, problem = _line_of(error)
-        seconds, megabytes = time.perf_counter() - started, max(_peak() - before, 0.0)
+        seconds, megabytes = time.perf_counter() - started, max(_memory("VmHWM") - before, 0.0)
         if megabytes > LARGEST:
             problem = problem or f"took {megabytes:.0f} MB, more than {LARGEST}"
-        return Attempt(not line, line, seconds, megabytes, problem)
+        return Attempt(line, seconds, megabytes, problem)
 
 
 @contextlib.contextmanager
@@ -106,7 +112,7 @@ def bench(target: Target, folder: Path) -> Iterator[Bench]:
         made = Bench(target, base, folder / "work")
         for number in range(len(target.reads)):
             tried = made.attempt(made.valid, number)
-            if tried.problem or not tried.accepted:
+            if tried.problem or tried.line:
                 raise RuntimeError(f"{target.name}: what is valid was refused: {tried.line}\n{tried.problem}")
         yield made
 
@@ -125,19 +131,7 @@ def _line_of(error: BaseException) -> tuple[str, str]:
     return line, ""
 
 
-def _reset_peak() -> float:
-    """Forget the process' peak of memory; what it holds now [MB]."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
-
-
-def _peak() -> float:
-    return _status("VmHWM")
-
-
-def _status(name: str) -> float:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{name}:"):
-            return int(line.split()[1]) / 1024
-    return 0.0
+def _memory(name: str) -> float:
+    """What the process holds, or held at most [MB]."""
+    found = re.search(rf"^{name}:\s+(\d+) kB", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(found.group(1)) / 1024 if found else 0.0

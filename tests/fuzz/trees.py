@@ -1,4 +1,4 @@
-"""Mutations of JSON and YAML: types swapped, values removed, added, enlarged, nested; and texts that no tree gives."""
+"""Mutations of bytes, JSON and YAML: types swapped, values removed, added, nested; and texts that no tree gives."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from typing import Any
 
 import yaml
 
-from .binary import damaged
-
 Path = list[Any]  # keys and indices from the root
 
+LENGTHS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFFFFFF, 0xFFFFFFFF, 2**40, 2**63 - 1, 2**64 - 1)
 DEEP = 20_000  # levels; Python's own limit is 1,000
 _MARK = "@@RAW@@"  # in place of a text that no dumper writes
 _RAW = (
@@ -44,6 +43,51 @@ ODD: tuple[Any, ...] = (
     *("x" * 100_000, "9" * 5_000, [], {}, [[]], [None], {"": None}, {"type": None}, [1, "a", None]),
     *([0] * 2_000, {str(number): number for number in range(2_000)}),
 )
+
+
+def damaged(rng: Random, data: bytes) -> bytes:
+    """The bytes with one to four changes: flipped, cut, doubled, spliced, overwritten by a length."""
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        data = rng.choice(_DAMAGES)(rng, data)
+    return data
+
+
+def _flip(rng: Random, data: bytes) -> bytes:
+    place = rng.randrange(len(data) + 1)
+    return data[:place] + bytes([(data[place : place + 1] or b"\0")[0] ^ (1 << rng.randrange(8))]) + data[place + 1 :]
+
+
+def _cut(rng: Random, data: bytes) -> bytes:
+    place = rng.randrange(len(data) + 1)
+    return rng.choice((data[:place], data[place:], b""))
+
+
+def _repeat(rng: Random, data: bytes) -> bytes:
+    start = rng.randrange(len(data) + 1)
+    piece = data[start : start + rng.choice((1, 8, 200))]
+    return data[:start] + piece * rng.choice((2, 10, 1_000)) + data[start:]
+
+
+def _splice(rng: Random, data: bytes) -> bytes:
+    there, here, size = (rng.randrange(len(data) + 1) for _ in range(3))
+    piece = data[there : there + min(size, 500)]
+    return data[:here] + piece + data[here + len(piece) :]
+
+
+def _length(rng: Random, data: bytes) -> bytes:
+    size = rng.choice((1, 2, 4, 8))
+    value = rng.choice(LENGTHS) % 2 ** (8 * size)
+    anywhere, head = rng.randrange(len(data) + 1), rng.randrange(min(len(data), 64) + 1)
+    place = rng.choice((anywhere, head, max(len(data) - rng.randrange(64), 0)))
+    return data[:place] + value.to_bytes(size, rng.choice(("little", "big"))) + data[place + size :]
+
+
+def _noise(rng: Random, data: bytes) -> bytes:
+    place = rng.randrange(len(data) + 1)
+    return data[:place] + rng.randbytes(rng.choice((1, 16, 300))) + data[place:]
+
+
+_DAMAGES = (_flip, _flip, _cut, _repeat, _splice, _length, _length, _noise)
 
 
 def mutate_json(rng: Random, data: bytes) -> bytes:

@@ -31,8 +31,8 @@ def table(gapped):
 @pytest.fixture
 def meta(dataset, spec):
     """What LeRobot knows of a dataset with two cameras, a tenth of whose labels are invalid; it has no videos."""
-    seen = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
-    return SimpleNamespace(features=features(seen), root=dataset.root, stats={})
+    pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE))
+    return SimpleNamespace(features=features(pictured), root=dataset.root, stats={})
 
 
 def new_policy(meta, observation: str = "images", **options) -> CNNPolicy:
@@ -151,9 +151,9 @@ def test_saved_and_loaded_by_lerobot_it_acts_bit_equal(meta, table, tmp_path):
     again = get_policy_class("cnn").from_pretrained(tmp_path / "policy", strict=True)
     before, after = make_pre_post_processors(again.config, pretrained_path=str(tmp_path / "policy"))
     expected = policy.eval().select_action(batch)
-    seen = {key: batch[key] for key in again.config.input_features or {}}
+    inputs = {key: batch[key] for key in again.config.input_features or {}}
     for row in range(3):  # unbatched, as a robot gives them
-        action = after(again.select_action(before({key: value[row] for key, value in seen.items()})))
+        action = after(again.select_action(before({key: value[row] for key, value in inputs.items()})))
         assert torch.equal(action, expected[row : row + 1])
 
 
@@ -212,11 +212,10 @@ def test_features_that_do_not_fit_are_refused_in_one_line(meta):
     del config.input_features["observation.state"]
     with pytest.raises(UsageError, match=r"cnn policy needs observation\.state and action"):
         CNNPolicy(config)
-    narrow = meta.features | {"action": meta.features["action"] | {"shape": (3,)}}
-    with pytest.raises(MismatchError, match=r"\(4,\).*\(3,\)"):
-        new_policy(SimpleNamespace(features=narrow, root=meta.root, stats={}))
-    grey = meta.features["observation.images.front"] | {"shape": (SIDE, SIDE, 1)}
-    with pytest.raises(MismatchError, match=r"images\.front has \(1, 32, 32\)"):
-        new_policy(
-            SimpleNamespace(features=meta.features | {"observation.images.front": grey}, root=meta.root, stats={})
-        )
+    for key, shape, words in (
+        ("action", (3,), r"\(4,\).*\(3,\)"),
+        ("observation.images.front", (SIDE, SIDE, 1), r"images\.front has \(1, 32, 32\)"),
+    ):
+        columns = meta.features | {key: meta.features[key] | {"shape": shape}}
+        with pytest.raises(MismatchError, match=words):
+            new_policy(SimpleNamespace(features=columns, root=meta.root, stats={}))

@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.error import URLError
 
 import numpy as np
@@ -13,10 +15,13 @@ from accelerate.state import AcceleratorState
 from huggingface_hub import ModelCard
 
 from manip_il.cli.main import main
+from manip_il.cli.outputs import read_jsonl
 from manip_il.data.lerobot_library import lerobot_windows, read_metadata
 from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
+from manip_il.learn import train
 from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.fit_policy import PolicyTrainer
 from manip_il.learn.lerobot_config import policy_config, set_features
@@ -24,19 +29,9 @@ from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.samples import LibrarySource, MemorySource, Samples, load_samples
 
-from .tiny_policies import ACT
+from .tiny_policies import ACT, DIFFUSION
 
-DIFFUSION = {
-    "type": "diffusion",
-    "device": "cpu",
-    "horizon": 8,
-    "n_action_steps": 4,
-    "down_dims": [8, 16],
-    "n_groups": 4,
-    "diffusion_step_embed_dim": 8,
-    "num_train_timesteps": 10,
-}
-SEEN = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
+VISION = {**ACT, "pretrained_backbone_weights": None, "use_vae": False}
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +42,9 @@ def demos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory) -> Path:
+def pictures(tmp_path_factory) -> Path:
     """Demonstrations with pictures."""
-    root = tmp_path_factory.mktemp("seen") / "d"
+    root = tmp_path_factory.mktemp("pictures") / "d"
     words = ["--cameras=front,wrist", "--image.height=64", "--image.width=64", "--task.type=reach"]
     assert main(["record", f"--dataset.root={root}", "--dataset.num_episodes=2", "--workers=1", *words]) == 0
     return root
@@ -72,6 +67,11 @@ def fit(root: Path, folder: Path, settings=ACT, stop_after: int | None = None, r
     return PolicyTrainer(root, config(settings, **changes), folder, spec=read_spec(root), resume=resume).fit(step)
 
 
+def records(folder: Path) -> list[dict[str, Any]]:
+    """The metrics of a run."""
+    return read_jsonl(folder / "metrics.jsonl")
+
+
 def saved(folder: Path) -> dict[str, bytes]:
     last = folder / "checkpoints" / "last"
     return {p.name: p.read_bytes() for p in sorted(last.rglob("*.safetensors"))}
@@ -88,11 +88,9 @@ def test_a_resumed_fit_ends_with_the_same_bits(demos, tmp_path, settings) -> Non
     assert "model.safetensors" in straight
     assert "optimizer_state.safetensors" in straight
     assert straight == stopped
-    steps = [json.loads(line) for line in (tmp_path / "stopped/metrics.jsonl").read_text().splitlines()]
-    expected = [json.loads(line) for line in (tmp_path / "straight/metrics.jsonl").read_text().splitlines()]
-    assert [(r["step"], r["loss"], r["val_loss"]) for r in steps] == [
-        (r["step"], r["loss"], r["val_loss"]) for r in expected
-    ]
+    keys = ("step", "loss", "val_loss")
+    one, other = ([[r[key] for key in keys] for r in records(tmp_path / name)] for name in ("straight", "stopped"))
+    assert one == other
 
 
 def test_metrics_and_checkpoints_do_not_change_the_weights(demos, tmp_path) -> None:
@@ -103,17 +101,16 @@ def test_metrics_and_checkpoints_do_not_change_the_weights(demos, tmp_path) -> N
 
 def test_a_fit_lowers_the_loss(demos, tmp_path) -> None:
     fit(demos, tmp_path / "r", {**ACT, "use_vae": False}, steps=60, log_freq=20, save_freq=60, lr=3e-3)
-    records = [json.loads(line) for line in (tmp_path / "r/metrics.jsonl").read_text().splitlines()]
-    assert [record["step"] for record in records] == [20, 40, 60]
-    assert records[-1]["loss"] < 0.7 * records[0]["loss"]
-    assert records[-1]["val_loss"] < records[0]["val_loss"]
-    assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss"} <= records[0].keys()
+    first, second, last = records(tmp_path / "r")
+    assert [record["step"] for record in (first, second, last)] == [20, 40, 60]
+    assert last["loss"] < 0.7 * first["loss"]
+    assert last["val_loss"] < first["val_loss"]
+    assert {"grad_norm", "lr", "samples_per_s", "data_share", "l1_loss"} <= first.keys()
 
 
 def acts(path: Path) -> bytes:
     """What the policy in a folder does in six states of three episodes."""
-    rng = np.random.default_rng(0)
-    policy = LearnedPolicy.load(path)
+    rng, policy = np.random.default_rng(0), LearnedPolicy.load(path)
     states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 25))
     actions = [
         policy.act(joints.astype(np.float32), scene.astype(np.float32), episodes=[5, 6, 7])
@@ -135,9 +132,12 @@ print(*(acts(Path(path)).hex() for path in sys.argv[1:]))
 @pytest.mark.slow
 def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, demos, tmp_path) -> None:
     paths = [fit(demos, tmp_path / settings["type"], settings) for settings in (ACT, DIFFUSION)]
+    table = read_table(demos, LEARNING_COLUMNS)
+    paths.append(train.fit(table, FitConfig(steps=4, batch_size=8), tmp_path / "mlp", spec=read_spec(demos)))
     done = warm_lerobot.run("python", "-c", ACTS, *paths)
     assert done.returncode == 0, done.stderr
-    fresh = [bytes.fromhex(word) for word in done.stdout.splitlines()[-1].split()]
+    [line] = done.stdout.splitlines()  # loading prints nothing
+    fresh = [bytes.fromhex(word) for word in line.split()]
     assert fresh == [acts(path) for path in paths]
     # Diffusion draws: in a rollout alone its generator is seeded by the episode.
     trainer = PolicyTrainer(demos, config(ACT), tmp_path / "act", spec=read_spec(demos), resume=True)
@@ -167,20 +167,20 @@ def test_held_out_episodes_are_never_learnt_from(demos) -> None:
     assert len(np.unique(episodes[samples.train])) == 3
 
 
-@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
-def test_a_batch_from_memory_is_lerobots_batch(demos, settings) -> None:
-    _same_batches(demos, settings, "state")
-
-
-@pytest.mark.slow
-@pytest.mark.gl
-@pytest.mark.parametrize("observation", ["images", "both"])
-def test_a_batch_from_the_cache_is_lerobots_batch(seen, observation, tmp_path, monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("dataset", "settings", "observation"),
+    [
+        pytest.param("demos", ACT, "state", id="act"),
+        pytest.param("demos", DIFFUSION, "state", id="diffusion"),
+        pytest.param("pictures", VISION, "images", id="images", marks=[pytest.mark.slow, pytest.mark.gl]),
+        pytest.param("pictures", VISION, "both", id="both", marks=[pytest.mark.slow, pytest.mark.gl]),
+    ],
+)
+def test_a_batch_from_memory_and_the_cache_is_lerobots(
+    request, dataset, settings, observation, tmp_path, monkeypatch
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    _same_batches(seen, SEEN, observation)
-
-
-def _same_batches(root: Path, settings, observation: str) -> None:
+    root = request.getfixturevalue(dataset)
     meta, source = read_metadata(root), loaded(root, config(settings), observation).source
     assert isinstance(source, MemorySource)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in source.windows.deltas.items()}
@@ -200,25 +200,22 @@ def _same_batches(root: Path, settings, observation: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.gl
-def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(seen, tmp_path, monkeypatch) -> None:
+def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(pictures, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     one = {"observation": "images", "batch_size": 4, "steps": 2, "image_augment": False}
-    fit(seen, tmp_path / "cached", SEEN, **one)
+    fit(pictures, tmp_path / "cached", VISION, **one)
     assert list((tmp_path / "cache").rglob("*"))
-    fit(seen, tmp_path / "loaded", SEEN, **one, image_cache_gb=0.0, num_workers=0)
-    ours, theirs = (
-        [json.loads(line)["loss"] for line in (tmp_path / name / "metrics.jsonl").read_text().splitlines()]
-        for name in ("cached", "loaded")
-    )
+    fit(pictures, tmp_path / "loaded", VISION, **one, image_cache_gb=0.0, num_workers=0)
+    ours, theirs = ([record["loss"] for record in records(tmp_path / name)] for name in ("cached", "loaded"))
     assert ours == pytest.approx(theirs, rel=1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.gl
-def test_a_cnn_is_trained_and_evaluated_on_the_pictures_that_it_saw(seen, tmp_path, monkeypatch, capfd) -> None:
+def test_a_cnn_is_trained_and_evaluated_on_the_pictures_that_it_saw(pictures, tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     run, small = tmp_path / "r", ["--policy.channels=[4, 8]", "--policy.keypoints=4", "--policy.width=8"]
-    words = ["train", f"--dataset.root={seen}", "--policy.type=cnn", *small, "--batch_size=4", "--steps=2"]
+    words = ["train", f"--dataset.root={pictures}", "--policy.type=cnn", *small, "--batch_size=4", "--steps=2"]
     assert main([*words, f"--output_dir={run}"]) == 0
     evaluate = ["eval", f"--policy.path={run}", "--eval.n_episodes=1", "--env.horizon=6", "--workers=1"]
     evaluate.append("--eval.films=0")
@@ -227,13 +224,11 @@ def test_a_cnn_is_trained_and_evaluated_on_the_pictures_that_it_saw(seen, tmp_pa
     assert result["fingerprint"]["cameras_sha256"]
     assert result["episodes"][0]["steps"] == 6
     assert main([*evaluate, "--robot.type=fetch", f"--output_dir={tmp_path / 'other'}"]) == 1
-    error = capfd.readouterr().err.strip().splitlines()[-1]
-    assert "panda" in error
-    assert "fetch" in error
+    assert re.search("panda.*fetch|fetch.*panda", capfd.readouterr().err.strip().splitlines()[-1])
     assert not (tmp_path / "other").exists()
 
 
-def test_a_run_that_is_there_is_not_trained_over(demos, tmp_path) -> None:
+def test_a_run_is_neither_trained_over_nor_continued_with_other_options_or_data(demos, tmp_path) -> None:
     fit(demos, tmp_path / "r")
     with pytest.raises(FolderExistsError):
         fit(demos, tmp_path / "r")
@@ -241,10 +236,6 @@ def test_a_run_that_is_there_is_not_trained_over(demos, tmp_path) -> None:
         fit(demos, tmp_path / "r", resume=True, batch_size=4)
     with pytest.raises(MismatchError, match="policy"):
         fit(demos, tmp_path / "r", {**ACT, "dropout": 0.0}, resume=True)
-
-
-def test_a_run_is_not_gone_on_with_on_other_data(demos, tmp_path) -> None:
-    fit(demos, tmp_path / "r")
     other = tmp_path / "other"
     assert main(["record", f"--dataset.root={other}", "--dataset.num_episodes=4", "--workers=1"]) == 0
     with pytest.raises(MismatchError, match="training data"):
@@ -258,15 +249,8 @@ def test_a_backbone_that_cannot_be_downloaded_is_one_line_with_two_ways_out(demo
     monkeypatch.setattr("manip_il.learn.lerobot_policy.make_policy", no_network)
     with pytest.raises(ManipError) as raised:
         fit(demos, tmp_path / "r")
-    text = str(raised.value)
-    assert "--policy.pretrained_backbone_weights=null" in text
-    assert "checkpoints" in text
-    assert "ResNet18_Weights" in text
-
-
-def test_what_a_policy_cannot_see_is_named(demos, tmp_path) -> None:
-    with pytest.raises(ManipError, match="--cameras"):
-        fit(demos, tmp_path / "r", observation="images")
+    for word in ("--policy.pretrained_backbone_weights=null", "checkpoints", "ResNet18_Weights"):
+        assert word in str(raised.value)
 
 
 def test_a_column_that_hardly_moves_is_not_blown_up() -> None:
@@ -279,19 +263,12 @@ def test_a_column_that_hardly_moves_is_not_blown_up() -> None:
 
 def test_a_checkpoint_has_lerobots_layout_and_a_card(demos, tmp_path) -> None:
     path = fit(demos, tmp_path / "r")
-    assert {
-        "config.json",
-        "model.safetensors",
-        "train_config.json",
-        "policy_preprocessor.json",
-        "policy_postprocessor.json",
-        "manip_il.json",
-        "README.md",
-    } <= {p.name for p in path.iterdir()}
+    made = {file.name for file in path.iterdir()}
+    assert {"config.json", "model.safetensors", "train_config.json", "manip_il.json", "README.md"} <= made
+    assert {"policy_preprocessor.json", "policy_postprocessor.json"} <= made
     assert json.loads((path / "config.json").read_text())["pretrained_backbone_weights"] is None
     card = ModelCard.load(path / "README.md")
-    assert card.data.to_dict()["library_name"] == "lerobot"
-    assert card.data.to_dict()["pipeline_tag"] == "robotics"
+    assert card.data.to_dict().items() >= {"library_name": "lerobot", "pipeline_tag": "robotics"}.items()
     assert "5 episodes" in card.text
     assert "val_loss" in card.text
     assert str(tmp_path) not in card.text
@@ -301,15 +278,9 @@ def test_a_checkpoint_has_lerobots_layout_and_a_card(demos, tmp_path) -> None:
     assert replace(meta, options={}) == CheckpointMeta.of(read_spec(demos))
 
 
-def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("WANDB_DIR", str(tmp_path))
-    fit(demos, tmp_path / "r", tensorboard=True, wandb={"enable": True, "mode": "offline", "disable_artifact": True})
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(tmp_path / "r" / "tensorboard"))
-    events.Reload()
-    assert [point.step for point in events.Scalars("loss")] == [1, 2, 3, 4]
-    assert list((tmp_path / "r" / "wandb").glob("offline-run-*"))
+def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, curves) -> None:
+    fit(demos, tmp_path / "r", **curves.options)
+    assert curves.steps(tmp_path / "r") == [1, 2, 3, 4]
 
 
 def test_a_checkpoint_to_start_from_that_does_not_fit_is_one_line(demos, tmp_path) -> None:
@@ -356,13 +327,10 @@ def test_half_precision_trains_in_bfloat16_on_a_cpu(demos, tmp_path) -> None:
     assert json.loads((path / "config.json").read_text())["use_amp"] is True
 
 
-def test_a_policy_starts_from_a_checkpoints_weights(demos, tmp_path) -> None:
+def test_a_policy_starts_from_a_checkpoints_weights(demos, tmp_path, weights) -> None:
     first = fit(demos, tmp_path / "first")
-    settings = {"path": str(first)}
-    second = fit(demos, tmp_path / "second", settings, steps=1, lr=1e-12)
-    from safetensors.torch import load_file
-
-    before, after = load_file(first / "model.safetensors"), load_file(second / "model.safetensors")
+    second = fit(demos, tmp_path / "second", {"path": str(first)}, steps=1, lr=1e-12)
+    before, after = weights(first), weights(second)
     assert all(torch.allclose(before[name], after[name], atol=1e-6) for name in before)
 
 
@@ -378,16 +346,10 @@ sys.exit(max(elastic_launch(config, main)(sys.argv[1:]).values()))
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, demos, tmp_path) -> None:
+def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, demos, tmp_path, weights) -> None:
     """Every process takes its share of the batch; the gradients are averaged."""
-    words = [
-        "train",
-        f"--dataset.root={demos}",
-        "--steps=3",
-        "--save_freq=3",
-        "--optimizer.type=sgd",
-        "--optimizer.lr=0.001",
-    ]
+    words = ["train", f"--dataset.root={demos}", "--steps=3", "--save_freq=3"]
+    words += ["--optimizer.type=sgd", "--optimizer.lr=0.001"]
     words += [f"--policy.{k}={json.dumps(v) if not isinstance(v, str) else v}" for k, v in ACT.items()]
     # One action a chunk: ACT's mean over all that is no padding is then the mean of the shares' means.
     words += ["--policy.use_vae=false", "--policy.dropout=0.0", "--policy.chunk_size=1", "--policy.n_action_steps=1"]
@@ -397,9 +359,7 @@ def test_two_processes_learn_what_one_learns_from_both_shares(warm_lerobot, demo
     assert done.stdout.count("checkpoint:") == 1
     assert done.stderr.count("3/3") == 1
     assert main([*words, "--batch_size=8", f"--output_dir={tmp_path / 'one'}"]) == 0
-    from safetensors.torch import load
-
-    one, both = (load(saved(folder)["model.safetensors"]) for folder in (tmp_path / "one", two))
+    one, both = (weights(run / "checkpoints/last/pretrained_model") for run in (tmp_path / "one", two))
     assert all(torch.allclose(one[name], both[name], atol=1e-5) for name in one)
 
 

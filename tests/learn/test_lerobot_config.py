@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
 
 import pytest
 import torch
@@ -25,9 +24,13 @@ from manip_il.learn.lerobot_config import (
 )
 from manip_il.learn.pretrained import observation_of
 
+STATES = ["observation.state", "observation.environment_state"]
+PICTURES = ["observation.images.front", "observation.images.wrist"]
 
-def test_every_policy_of_lerobot_and_ours_is_known() -> None:
+
+def test_every_policy_of_lerobot_and_ours_is_known_also_from_the_text_of_their_files() -> None:
     assert {"act", "diffusion", "vqbet", "smolvla", "pi0", "mlp", "cnn"} <= set(policy_types())
+    assert tuple(sorted(policy_files())) == policy_types()
 
 
 def test_options_have_lerobots_names_and_types() -> None:
@@ -77,21 +80,20 @@ def test_optimisers_and_schedules_by_their_type() -> None:
 def test_a_checkpoint_gives_its_options_and_they_can_be_changed(tmp_path) -> None:
     policy_config({"type": "act", "chunk_size": 7, "n_action_steps": 5, "device": "cpu"})._save_pretrained(tmp_path)
     (tmp_path / "model.safetensors").touch()
-    config = policy_config({"path": str(tmp_path), "n_action_steps": 2})
-    assert isinstance(config, ACTConfig)
-    assert (config.chunk_size, config.n_action_steps) == (7, 2)
-    assert config.pretrained_path == tmp_path
+    for changes, sizes in (({}, (7, 5)), ({"n_action_steps": 2}, (7, 2)), ({"chunk_size": 2}, (2, 2))):
+        config = policy_config({"path": str(tmp_path), "device": "cpu"} | changes)
+        assert isinstance(config, ACTConfig)
+        assert (config.chunk_size, config.n_action_steps) == sizes
+        assert config.pretrained_path == tmp_path
+    longer = policy_config({"type": "act", "chunk_size": 200, "device": "cpu"})
+    assert isinstance(longer, ACTConfig)
+    assert longer.n_action_steps == 100
 
 
 def test_the_help_lists_a_policys_options() -> None:
     rows = dict(option_lines("act"))
     assert rows["--policy.chunk_size"] == "100"
     assert "--policy.push_to_hub" not in rows
-
-
-def actions(config: Any) -> int:
-    """The actions that are taken of a plan."""
-    return config.n_action_steps
 
 
 PLANS = {
@@ -117,7 +119,7 @@ PLANS = {
 def test_no_more_actions_are_taken_of_a_plan_than_it_has(kind) -> None:
     option, plan, taken = PLANS[kind]
     config = policy_config({"type": kind, option: plan, "device": "cpu"}, trust=True)
-    assert (getattr(config, option), actions(config)) == (plan, taken)
+    assert (getattr(config, option), vars(config)["n_action_steps"]) == (plan, taken)
 
 
 def test_a_policy_that_plans_and_is_not_above_is_new_in_lerobot() -> None:
@@ -125,22 +127,9 @@ def test_a_policy_that_plans_and_is_not_above_is_new_in_lerobot() -> None:
     assert plan == {*PLANS, "eo1"}  # eo1 cannot be made without transformers
 
 
-def test_what_the_user_gives_stays_as_it_is(tmp_path) -> None:
-    config = policy_config({"type": "act", "chunk_size": 10, "n_action_steps": 3, "device": "cpu"})
-    assert actions(config) == 3
-    assert actions(policy_config({"type": "act", "chunk_size": 200, "device": "cpu"})) == 100
-    config._save_pretrained(tmp_path)
-    (tmp_path / "model.safetensors").touch()
-    assert actions(policy_config({"path": str(tmp_path), "chunk_size": 2, "device": "cpu"})) == 2
-
-
 def test_packages_that_a_policy_needs_are_named() -> None:
     with pytest.raises(UsageError, match=r"--policy\.type=eo1: 'transformers' is required"):
         policy_config({"type": "eo1", "device": "cpu"}, trust=True)
-
-
-def test_the_policies_are_those_that_lerobot_registers():
-    assert tuple(sorted(policy_files())) == policy_types()
 
 
 @pytest.mark.parametrize("kind", policy_files())
@@ -179,33 +168,29 @@ def test_a_name_that_is_not_there_is_refused_with_the_nearest():
 @pytest.mark.parametrize(
     ("observation", "inputs"),
     [
-        ("state", ["observation.state", "observation.environment_state"]),
-        ("images", ["observation.state", "observation.images.front", "observation.images.wrist"]),
-        (
-            "both",
-            ["observation.state", "observation.environment_state"]
-            + ["observation.images.front", "observation.images.wrist"],
-        ),
+        ("state", STATES),
+        ("images", [STATES[0], *PICTURES]),
+        ("both", [*STATES, *PICTURES]),
     ],
 )
 def test_a_choice_is_its_columns_and_a_checkpoint_tells_it(observation, inputs, pictured):
-    seen, given = policy_features(features(pictured), observation)
-    assert list(seen) == inputs
-    assert list(given) == ["action"]
-    assert given["action"].shape == (4,)
-    assert observation_of(seen) == observation
+    observed, acted = policy_features(features(pictured), observation)
+    assert list(observed) == inputs
+    assert list(acted) == ["action"]
+    assert acted["action"].shape == (4,)
+    assert observation_of(observed) == observation
     assert observation_of(["observation.state"]) == "state"
 
 
 def test_pictures_are_channels_first_for_a_policy_and_kinds_are_lerobots(pictured):
     table = features(pictured)
     table["observation.state"] |= {"shape": [4]}  # as JSON has it
-    seen, given = policy_features(table, "both")
-    assert seen["observation.images.front"].shape == (3, 32, 48)
-    assert seen["observation.state"].shape == (4,)
+    observed, acted = policy_features(table, "both")
+    assert observed["observation.images.front"].shape == (3, 32, 48)
+    assert observed["observation.state"].shape == (4,)
     kinds = [FeatureType.STATE, FeatureType.ENV, FeatureType.VISUAL, FeatureType.VISUAL]
-    assert [feature.type for feature in seen.values()] == kinds
-    assert given["action"].type is FeatureType.ACTION
+    assert [feature.type for feature in observed.values()] == kinds
+    assert acted["action"].type is FeatureType.ACTION
 
 
 def test_what_is_missing_is_named_with_a_way_out(spec, pictured):

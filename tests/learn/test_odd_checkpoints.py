@@ -52,6 +52,12 @@ def mlp(table, spec, tmp_path) -> Path:
         ({"input_features": {"observation.state": {"type": {}, "shape": [4]}}}, "type of observation.state"),
         ({"input_features": {"observation.state": 4}}, "expected an object"),
         ({"output_features": {"action": {"type": "ACTION", "shape": 4}}}, "shape of action"),
+        (
+            {"input_features": {"observation.images.front": {"type": "VISUAL", "shape": [3, 32]}}},
+            "features that cannot be read",
+        ),
+        ({"output_features": {"move": {"type": "ACTION", "shape": [4]}}}, "features that cannot be read"),
+        ({"width": 32}, "do not match"),
         ({"input_features": {f"x{i}": {"type": "STATE", "shape": [1]} for i in range(1_000)}}, "1000 features"),
     ],
 )
@@ -80,11 +86,13 @@ def test_an_mlps_config_that_lacks_something(mlp):
         ({"vision_backbone": "x" * 20_000}, "vision_backbone is"),
         ({"normalization_mapping": 3}, "LeRobot cannot load it"),
         ({"dropout": "lots"}, "LeRobot cannot load it"),
+        ({"no_such_option": 3}, r"LeRobot cannot load it.*no_such_option"),
+        ({"dim_model": 32}, "do not match"),
     ],
 )
 def test_a_config_of_a_policy_of_lerobots(changes, words, act):
     edit_config(act, **changes)
-    refused(act, words)
+    refused(act, words, longest=600)
 
 
 @pytest.mark.parametrize("kind", PLAIN)
@@ -169,8 +177,12 @@ def test_a_processors_file(steps, words, act):
     path = act / "policy_postprocessor.json"
     path.write_text(json.dumps({"name": "x", "steps": steps}))
     refused(act, rf"policy_postprocessor\.json cannot be read: .*{words}")
-    path.write_text(DEEP)
-    refused(act, "nested too deeply")
+
+
+@pytest.mark.parametrize(("text", "words"), [(DEEP, "nested too deeply"), ("[", r"json is not valid JSON")])
+def test_a_processors_file_that_is_no_json(text, words, act):
+    (act / "policy_preprocessor.json").write_text(text)
+    refused(act, words)
 
 
 @pytest.mark.parametrize(

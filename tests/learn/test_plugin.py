@@ -16,11 +16,7 @@ from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
 
 
-def test_the_plugin_is_known_by_name_after_import():
-    assert type(make_policy_config("mlp")).__module__ == "manip_il.learn.mlp.configuration_mlp"
-
-
-def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset, gapped):
+def test_make_policy_takes_features_and_the_statistics_of_the_valid_relative_targets(dataset, gapped, tmp_path):
     policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
     assert isinstance(policy, MLPPolicy)
     valid = gapped["label_valid"][:, 0] != 0
@@ -28,6 +24,10 @@ def test_make_policy_takes_the_statistics_of_the_valid_relative_targets(dataset,
     np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
     np.testing.assert_allclose(policy.model.target_scale[:-1], relative.std(0), rtol=1e-4)
     assert sorted(policy.config.input_features) == ["observation.environment_state", "observation.state"]
+    policy.save_pretrained(tmp_path / "policy")
+    config = PreTrainedConfig.from_pretrained(tmp_path / "policy")
+    assert config.input_features["observation.environment_state"].type is FeatureType.ENV
+    assert config.output_features["action"].shape == (4,)
 
 
 def test_lerobots_batches_leave_out_frames_without_a_valid_label(dataset):
@@ -50,32 +50,20 @@ def test_features_that_do_not_fit_are_refused(dataset):
 
 
 @pytest.mark.slow
-def test_lerobot_train_gives_a_policy_that_acts_and_resumes(warm_lerobot, dataset, gapped, tmp_path):
+def test_a_run_of_lerobot_train_is_resumed_by_it(warm_lerobot, dataset, tmp_path):
     def lerobot_train(*options: str) -> None:
         run = warm_lerobot.run("lerobot-train", *options, "--policy.discover_packages_path=manip_il.learn.mlp")
         assert run.returncode == 0, run.stderr[-3000:]
 
     lerobot_train(
-        "--policy.type=mlp", "--policy.width=64", "--policy.optimizer_lr=5e-3", "--policy.scheduler_warmup_steps=10",
-        "--dataset.repo_id=manip/test", f"--dataset.root={dataset.root}", f"--output_dir={tmp_path / 'run'}",
-        "--steps=200", "--save_freq=100", "--batch_size=32", "--num_workers=0", "--prefetch_factor=null",
-        "--persistent_workers=false", "--wandb.enable=false",
+        "--policy.type=mlp", "--policy.width=64", "--policy.scheduler_warmup_steps=10", "--dataset.repo_id=manip/test",
+        f"--dataset.root={dataset.root}", f"--output_dir={tmp_path / 'run'}", "--steps=20", "--save_freq=10",
+        "--batch_size=32", "--num_workers=0", "--prefetch_factor=null", "--persistent_workers=false",
+        "--wandb.enable=false",
     )  # fmt: skip
-    last = tmp_path / "run/checkpoints/last/pretrained_model"
-    policy = LearnedPolicy.load(last)
-    actions = policy.act(gapped["observation.state"], gapped["observation.environment_state"])
-    relative = gapped["action"][:, :-1] - gapped["observation.state"][:, :-1]
-    assert np.abs(actions - gapped["action"])[:, :-1].mean() < 0.4 * np.abs(relative - relative.mean(0)).mean()
-
-    config = tmp_path / "run/checkpoints/000100/pretrained_model/train_config.json"
+    checkpoints = tmp_path / "run/checkpoints"
+    config = checkpoints / "000010/pretrained_model/train_config.json"
     assert json.loads(config.read_text())["policy"]["type"] == "mlp"
-    lerobot_train(f"--config_path={config}", "--resume=true", "--steps=110")
-    assert (tmp_path / "run/checkpoints/000110/pretrained_model/model.safetensors").is_file()
-
-
-def test_features_of_a_checkpoint_are_lerobots(dataset):
-    policy = make_policy(make_policy_config("mlp"), ds_meta=dataset.meta)
-    policy.save_pretrained(dataset.root / "policy")
-    config = PreTrainedConfig.from_pretrained(dataset.root / "policy")
-    assert config.input_features["observation.environment_state"].type is FeatureType.ENV
-    assert config.output_features["action"].shape == (4,)
+    lerobot_train(f"--config_path={config}", "--resume=true", "--steps=11")
+    for step in ("000011", "last"):
+        assert LearnedPolicy.load(checkpoints / step / "pretrained_model").interface.type == "mlp"

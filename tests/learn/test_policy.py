@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import socket
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
-from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.limits import threads
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
@@ -64,20 +61,6 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
         assert np.array_equal(action.numpy().astype(np.float64), fast)
 
 
-def test_a_fresh_process_acts_bit_equal(checkpoint, tmp_path):
-    states, environments = observations(9)
-    np.savez(tmp_path / "in.npz", states=states, environments=environments)
-    code = (
-        "import sys, numpy as np; from manip_il.learn.policy import LearnedPolicy;"
-        "z = np.load(sys.argv[2]); p = LearnedPolicy.load(sys.argv[1]);"
-        "np.save(sys.argv[3], p.act(z['states'], z['environments']))"
-    )
-    arguments = [str(checkpoint), str(tmp_path / "in.npz"), str(tmp_path / "out.npy")]
-    run = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
-    assert run.stdout == ""
-    assert np.array_equal(np.load(tmp_path / "out.npy"), LearnedPolicy.load(checkpoint).act(states, environments))
-
-
 def test_loading_needs_no_network(checkpoint, monkeypatch):
     def refuse(*_):
         raise AssertionError("a network connection was tried")
@@ -105,24 +88,13 @@ def test_actions_that_are_not_finite_are_refused_by_row(checkpoint):
         LearnedPolicy.load(checkpoint).act(states, environments)
 
 
-def test_observations_that_are_not_finite_are_refused_by_row(checkpoint):
-    states, environments = observations(3)
+def test_observations_that_are_not_finite_or_of_another_width_are_refused(checkpoint):
+    policy, (states, environments) = LearnedPolicy.load(checkpoint), observations(3)
+    with pytest.raises(MismatchError, match=r"\(3, 6\).*\(3, 5\)"):
+        policy.act(states, environments[:, :5])
     environments[2, 1] = np.inf
     with pytest.raises(NotFiniteError, match=r"environment_state in row 2"):
-        LearnedPolicy.load(checkpoint).act(states, environments)
-
-
-def test_observations_of_another_width_are_refused(checkpoint):
-    states, environments = observations(3)
-    with pytest.raises(MismatchError, match=r"\(3, 6\).*\(3, 5\)"):
-        LearnedPolicy.load(checkpoint).act(states, environments[:, :5])
-
-
-def test_weights_that_do_not_fit_the_config_are_refused(checkpoint):
-    config = json.loads((checkpoint / "config.json").read_text())
-    (checkpoint / "config.json").write_text(json.dumps(config | {"width": 32}))
-    with pytest.raises(ManipError, match="do not match"):
-        LearnedPolicy.load(checkpoint)
+        policy.act(states, environments)
 
 
 def test_pictures_go_in_as_lerobot_feeds_them():
@@ -185,9 +157,18 @@ def test_gaussian_samples_lie_around_the_action(table, spec, tmp_path):
     assert (error < 5 * samples.std(axis=0) / np.sqrt(4_000)).all()
 
 
-def test_a_policy_without_a_distribution_says_so_in_one_line(checkpoint):
-    policy, (states, environments) = LearnedPolicy.load(checkpoint), observations(2)
-    says = "loss 'mse' learns no spread of actions; expected gaussian, mixture, categorical"
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("checkpoint", "loss 'mse' learns no spread of actions; expected gaussian, mixture, categorical"),
+        (
+            "act",
+            "type 'act' has no distribution of actions here; expected an mlp with loss gaussian, mixture, categorical",
+        ),
+    ],
+)
+def test_a_policy_without_a_distribution_says_so_in_one_line(kind, says, request):
+    policy, (states, environments) = LearnedPolicy.load(request.getfixturevalue(kind)), observations(2)
     with pytest.raises(UsageError, match=says):
         policy.sample(states, environments, {}, generators(0, 1))
     with pytest.raises(UsageError, match=says):

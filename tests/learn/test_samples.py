@@ -32,12 +32,8 @@ def test_a_window_never_leaves_its_episode(lengths, deltas) -> None:
     assert (episodes[rows] == episodes[:, None]).all()
     wanted = samples[:, None] + np.array(deltas)
     assert (rows[~padded] == wanted[~padded]).all()
-    outside = (
-        (wanted < 0)
-        | (wanted >= len(episodes))
-        | (episodes[np.clip(wanted, 0, len(episodes) - 1)] != episodes[:, None])
-    )
-    assert (padded == outside).all()
+    around = np.pad(episodes, 4, constant_values=-1)  # of what lies beyond all episodes
+    assert (padded == (around[wanted + 4] != episodes[:, None])).all()
 
 
 def test_a_frame_outside_is_the_nearest_one_inside() -> None:
@@ -46,16 +42,17 @@ def test_a_frame_outside_is_the_nearest_one_inside() -> None:
     assert padded.tolist() == [[True, False, False, False], [False, False, True, True], [True, False, False, True]]
 
 
-def test_a_window_with_an_unsound_label_is_left_out() -> None:
-    valid = np.ones(11, dtype=bool)
-    valid[3] = False
-    usable = Windows(EPISODES, {"action": np.arange(3)}).usable(valid)
-    assert usable.tolist() == [0, 4, 5, 6, 7, 8, 9, 10]  # 1, 2 and 3 would learn from frame 3
-
-
-def test_the_last_frames_of_an_episode_can_be_left_out() -> None:
-    usable = Windows(EPISODES, {}).usable(np.ones(11, dtype=bool), drop_last=1)
-    assert usable.tolist() == [0, 1, 2, 3, 5, 7, 8, 9]
+@pytest.mark.parametrize(
+    ("deltas", "invalid", "drop_last", "usable"),
+    [
+        ({"action": np.arange(3)}, [3], 0, [0, 4, 5, 6, 7, 8, 9, 10]),  # 1, 2 and 3 would learn from frame 3
+        ({}, [], 1, [0, 1, 2, 3, 5, 7, 8, 9]),
+    ],
+    ids=["unsound label", "last frames"],
+)
+def test_samples_with_an_unsound_label_and_last_frames_are_left_out(deltas, invalid, drop_last, usable) -> None:
+    valid = ~np.isin(np.arange(11), invalid)
+    assert Windows(EPISODES, deltas).usable(valid, drop_last).tolist() == usable
 
 
 def test_nothing_left_to_learn_from_is_an_error() -> None:
@@ -100,17 +97,12 @@ def trainer(roots, folder: Path, weights=None) -> PolicyTrainer:
     return PolicyTrainer(roots, config, folder, spec=read_spec(roots[0]), weights=weights)
 
 
-def test_several_datasets_are_numbered_throughout(two):
+def test_several_datasets_are_numbered_throughout_and_have_the_statistics_of_all_frames(two):
     joined = read_tables(two, ("action", "episode_index", "index"))
-    frames = len(joined["action"])
+    action = joined["action"].astype(np.float64)
     assert np.array_equal(np.unique(joined["episode_index"]), np.arange(5))
-    assert np.array_equal(joined["index"].ravel(), np.arange(frames))
-    parts = [read_table(root, ("action",))["action"] for root in two]
-    np.testing.assert_array_equal(joined["action"], np.concatenate(parts))
-
-
-def test_several_datasets_have_the_statistics_of_all_their_frames(two):
-    action = read_tables(two, ("action",))["action"].astype(np.float64)
+    assert np.array_equal(joined["index"].ravel(), np.arange(len(action)))
+    np.testing.assert_array_equal(action, np.concatenate([read_table(root, ("action",))["action"] for root in two]))
     stats = read_metadata(*two).stats
     assert stats is not None
     np.testing.assert_allclose(stats["action"]["mean"], action.mean(0), rtol=1e-4, atol=1e-5)

@@ -94,10 +94,11 @@ def test_only_the_steps_and_options_of_the_policys_own_processors_are_loaded(ste
     assert len(str(caught.value)) < 1_000
 
 
-def test_a_step_by_its_import_path_is_refused_in_any_case(act):
+@pytest.mark.parametrize("trust", [False, True])
+def test_a_step_by_its_import_path_is_refused_in_any_case(trust, act):
     add_step(act, {"class": "subprocess.Popen", "config": {"args": "true"}})
     with pytest.raises(ManipError, match=r"subprocess\.Popen"):
-        LearnedPolicy.load(act, trust=True)
+        LearnedPolicy.load(act, trust=trust)
 
 
 @pytest.mark.parametrize("name", ["../secret.safetensors", "/etc/secret", "sub/x.safetensors", "missing.safetensors"])
@@ -125,14 +126,12 @@ def test_every_policy_of_lerobots_is_plain_or_needs_trust(kind):
     require_trust(settings, "x", trust=True)
 
 
-def test_an_encoder_by_name_is_refused_in_options_and_in_checkpoints(tmp_path):
+def test_an_encoder_that_a_checkpoint_names_is_made_only_where_it_is_trusted(tmp_path):
     settings = {"type": "gaussian_actor", "vision_encoder_name": "evil/encoder"}
-    with pytest.raises(ManipError, match=r"--policy\.type=gaussian_actor.*vision_encoder_name='evil/encoder'"):
-        policy_config(settings)
-    assert policy_config({"type": "gaussian_actor"}).type == "gaussian_actor"
-    config = settings | {"input_features": {}, "output_features": {}}
-    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "config.json").write_text(json.dumps(settings | {"input_features": {}, "output_features": {}}))
     (tmp_path / "model.safetensors").touch()
-    with pytest.raises(ManipError, match=r"vision_encoder_name='evil/encoder'.*--trust=true"):
+    with pytest.raises(ManipError, match=r"--policy\.path.*vision_encoder_name='evil/encoder'.*--trust=true"):
         policy_config({"path": str(tmp_path)})
     assert policy_config({"path": str(tmp_path)}, trust=True).type == "gaussian_actor"
+    with pytest.raises(ManipError, match=r"--policy\.type=gaussian_actor.*vision_encoder_name='evil/encoder'"):
+        policy_config(settings)

@@ -82,16 +82,17 @@ class Trial:
         flags = [f"--eval.n_episodes={self.count}", f"--eval.batch_size={batch_size}", f"--seed={self.seeds[0]}"]
         return [*self.env_words, *flags, f"--eval.use_async_envs={str(asynchronous).lower()}"]
 
-    def ours(self, policy: Path, on_episode: Callable[[Episode], None] | None = None) -> tuple[EpisodeResult, ...]:
+    def ours(
+        self, policy: Path, on_episode: Callable[[Episode], None] = lambda episode: None
+    ) -> tuple[EpisodeResult, ...]:
         """By this project's own evaluation."""
+        job = RolloutJob(self.env, "policy", policy, cameras=self.cameras)
+        found: dict[int, EpisodeResult] = {}
         with Engine(workers=1) as engine:
-            job = RolloutJob(self.env, "policy", policy, cameras=self.cameras)
-            found: dict[int, EpisodeResult] = {}
             for episode in engine.run(job, self.seeds):
                 found[episode.seed] = episode_result(job, episode)
-                if on_episode is not None:
-                    on_episode(episode)
-            return tuple(found[seed] for seed in self.seeds)
+                on_episode(episode)
+        return tuple(found[seed] for seed in self.seeds)
 
 
 @pytest.fixture(scope="session")
@@ -118,15 +119,8 @@ def act_words() -> Callable[..., Sequence[str]]:
         chunk = {"chunk_size": 5, "n_action_steps": 5, "use_vae": "false", "optimizer_lr": 1e-3}
         offline = {"pretrained_backbone_weights": "null", "push_to_hub": "false", "device": "cpu"}
         policy = {"type": "act"} | sizes | chunk | offline
-        return [
-            *(f"--policy.{name}={value}" for name, value in policy.items()),
-            f"--dataset.repo_id=someone/{root.name}",
-            f"--dataset.root={root}",
-            f"--output_dir={output_dir}",
-            f"--steps={steps}",
-            f"--save_freq={steps}",
-            f"--env_eval_freq={steps}",
-            "--num_workers=0",
-        ]
+        run = {"dataset.repo_id": f"someone/{root.name}", "dataset.root": root, "output_dir": output_dir}
+        run |= dict.fromkeys(("steps", "save_freq", "env_eval_freq"), steps) | {"num_workers": 0}
+        return [*(f"--policy.{key}={value}" for key, value in policy.items()), *(f"--{k}={v}" for k, v in run.items())]
 
     return words

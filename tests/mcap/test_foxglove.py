@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import io
 import json
-from typing import Any
 
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import Writer
-from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import schema as s
 from manip_il.errors import ManipError
 from manip_il.mcap import foxglove
 from manip_il.mcap.records import Budget, chunk_records
 from manip_il.mdp import Episode
+
+from .use import decoded
 
 SPEC = s.RobotTaskSpec("r", "t", 30, ("a", "b"), ("ee.x",), 1, "", cameras=("front", "wrist"), image_size=(2, 3))
 
@@ -33,17 +32,6 @@ def written(channels: list[foxglove.Channel], times: list[int]) -> bytes:
     foxglove.add_channels(writer, channels, times)
     writer.finish()
     return stream.getvalue()
-
-
-def read(data: bytes) -> list[tuple[str, int, Any]]:
-    return [
-        (
-            channel.topic,
-            message.log_time,
-            (DecoderFactory().decoder_for(channel.message_encoding, schema) or json.loads)(message.data),
-        )
-        for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages()
-    ]
 
 
 @given(hnp.arrays(np.float64, (3, 2), elements=st.floats(allow_nan=False, allow_infinity=False)))
@@ -58,7 +46,7 @@ def test_numbers_keep_every_bit(values: np.ndarray) -> None:
         ],
         times,
     )
-    found = {(topic, time): message for topic, time, message in read(data)}
+    found = {(topic, time): message for topic, time, message in decoded(data)}
     for time, row in zip(times, values, strict=True):
         joints = found["/joints", time].joints
         assert np.array([joint.position for joint in joints]).tobytes() == row.tobytes()

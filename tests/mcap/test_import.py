@@ -5,31 +5,31 @@ Resampling is compared with a search through all messages.
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
-from PIL import Image
 
 from manip_il.data.journal import write_episode
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mcap.foxglove import NANOSECONDS
-from manip_il.mcap.importing import Import, features_of, frame_times, frames_of, list_files, pick, read_import
-from manip_il.mcap.mapping import Mapping, Method, load_mapping
-from manip_il.mdp import Episode
+from manip_il.mcap.importing import features_of, frame_times, frames_of, list_files, pick, read_import
+from manip_il.mcap.mapping import Method
+
+from ..pictures import encoded
+from ..synthetic import MakeEpisode
+from .use import imported, load
 
 MS = 1_000_000
 JSON = "json"
@@ -58,37 +58,23 @@ def feature(topic: str = "/a", **changes: Any) -> dict[str, Any]:
     return {"topic": topic, "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 0.02, **changes}
 
 
-@pytest.fixture
-def load(tmp_path: Path) -> Callable[..., Mapping]:
-    def mapping(features: dict[str, Any], fps: int = 10, task: Any = "t") -> Mapping:
-        path = tmp_path / "m.yaml"
-        path.write_text(yaml.safe_dump({"fps": fps, "task": task, "features": features}))
-        return load_mapping(path)
-
-    return mapping
-
-
-def frames(path: Path, mapping: Mapping) -> tuple[Import, list[dict[str, Any]]]:
-    episode = read_import(path, mapping)
-    return episode, list(frames_of(episode, mapping, features_of(mapping, episode)))
-
-
 def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:
     return [(stamp, {"x": float(stamp)}) for stamp in stamps]
 
 
-def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path) -> None:
     fast, slow, whole = range(0, 1001, 10), range(45, 900, 50), range(5, 990, 7)
     topics = {"/fast": ramp(fast), "/slow": ramp(slow), "/whole": [(s, {"x": s}) for s in whole], "/rest": ramp([0])}
     path = write(tmp_path / "a.mcap", topics)
     mapping = load(
+        tmp_path,
         {
             "near": feature("/fast"),
             "between": feature("/slow", resample="interpolate", tolerance=0.05),
             "held": feature("/whole", resample="hold", dtype="int64"),
-        }
+        },
     )
-    episode, rows = frames(path, mapping)
+    episode, rows = read_import(path, mapping), imported(path, mapping)
     times = list(range(45, 896, 100))  # from the latest first message to the earliest last one
     assert episode.frames == len(rows) == len(times)
     assert [row["between"].item() for row in rows] == times
@@ -99,11 +85,12 @@ def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path, load: 
     assert episode.used == {"/fast": 9, "/slow": 9, "/whole": 9}
 
 
-def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path) -> None:
     big, small = 2**63 - 1, 5e-324
     contents = [{"i": big - n, "f": [small * n, -0.0], "b": n == 1, "s": f"é\n{n}"} for n in range(3)]
     path = write(tmp_path / "a.mcap", {"/a": [(n * 100, content) for n, content in enumerate(contents)]})
     mapping = load(
+        tmp_path,
         {
             "i": feature(field="i", dtype="int64"),
             "f": feature(field=["f[:]", "f[0]"], shape=[3, 1], names=None),
@@ -112,7 +99,7 @@ def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path, load: Cal
         },
         task={"topic": "/a", "field": "s", "resample": "hold", "tolerance": 0},
     )
-    _, rows = frames(path, mapping)
+    rows = imported(path, mapping)
     for n, row in enumerate(rows):
         assert (row["i"].item(), row["b"].item(), row["s"], row["task"]) == (big - n, n == 1, f"é\n{n}", f"é\n{n}")
         assert row["f"].tobytes() == np.array([small * n, -0.0, small * n]).tobytes()
@@ -130,12 +117,10 @@ def raw(number: int, encoding: str = "rgb8") -> RawImage:
 
 
 def png(number: int) -> CompressedImage:
-    stream = io.BytesIO()
-    Image.fromarray(picture(number)).save(stream, "PNG")
-    return CompressedImage(format="png", data=stream.getvalue())
+    return CompressedImage(format="png", data=encoded(picture(number)))
 
 
-def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
     stamps = range(0, 500, 33)
     topics = {
         "/a": ramp(range(0, 500, 100)),
@@ -145,8 +130,10 @@ def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path, load: Cal
     }
     path = write(tmp_path / "a.mcap", topics)
     camera = {"resample": "nearest", "tolerance": 0.02, "video": False}
-    mapping = load({"a": feature(), **{name: {**camera, "topic": f"/{name}"} for name in ("raw", "bgr", "png")}})
-    episode, rows = frames(path, mapping)
+    mapping = load(
+        tmp_path, {"a": feature(), **{name: {**camera, "topic": f"/{name}"} for name in ("raw", "bgr", "png")}}
+    )
+    episode, rows = read_import(path, mapping), imported(path, mapping)
     for time, row in zip(range(0, 500, 100), rows, strict=True):
         wanted = picture(min(range(len(stamps)), key=lambda n: abs(stamps[n] - time)))
         for name in ("raw", "bgr", "png"):
@@ -176,33 +163,32 @@ STEADY = range(0, 1000, 100)
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "topic /a at 0 ns: 2 values, f has 1"),
         ([(0, {"x": [1, 2]}), (100, {"x": [1]})], {}, "message 1 has 1 values, the first one 2"),
         ([(0, {"x": 1}), (100, {"y": 1})], {}, "topic /a at 100000000 ns: x: no field 'x'"),
-        (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a"),
-        (ramp(STEADY), {"topic": "/late"}, r"/a ends 4\.1 s before /late starts"),
+        (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a, /late, /steady"),
+        (ramp(STEADY), {"topic": "/late"}, r"/steady ends 4\.1 s before /late starts"),
     ],
 )
 def test_what_cannot_be_is_refused_by_file_topic_and_time(
-    tmp_path: Path, load: Callable[..., Mapping], messages: Messages, changes: dict[str, Any], why: str
+    tmp_path: Path, messages: Messages, changes: dict[str, Any], why: str
 ) -> None:
-    late = ramp([5000, 5100]) if changes.get("topic") == "/late" else ramp(STEADY)
-    path = write(tmp_path / "bad.mcap", {"/a": messages, "/late" if len(late) == 2 else "/steady": late})
-    steady = "/a" if len(late) == 2 else "/steady"
+    topics = {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])}
+    path = write(tmp_path / "bad.mcap", topics)
     with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
-        read_import(path, load({"f": feature(**changes), "g": feature(steady)}))
+        read_import(path, load(tmp_path, {"f": feature(**changes), "g": feature("/steady")}))
 
 
-def test_an_encoding_that_cannot_be_read_is_refused(tmp_path: Path, load: Callable[..., Mapping]) -> None:
+def test_an_encoding_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "ros.mcap", {"/a": ramp(STEADY)}, "cdr")
     with pytest.raises(ManipError, match=r"ros\.mcap, topic /a: its messages are encoded as 'cdr'; expected protobuf"):
-        read_import(path, load({"f": feature()}))
+        read_import(path, load(tmp_path, {"f": feature()}))
 
 
 @pytest.mark.parametrize("keep", [0, 5, 0.3, 0.9, 0.99])
-def test_a_file_that_is_cut_is_refused(tmp_path: Path, load: Callable[..., Mapping], keep: float) -> None:
+def test_a_file_that_is_cut_is_refused(tmp_path: Path, keep: float) -> None:
     path = write(tmp_path / "cut.mcap", {"/a": ramp(range(1000))})
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(len(data) * keep)])
     with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: .*; expected a complete MCAP file"):
-        read_import(path, load({"f": feature()}))
+        read_import(path, load(tmp_path, {"f": feature()}))
 
 
 @pytest.mark.parametrize(
@@ -214,15 +200,15 @@ def test_a_file_that_is_cut_is_refused(tmp_path: Path, load: Callable[..., Mappi
         ({"x": 1}, "a message of no schema; pictures are read from foxglove.RawImage"),
     ],
 )
-def test_what_is_no_picture_is_refused(tmp_path: Path, load: Callable[..., Mapping], message: Any, why: str) -> None:
+def test_what_is_no_picture_is_refused(tmp_path: Path, message: Any, why: str) -> None:
     path = write(tmp_path / "p.mcap", {"/a": [(0, message)]})
-    mapping = load({"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
+    mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
     with pytest.raises(ManipError, match=rf"p\.mcap, topic /a at 0 ns: .*{why}"):
-        frames(path, mapping)
+        imported(path, mapping)
 
 
-def test_files_that_do_not_fit_each_other_are_refused(tmp_path: Path, load: Callable[..., Mapping]) -> None:
-    mapping = load({"f": feature()})
+def test_files_that_do_not_fit_each_other_are_refused(tmp_path: Path) -> None:
+    mapping = load(tmp_path, {"f": feature()})
     first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
     second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
     features = features_of(mapping, read_import(first, mapping))
@@ -231,13 +217,14 @@ def test_files_that_do_not_fit_each_other_are_refused(tmp_path: Path, load: Call
 
 
 def test_our_journals_come_in_by_a_mapping_of_their_topics(
-    tmp_path: Path, make_episode: Callable[..., Episode], spec: RobotTaskSpec, load: Callable[..., Mapping]
+    tmp_path: Path, make_episode: MakeEpisode, spec: RobotTaskSpec
 ) -> None:
     episode = make_episode(3, 6)
     path = write_episode(tmp_path, episode, spec, {})
     joints = [f"joints[name={name}].position" for name in spec.joint_names]
     places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
     mapping = load(
+        tmp_path,
         {
             STATE: feature("/joint_states", field=joints, dtype="float32", names=list(spec.joint_names)),
             ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="hold"),
@@ -266,7 +253,6 @@ def test_files_are_taken_in_the_order_of_their_names(tmp_path: Path) -> None:
 
 SECOND = NANOSECONDS
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
-frame_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
 
 
 def expected(method: Method, stamps: list[int], time: int, tolerance: int) -> tuple[int, int, Fraction] | None:
@@ -285,7 +271,7 @@ def expected(method: Method, stamps: list[int], time: int, tolerance: int) -> tu
 
 
 @settings(max_examples=300)
-@given(st.sampled_from(["nearest", "hold", "interpolate"]), stamp_lists, frame_lists, st.integers(0, 20))
+@given(st.sampled_from(["nearest", "hold", "interpolate"]), stamp_lists, stamp_lists, st.integers(0, 20))
 def test_every_frame_gets_what_a_full_search_finds(
     method: Method, stamps: list[int], times: list[int], tolerance: int
 ) -> None:
@@ -316,7 +302,7 @@ def test_a_frame_at_a_messages_stamp_is_that_message(data: st.DataObject, stamps
         assert blended.tobytes() == values.tobytes()  # bits: a minus zero is one
 
 
-@given(stamp_lists, frame_lists, st.floats(-10, 10), st.floats(-10, 10))
+@given(stamp_lists, stamp_lists, st.floats(-10, 10), st.floats(-10, 10))
 def test_interpolation_is_exact_on_a_line(stamps: list[int], times: list[int], slope: float, offset: float) -> None:
     times = [time for time in times if stamps[0] <= time <= stamps[-1]]
     assume(times)

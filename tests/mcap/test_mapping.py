@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from hypothesis import given
@@ -15,6 +14,8 @@ from hypothesis import strategies as st
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.mapping import Camera, Mapping, Values, load_mapping
 from manip_il.mcap.path import FieldPath, parse_path
+
+from .use import load
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,14 +26,8 @@ def tree() -> dict[str, Any]:
     return {"fps": 20, "task": "do it", "features": {"action": number, "observation.images.c": camera}}
 
 
-def load(folder: Path, content: object) -> Mapping:
-    path = folder / "m.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    return load_mapping(path)
-
-
 def test_a_mapping_is_its_file(tmp_path: Path) -> None:
-    mapping = load(tmp_path, tree())
+    mapping = load(tmp_path, **tree())
     assert mapping == Mapping(
         20,
         None,
@@ -107,7 +102,7 @@ def of_camera(**changes: Any) -> dict[str, Any]:
 )
 def test_a_wrong_value_is_refused_by_name(tmp_path: Path, change: dict[str, Any], why: str) -> None:
     with pytest.raises(UsageError, match=rf"m\.yaml: .*{why}"):
-        load(tmp_path, tree() | change)
+        load(tmp_path, **(tree() | change))
 
 
 @pytest.mark.parametrize("text", ["[1]", "a: [", "a: !!python/name:os.system x", "\0"])

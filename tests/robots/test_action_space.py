@@ -76,22 +76,6 @@ def test_parts_of_different_lengths_are_refused_with_all_of_them():
         replace(SPACE, low=np.zeros(3))
 
 
-def test_a_random_action_is_any_within_a_joint_step_and_any_opening():
-    state = np.array([0.5, 0.02, -0.5, 9.0])
-    drawn = np.array([SPACE.random_near(state, np.random.default_rng(seed)) for seed in range(400)])
-    steps = (drawn - state)[:, SPACE.arm]
-    assert (np.abs(steps) <= SPACE.scale[SPACE.arm]).all()
-    assert (np.abs(steps).max(axis=0) > 0.95 * SPACE.scale[SPACE.arm]).all()
-    assert 0 <= drawn[:, 1].min() < 0.005
-    assert 0.075 < drawn[:, 1].max() <= 0.08
-
-
-@given(st.integers(0, 2**32))
-def test_a_random_action_follows_from_its_generator(seed: int):
-    one, other = (SPACE.random_near(np.zeros(4), np.random.default_rng(seed)) for _ in range(2))
-    assert one.tobytes() == other.tobytes()
-
-
 @every_robot
 def test_a_scenes_actions_are_its_robots_joints_in_their_ranges(robot: str):
     scene = build_scene(robot, "reach")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -12,52 +11,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import UsageError
 from manip_il.robots.gripper import TOUCH, Gripper, sweep
 from manip_il.robots.robot import ROBOTS, Robot, get_robot
 from manip_il.robots.spec import arm_spec
-from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
 from manip_il.tasks.ladder import LOWEST_EE
 from manip_il.tasks.pick_place import OBJECT
 
+from ..scenes import started, still, world_at_home
 from ..tables import every_robot
 from .own import JAWS, write
 
-SEED = 5_000_000
 EDGE = 0.05  # of the model's cube [m]
 
 
-@cache
-def world_of(robot: str) -> World:
-    world = World(build_scene(robot, "pick_place"))
-    world.data.qpos[world.scene.arm_q] = world.scene.robot.home
-    return world
+world_of = cache(world_at_home)
 
 
-def with_cube(robot: str, opening: float, offset: tuple[float, float, float] = (0, 0, 0), turn: float = 0.0) -> World:
-    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m] and turned [rad]."""
-    world = world_of(robot)
+def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) -> World:
+    """At home, the cube between the fingers, off their middle by an offset in the hand's frame [m]."""
+    world, quat = world_of(robot), np.empty(4)
     gripper = world.scene.gripper
     world.data.qpos[gripper.q] = gripper.command(opening)
     world.update()
-    quat, turned, both = np.empty(4), np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]), np.empty(4)
     mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
-    mujoco.mju_mulQuat(both, quat, turned)
-    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, both)
+    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, quat)
     world.update()
     return world
 
 
 @every_robot
 def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: str):
-    env = ManipEnv(robot, "reach")
-    env.start(SEED)
-    arm, gripper = env.data.ctrl[env.scene.arm_ctrl].copy(), env.scene.gripper
+    env = started(robot, "reach")
+    gripper = env.scene.gripper
     for opening in (gripper.most, 0.03, 0.055, 0.01, gripper.least):
         for _ in range(25):
-            env.advance(env.scene.actions.join(arm, opening))
+            env.advance(still(env, opening))
         assert env.world.opening == pytest.approx(opening, abs=1e-3)
         assert env.observe().state[env.scene.actions.gripper] == np.float32(env.world.opening)
 
@@ -94,28 +83,22 @@ def test_a_sweep_comes_apart_from_closed_to_open(robot: str):
     assert sweep(get_robot(robot)) is found
 
 
+@pytest.mark.parametrize(
+    ("openings", "offset", "touched"),
+    [
+        ([EDGE, EDGE + TOUCH], (0, 0, 0), True),
+        (np.linspace(EDGE + 3 * TOUCH, 0.1, 25), (0, 0, 0), False),  # as far as they open
+        ([EDGE + 0.015], (0, -0.0075, 0), False),  # one finger is at it
+        ([EDGE + 0.015], (0, 0.0075, 0), False),
+        ([EDGE], (0.15, 0, 0), False),
+        ([EDGE], (0, 0.15, 0), False),
+        ([EDGE], (0, 0, 0.08), False),
+    ],
+)
 @every_robot
-def test_fingers_that_closed_on_the_cube_touch_it(robot: str):
-    assert with_cube(robot, EDGE).touched(OBJECT)
-    assert with_cube(robot, EDGE + TOUCH).touched(OBJECT)
-
-
-@every_robot
-def test_fingers_that_are_open_around_the_cube_do_not_touch_it(robot: str):
-    for opening in np.linspace(EDGE + 3 * TOUCH, world_of(robot).most_opening, 25):
-        assert not with_cube(robot, opening).touched(OBJECT)
-
-
-@every_robot
-def test_one_finger_at_the_cube_is_no_touch(robot: str):
-    for side in (-1, 1):
-        assert not with_cube(robot, EDGE + 0.015, (0, side * 0.0075, 0)).touched(OBJECT)
-
-
-@every_robot
-def test_a_cube_elsewhere_is_not_touched(robot: str):
-    for offset in ((0.15, 0, 0), (0, 0.15, 0), (0, 0, 0.08)):
-        assert not with_cube(robot, EDGE, offset).touched(OBJECT)
+def test_the_cube_is_touched_by_all_fingers_or_not_at_all(robot: str, openings, offset, touched: bool):
+    for opening in openings:
+        assert with_cube(robot, opening, offset).touched(OBJECT) == touched
 
 
 @given(st.sampled_from(sorted(ROBOTS)), st.floats(-0.008, 0.008), st.floats(-0.008, 0.008), st.floats(0.005, 0.02))
@@ -165,29 +148,3 @@ def test_the_stiffer_finger_waits_for_the_other(own: Robot):
     (left,), (right,) = gripper.pads
     gap = mujoco.mj_geomDistance(model, data, left, right, 1.0, None)
     assert gripper.opening(data.qpos) == pytest.approx(gap, abs=1e-3)
-
-
-def swapped(robot: Robot) -> Robot:
-    return replace(robot, gripper=replace(robot.gripper, closed=robot.gripper.open, open=robot.gripper.closed))
-
-
-def barely(robot: Robot) -> Robot:
-    return replace(robot, gripper=replace(robot.gripper, open=(0.001, 0.001)))
-
-
-@pytest.mark.parametrize("wrong", [swapped, barely])
-def test_fingers_that_do_not_come_apart_are_refused(wrong, own: Robot):
-    with pytest.raises(UsageError) as caught:
-        sweep(wrong(own))
-    assert "robot own: the fingers stand" in str(caught.value)
-    assert "gripper.closed, gripper.open and gripper.fingers" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_finger_that_touches_nothing_is_refused_by_name(own: Robot, tmp_path: Path):
-    text = own.model.read_text().replace('<geom type="box" size="0.01 0.004 0.04"', "<geom contype='0' conaffinity='0' "
-                                         'type="box" size="0.01 0.004 0.04"')  # fmt: skip
-    (tmp_path / "air").mkdir()
-    robot = get_robot(str(write(tmp_path / "air", model=text)))
-    with pytest.raises(UsageError, match="finger 'left' has no geom that can touch anything"):
-        sweep(robot)

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.robots import reach
+from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
-from manip_il.robots.robot import HERE, Robot, get_robot
+from manip_il.robots.robot import Robot, get_robot
 
 from ..tables import every_robot
 from .own import write
@@ -154,30 +154,26 @@ def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypa
     assert first.has(np.array([0.41, 0.01, 0.06]))
 
 
-@pytest.mark.parametrize("changed", ["model", "yaml", "part"])
-def test_another_model_or_yaml_has_a_map_of_its_own(changed: str, solved: list[str], tmp_path: Path):
-    (tmp_path / "parts.xml").write_text("<mujoco/>")
-    path = write(tmp_path)
-    read_again(get_robot(str(path)))
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "parts.xml").write_text("<mujoco/>" if changed != "part" else "<mujoco><asset/></mujoco>")
-    other = write(tmp_path / "other")
-    if changed == "model":
-        (tmp_path / "other" / "own.xml").write_text((tmp_path / "own.xml").read_text() + "<!-- later -->")
-    elif changed == "yaml":
-        other.write_text(path.read_text().replace("- 2000", "- 1999", 1))
-    read_again(get_robot(str(other)))
-    assert solved == ["own", "own"]
-    assert len(kept(tmp_path)) == 2
-
-
-def test_the_same_robot_elsewhere_has_the_same_map(solved: list[str], tmp_path: Path):
-    (tmp_path / "other").mkdir()
-    read_again(get_robot(str(write(tmp_path))))
-    (tmp_path / "other" / "pictures").mkdir()
-    (tmp_path / "other" / "pictures" / "vase.stl").write_bytes(b"what lies beside it is none of its")
-    read_again(get_robot(str(write(tmp_path / "other"))))
-    assert solved == ["own"]
+@pytest.mark.parametrize(
+    ("file", "change", "maps"),
+    [
+        ("own.xml", lambda text: f"{text}<!-- later -->", 2),
+        ("own.yaml", lambda text: text.replace("- 2000", "- 1999", 1), 2),
+        ("parts.xml", lambda text: "<mujoco><asset/></mujoco>", 2),
+        ("pictures/vase.stl", lambda text: "what lies beside it is none of its", 1),
+        ("own.xml", lambda text: text, 1),  # the same robot elsewhere
+    ],
+)
+def test_another_model_or_yaml_has_a_map_of_its_own(file: str, change, maps: int, solved: list[str], tmp_path: Path):
+    for folder in (tmp_path / "one", tmp_path / "other"):
+        (folder / "pictures").mkdir(parents=True)
+        (folder / "parts.xml").write_text("<mujoco/>")
+        path = write(folder)
+        if folder.name == "other":
+            (folder / file).write_text(change((folder / file).read_text() if (folder / file).is_file() else ""))
+        read_again(get_robot(str(path)))
+    assert solved == ["own"] * maps
+    assert len(kept(tmp_path)) == maps
 
 
 @pytest.mark.parametrize("broken", [b"", b"no map", b"PK\x03\x04 cut", "half"])

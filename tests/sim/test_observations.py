@@ -9,9 +9,8 @@ from manip_il.sim.env import ManipEnv, environment_state, environment_state_name
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
 
-from ..tables import every_robot, every_scene
-
-SEED = 5_000_000
+from ..scenes import cube, started
+from ..tables import every_scene, every_scene_with_an_object
 
 
 def values_of(env: ManipEnv) -> dict[str, float]:
@@ -24,8 +23,7 @@ def vector(values: dict[str, float], name: str) -> np.ndarray:
 
 @every_scene
 def test_the_hand_and_the_goal_are_shown_where_they_are(robot: str, task: str):
-    env = ManipEnv(robot, task)
-    env.start(SEED)
+    env = started(robot, task)
     values, ee = values_of(env), env.world.ee
     np.testing.assert_allclose(vector(values, "ee"), ee.position, atol=1e-6)
     np.testing.assert_allclose(vector(values, "ee.axis_y"), ee.rotation[:, 1], atol=1e-6)
@@ -34,27 +32,19 @@ def test_the_hand_and_the_goal_are_shown_where_they_are(robot: str, task: str):
     np.testing.assert_allclose(env.world.goal, env.data.mocap_pos[0])
 
 
-@every_robot
-def test_the_cubes_numbers_are_what_their_names_say(robot: str):
-    env = ManipEnv(robot, "pick_place")
-    env.start(SEED)
+@every_scene_with_an_object
+def test_the_cubes_numbers_are_what_their_names_say(robot: str, task: str):
+    env = started(robot, task)
     values = values_of(env)
-    np.testing.assert_allclose(vector(values, "object"), env.data.joint("object").qpos[:3], atol=1e-6)
-    np.testing.assert_allclose(
-        vector(values, "object_from_ee"), vector(values, "object") - vector(values, "ee"), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        vector(values, "goal_from_object"), vector(values, "goal") - vector(values, "object"), atol=1e-6
-    )
+    place, hand, goal = (vector(values, name) for name in ("object", "ee", "goal"))
+    np.testing.assert_allclose(place, cube(env), atol=1e-6)
+    np.testing.assert_allclose(vector(values, "object_from_ee"), place - hand, atol=1e-6)
+    np.testing.assert_allclose(vector(values, "goal_from_object"), goal - place, atol=1e-6)
     w, _, _, z = env.data.joint("object").qpos[3:]
     turns = np.exp(4j * 2 * np.arctan2(z, w))
     assert (values["object.cos4yaw"], values["object.sin4yaw"]) == pytest.approx((turns.real, turns.imag), abs=1e-6)
     assert values["object.tilt"] == pytest.approx(0, abs=1e-6)
     assert values["object.width"] == pytest.approx(0.05)
-
-
-def test_a_learner_is_shown_how_wide_the_cube_is():
-    env = ManipEnv("fetch", "lift")
     env.world.vary(with_drawn(env.scene.nominal, {"size": 0.07}))
     env.world.update()
     assert values_of(env)["object.width"] == pytest.approx(0.07)
@@ -62,8 +52,7 @@ def test_a_learner_is_shown_how_wide_the_cube_is():
 
 @every_scene
 def test_joints_and_opening_are_the_measured_ones(robot: str, task: str):
-    env = ManipEnv(robot, task)
-    env.start(SEED)
+    env = started(robot, task)
     shown, actions = joint_state(env.world), env.scene.actions
     assert shown.dtype == environment_state(env.world).dtype == np.float32
     np.testing.assert_array_equal(shown[actions.arm], env.data.qpos[env.scene.arm_q].astype(np.float32))
@@ -71,9 +60,9 @@ def test_joints_and_opening_are_the_measured_ones(robot: str, task: str):
 
 
 @every_scene
-def test_names_are_the_same_whatever_the_world_is_like(robot: str, task: str):
+def test_every_number_has_a_name_and_the_same_whatever_the_world_is_like(robot: str, task: str):
     env = ManipEnv(robot, task)
-    before = environment_state_names(env.scene)
-    env.start(SEED)
-    assert environment_state_names.__wrapped__(env.scene) == before
-    assert len(environment_state(World(env.scene))) == len(before)
+    names = environment_state_names(env.scene)
+    env.start(1)
+    assert environment_state_names.__wrapped__(env.scene) == names
+    assert len(environment_state(World(env.scene))) == len(names) == len(set(names))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
+import pkgutil
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -17,15 +18,15 @@ from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.gl import choose_backend, require_known_backend
+from manip_il.sim.world import GOAL
+from manip_il.tasks.starts import UPRIGHT
 
-SEED = 5_000_000
+from ..scenes import SEED, bits, started, still
 
 
 @pytest.fixture
 def env(request) -> ManipEnv:
-    env = ManipEnv(request.param, cameras=CAMERAS, render_mode="rgb_array")
-    env.start(SEED)
-    return env
+    return started(request.param, cameras=CAMERAS, render_mode="rgb_array")
 
 
 @pytest.fixture
@@ -72,28 +73,17 @@ def test_the_front_camera_sees_the_green_goal_and_the_red_cube(env: ManipEnv):
         picture = env.observe().images["front"]
         assert pixels_like(picture, 1) >= 8
         assert pixels_like(picture, 0) >= 8
-
-
-@pytest.mark.gl
-@with_every_robot
-def test_a_state_is_the_same_picture_again(env: ManipEnv):
-    state, first = env.get_state(), env.observe().images
-    env.start(SEED + 1)
-    other = env.observe().images["front"]
-    env.set_state(state)
-    again = env.observe().images
-    np.testing.assert_array_equal(again["front"], first["front"])
-    np.testing.assert_array_equal(again["wrist"], first["wrist"])
-    assert not np.array_equal(other, first["front"])
+    env.world.place(GOAL, np.array([0.0, 0.0, -1.0]), UPRIGHT)
+    assert pixels_like(env.observe().images["front"], 1) == 0
 
 
 @pytest.mark.gl
 @with_every_robot
 def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env: ManipEnv):
     before = env.observe().images
-    q = env.data.ctrl[env.scene.arm_ctrl].copy()
+    turned = still(env, 0.04) + 0.3 * np.eye(len(env.scene.actions))[env.scene.actions.arm[0]]
     for _ in range(10):
-        env.advance(env.scene.actions.join(q + 0.3 * np.eye(len(q))[0], 0.04))
+        env.advance(turned)
     after = env.observe().images
     share = {name: (np.abs(after[name].astype(int) - before[name]).max(axis=2) > 12).mean() for name in CAMERAS}
     assert share["wrist"] > 0.1
@@ -102,18 +92,8 @@ def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env:
 
 @pytest.mark.gl
 @with_every_robot
-def test_render_is_larger_and_leaves_the_cameras_as_they_were(env: ManipEnv):
-    before = env.observe().images["front"]
-    assert env.render().shape == (480, 640, 3)
-    np.testing.assert_array_equal(env.observe().images["front"], before)
-
-
-@pytest.mark.gl
-@with_every_robot
 def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
-    crowd = [ManipEnv(env.config.robot, cameras=CAMERAS) for _ in range(25)]
-    for seed, one in enumerate(crowd, SEED):
-        one.start(seed)
+    crowd = [started(env.config.robot, seed=seed, cameras=CAMERAS) for seed in range(SEED, SEED + 25)]
     together = [one.observe().images for one in crowd]
     for seed, images in enumerate(together, SEED):
         env.start(seed)
@@ -122,20 +102,27 @@ def test_pictures_of_25_environments_are_those_of_one_alone(env: ManipEnv):
 
 
 @pytest.mark.gl
-def test_other_robots_looks_and_sizes_in_between_change_no_byte():
-    env = ManipEnv("panda", cameras=("front",), image_size=(96, 128))
-    env.start(SEED)
-    first = env.observe().images["front"]
-    others = [
-        ManipEnv("fetch", cameras=("wrist",)),
-        ManipEnv("panda", cameras=("front",), look=Look(shadows=True, brightness=2)),
-        ManipEnv("panda", cameras=CAMERAS, image_size=(720, 1024)),  # larger than the buffer was made
-        ManipEnv("panda", cameras=CAMERAS, image_size=(16, 18)),
+@with_every_robot
+def test_nothing_that_is_drawn_in_between_changes_a_byte(env: ManipEnv):
+    def same() -> bool:
+        return all(np.array_equal(picture, first[name]) for name, picture in env.observe().images.items())
+
+    state, first = env.get_state(), env.observe().images
+    assert env.render().shape == (480, 640, 3)
+    assert same()
+    env.start(SEED + 1)
+    assert not np.array_equal(env.observe().images["front"], first["front"])
+    env.set_state(state)
+    assert same()
+    others: list[dict[str, Any]] = [
+        {"robot": "fetch", "cameras": ("wrist",)},
+        {"robot": "panda", "cameras": ("front",), "look": Look(shadows=True, brightness=2)},
+        {"robot": "panda", "cameras": CAMERAS, "image_size": (720, 1024)},  # larger than the buffer was made
+        {"robot": "panda", "cameras": CAMERAS, "image_size": (16, 18)},
     ]
     for other in others:
-        other.start(SEED)
-        other.observe()
-        np.testing.assert_array_equal(env.observe().images["front"], first)
+        started(**other).observe()
+        assert same()
 
 
 @pytest.mark.gl
@@ -151,8 +138,7 @@ def test_another_process_draws_the_same_bytes(env: ManipEnv):
 
 @pytest.mark.gl
 def test_the_picture_is_the_mean_of_finer_pixels_the_right_way_up():
-    env = ManipEnv("panda", "reach", cameras=("front",), image_size=(64, 96))
-    env.start(SEED)
+    env = started("panda", "reach", cameras=("front",), image_size=(64, 96))
     fine = render.pictures("panda", "reach", env.data, CameraConfig(("front",), 128, 192))["front"]
     blocks = fine.reshape(64, 2, 96, 2, 3).mean(axis=(1, 3))
     picture = env.observe().images["front"]
@@ -163,21 +149,18 @@ def test_the_picture_is_the_mean_of_finer_pixels_the_right_way_up():
 @pytest.mark.gl
 @with_every_robot
 def test_pictures_leave_the_physics_alone(env: ManipEnv):
-    blind = ManipEnv(env.config.robot)
-    blind.start(SEED)
+    blind = started(env.config.robot)
     for _ in range(5):
         env.observe()
         for one in (env, blind):
-            one.advance(one.scene.actions.join(one.data.ctrl[one.scene.arm_ctrl] + 0.02, 0.03))
-    np.testing.assert_array_equal(env.get_state().to_vector(), blind.get_state().to_vector())
+            one.advance(still(one, 0.01) + 0.02)
+    assert bits(env) == bits(blind)
 
 
 @pytest.mark.gl
 def test_shadows_darken_and_brightness_brightens():
     def mean(look: Look) -> float:
-        env = ManipEnv("panda", cameras=("front",), look=look)
-        env.start(SEED)
-        return float(env.observe().images["front"].mean())
+        return float(started(cameras=("front",), look=look).observe().images["front"].mean())
 
     plain = mean(Look())
     assert mean(Look(shadows=True)) < plain - 0.3
@@ -185,47 +168,36 @@ def test_shadows_darken_and_brightness_brightens():
     assert mean(Look(brightness=1.2)) > plain + 5
 
 
-@pytest.mark.gl
-@pytest.mark.usefixtures("no_context_yet")
-def test_a_process_makes_one_opengl_context(monkeypatch):
-    made = []
-    context = mujoco.GLContext
-
-    def counted(*size: int):
-        made.append(size)
-        return context(*size)
-
-    monkeypatch.setattr("mujoco.gl_context.GLContext", counted)
-    for robot, look in (("panda", Look()), ("fetch", Look()), ("panda", Look(shadows=True)), ("panda", Look())):
-        env = ManipEnv(robot, cameras=CAMERAS, look=look)
-        env.start(SEED)
-        env.observe()
-    assert len(made) == 1
+ONE_CONTEXT = [("panda", Look()), ("fetch", Look()), ("panda", Look(shadows=True)), ("panda", Look())]
 
 
 @pytest.mark.gl
 @pytest.mark.usefixtures("no_context_yet")
-def test_sizes_may_alternate_without_uploading_the_scene_again(monkeypatch):
+@pytest.mark.parametrize(
+    ("context", "drawn"),
+    [
+        ("mujoco.gl_context.GLContext", [{"robot": robot, "look": look} for robot, look in ONE_CONTEXT]),
+        ("mujoco.MjrContext", 3 * [{"image_size": (128, 128)}, {"image_size": (240, 320)}]),  # the scene, uploaded
+    ],
+)
+def test_whatever_is_drawn_a_process_makes_one_opengl_context(context: str, drawn: list[dict[str, Any]], monkeypatch):
     made = []
-    context = mujoco.MjrContext
+    real = pkgutil.resolve_name(context)
 
-    def counted(*arguments):
+    def counted(*arguments: Any) -> Any:
         made.append(arguments)
-        return context(*arguments)
+        return real(*arguments)
 
-    monkeypatch.setattr(mujoco, "MjrContext", counted)
-    envs = [ManipEnv("panda", "reach", cameras=CAMERAS, image_size=size) for size in ((128, 128), (240, 320))]
-    for env in envs * 3:
-        env.start(SEED)
-        env.observe()
+    monkeypatch.setattr(context, counted)
+    for settings in drawn:
+        started(cameras=CAMERAS, **settings).observe()
     assert len(made) == 1
 
 
 @pytest.mark.gl
 @pytest.mark.slow
 def test_after_a_fork_the_error_says_to_spawn():
-    env = ManipEnv("panda", "reach", cameras=("front",))
-    env.start(SEED)
+    env = started("panda", "reach", cameras=("front",))
     env.observe()
     with (
         ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool,
@@ -235,9 +207,7 @@ def test_after_a_fork_the_error_says_to_spawn():
 
 
 def test_without_a_render_mode_there_is_no_picture():
-    env = ManipEnv("panda", "reach")
-    env.start(SEED)
-    assert env.render() is None
+    assert started("panda", "reach").render() is None
 
 
 @pytest.mark.usefixtures("no_context_yet")
@@ -246,8 +216,7 @@ def test_without_opengl_the_error_names_debians_packages(monkeypatch):
         raise ImportError("cannot load libEGL.so.1")
 
     monkeypatch.setattr("mujoco.gl_context.GLContext", broken)
-    env = ManipEnv("panda", "reach", cameras=("front",))
-    env.start(SEED)
+    env = started("panda", "reach", cameras=("front",))
     with pytest.raises(RenderError, match=r"libEGL\.so\.1.*apt-get install -y libegl1 libegl-mesa0") as caught:
         env.observe()
     assert caught.value.exit_code == 1
@@ -259,13 +228,14 @@ def test_an_unknown_robot_is_no_fault_of_opengl():
         render.pictures("pand", "reach", env.data, CameraConfig(("front",)))
 
 
-def test_the_users_choice_of_backend_stands(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    assert choose_backend() == "glfw"
-    monkeypatch.setenv("MUJOCO_GL", "off")
-    assert choose_backend() == "off"
+@pytest.mark.parametrize("chosen", ["glfw", "off", "eglo"])  # on import nobody could answer an error
+def test_the_users_choice_of_backend_stands(chosen: str, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", chosen)
+    assert choose_backend() == chosen
+
+
+def test_a_backend_that_mujoco_does_not_know_is_refused(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "eglo")
-    assert choose_backend() == "eglo"  # it is called on import, where nobody could answer an error
     with pytest.raises(RenderError, match="MUJOCO_GL is 'eglo'; expected egl or osmesa"):
         require_known_backend()
     monkeypatch.setenv("MUJOCO_GL", "EGL ")

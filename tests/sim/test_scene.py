@@ -7,63 +7,31 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import DT_SIM, build_scene, camera_id
-from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS
+from manip_il.tasks.objects import CUBE_HALF
 
+from ..scenes import cube, drive_until, in_hand, started, still
 from ..tables import SCENES, every_robot, every_scene
 
-SEED = 5_000_000
-FURNITURE = {"table", "floor", "pedestal", "object", "leg0", "leg1", "leg2", "leg3"}
 
-
-def touching(env: ManipEnv) -> set[frozenset[str]]:
-    model = env.scene.model
-    pairs = ((model.geom(c.geom1).name, model.geom(c.geom2).name) for c in env.data.contact)
-    return {frozenset(name if name in FURNITURE else "robot" for name in pair) for pair in pairs}
-
-
-@every_robot
-def test_at_the_start_the_robot_touches_nothing(robot: str):
-    env = ManipEnv(robot)
-    for seed in range(SEED, SEED + 20):
-        env.start(seed)
-        assert touching(env) <= {frozenset(["object", "table"]), frozenset(["robot"])}
-        assert all(contact.dist > -1e-4 for contact in env.data.contact)
-
-
-@every_robot
-def test_an_arm_told_to_stand_still_stands_still(robot: str):
-    env = ManipEnv(robot, "reach")
-    env.start(SEED)
-    q = env.data.qpos[env.scene.arm_q].copy()
-    command = env.scene.actions.join(q, env.world.opening)
+@every_scene
+def test_an_arm_told_to_stand_still_and_an_untouched_cube_do(robot: str, task: str):
+    env = started(robot, task)
+    q, command = env.data.qpos[env.scene.arm_q].copy(), still(env)
+    lying = {name: env.world.pose(name).position.copy() for name in env.scene.objects}
     for _ in range(40):
         env.advance(command)
     np.testing.assert_allclose(env.data.qpos[env.scene.arm_q], q, atol=2e-3)
-
-
-def test_an_untouched_cube_lies_still():
-    env = ManipEnv()
-    env.start(SEED)
-    before = cube(env)
-    command = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], 0.04)
-    for _ in range(40):
-        env.advance(command)
-    np.testing.assert_allclose(cube(env), before, atol=1e-3)
-    assert cube(env)[2] == pytest.approx(CUBE_HALF, abs=5e-4)
-
-
-def test_the_cube_weighs_what_the_constant_says():
-    assert build_scene("panda", "lift").model.body("object").mass[0] == CUBE_MASS
+    for name, at in lying.items():
+        np.testing.assert_allclose(env.world.pose(name).position, at, atol=1e-3)
+        assert env.world.pose(name).position[2] == pytest.approx(CUBE_HALF, abs=5e-4)
 
 
 @every_robot
-def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str, drive_until):
-    env = ManipEnv(robot, "lift")
-    env.start(SEED)
+def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
+    env = started(robot, "lift")
     drive_until(env, "at_goal")
-    command = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl], 0.0)
+    command = still(env, 0.0)
     for _ in range(5):  # the arm comes to rest
         env.advance(command)
     first = in_hand(env)
@@ -71,17 +39,6 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str, drive_unti
     for _ in range(100):
         env.advance(command)
     assert np.linalg.norm(in_hand(env) - first) < 1e-3
-
-
-def cube(env: ManipEnv) -> np.ndarray:
-    return env.data.joint("object").qpos[:3].copy()
-
-
-def in_hand(env: ManipEnv) -> np.ndarray:
-    """The cube's centre in the hand's frame [m]."""
-    data, scene = env.data, env.scene
-    offset = cube(env) - data.site_xpos[scene.ee_site]
-    return data.site_xmat[scene.ee_site].reshape(3, 3).T @ offset
 
 
 @every_scene

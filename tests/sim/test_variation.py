@@ -32,6 +32,14 @@ def free_body(shape: str, size: str, mass: float = 0.2) -> tuple[mujoco.MjModel,
     return mujoco.MjSpec.from_string(xml).compile(), {"thing": Object("thing", 1, 0, 0, 0)}
 
 
+def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
+    """Of the one body: MuJoCo turns its axes so that its moments are sorted."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, model.body_iquat[1])
+    axes = axes.reshape(3, 3)
+    return axes @ np.diag(model.body_inertia[1]) @ axes.T
+
+
 @every_scene
 def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
     scene = build_scene(robot, task)
@@ -39,24 +47,25 @@ def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
         np.testing.assert_array_equal(row, [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION])
 
 
-def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was():
-    plain = np.array([0.025, 0.025, 0.025, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"size": 0.07}), [0.035, 0.035, 0.035, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"mass": 0.3}), [0.025, 0.025, 0.025, 0.3, 1.0])
-    np.testing.assert_allclose(with_drawn(plain, {"friction": 0.5}), [0.025, 0.025, 0.025, 0.1, 0.5])
-    np.testing.assert_array_equal(with_drawn(plain, {"colour": [1, 0, 0]}), plain)
-    assert plain.tolist() == [0.025, 0.025, 0.025, 0.1, 1.0]
+CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
 
 
-def test_a_drawn_size_is_the_longest_edge_and_keeps_proportions():
-    tall = np.array([0.01, 0.02, 0.04, 0.1, 1.0])
-    np.testing.assert_allclose(with_drawn(tall, {"size": 0.04})[:3], [0.005, 0.01, 0.02])
-
-
-def test_every_object_is_drawn_alike_and_no_object_is_none():
-    two = np.tile([0.025, 0.025, 0.025, 0.1, 1.0], 2)
-    np.testing.assert_allclose(with_drawn(two, {"mass": 0.2})[[3, 8]], 0.2)
-    assert with_drawn(np.empty(0), {"mass": 0.2, "size": 0.05}).shape == (0,)
+@pytest.mark.parametrize(
+    ("before", "drawn", "after"),
+    [
+        (CUBE, {"size": 0.07}, [0.035, 0.035, 0.035, 0.1, 1.0]),
+        (TALL, {"size": 0.04}, [0.005, 0.01, 0.02, 0.1, 1.0]),  # the longest edge; proportions stay
+        (CUBE, {"mass": 0.3}, [0.025, 0.025, 0.025, 0.3, 1.0]),
+        (CUBE, {"friction": 0.5}, [0.025, 0.025, 0.025, 0.1, 0.5]),
+        (CUBE, {"colour": [1, 0, 0]}, CUBE),
+        (CUBE + TALL, {"mass": 0.2}, [0.025, 0.025, 0.025, 0.2, 1.0, 0.01, 0.02, 0.04, 0.2, 1.0]),
+        ([], {"mass": 0.2, "size": 0.05}, []),
+    ],
+)
+def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(before: list[float], drawn, after: list[float]):
+    base = np.array(before)
+    np.testing.assert_allclose(with_drawn(base, drawn), after)
+    assert base.tolist() == before
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -81,15 +90,7 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
     changed = copy.copy(plain)
     apply(changed, plain, objects, np.array([*size, *[0.0] * (3 - len(size)), mass, 1.0]))
     mujoco.mj_setConst(changed, mujoco.MjData(changed))
-    turned = compiled.body_iquat[1]  # MuJoCo turns a body's axes so that its moments are sorted
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, turned)
-    axes = axes.reshape(3, 3)
-    tensor = axes @ np.diag(compiled.body_inertia[1]) @ axes.T
-    own = np.empty(9)
-    mujoco.mju_quat2Mat(own, changed.body_iquat[1])
-    own = own.reshape(3, 3)
-    np.testing.assert_allclose(own @ np.diag(changed.body_inertia[1]) @ own.T, tensor, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(inertia_tensor(changed), inertia_tensor(compiled), rtol=1e-6, atol=1e-12)
     for name in ("body_mass", "body_subtreemass", "geom_rbound", "geom_aabb"):
         np.testing.assert_allclose(getattr(changed, name), getattr(compiled, name), rtol=1e-9, err_msg=name)
 

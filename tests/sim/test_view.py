@@ -8,10 +8,10 @@ import pytest
 
 from manip_il.sim import render, view
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.view import ViewModel, cluster
 
+from ..scenes import started
 from ..tables import every_robot
 
 
@@ -80,8 +80,7 @@ def test_a_view_has_the_physics_poses_and_at_most_12000_triangles(robot):
 @pytest.mark.gl
 @every_robot
 def test_few_faces_look_like_all_of_them(robot, monkeypatch):
-    env = ManipEnv(robot, cameras=CAMERAS)
-    env.start(5_000_000)
+    env = started(robot, cameras=CAMERAS)
     few = env.observe().images
     with monkeypatch.context() as patch:
         patch.setattr(view, "_with_few_faces", lambda robot, task: build_scene(robot, task).model)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,23 +17,23 @@ from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 
-from ..tables import every_scene, every_scene_with_an_object
+from ..scenes import world_at_home
+from ..tables import GRASPING, every_scene, every_scene_with_an_object
 
+BESIDE = np.array([-0.04, 0.1, 0.0])  # of the hand [m]
 HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 
 
-@pytest.fixture
-def world() -> World:
-    world = World(build_scene("fetch", "pick_place"))
-    world.update()
-    return world
+@pytest.fixture(params=GRASPING, ids="-".join)
+def world(request) -> World:
+    return world_at_home(*request.param)
 
 
 def fall(world: World, steps: int = 60) -> bytes:
     """The physics of a world in which the cube falls onto the table and the arm stays."""
     mujoco.mj_resetData(world.model, world.data)
     world.data.qpos[world.scene.arm_q] = world.data.ctrl[world.scene.arm_ctrl] = world.scene.robot.home
-    world.place(OBJECT, np.array([0.6, 0.1, 0.06]), np.array([0.9, 0.1, 0.3, 0.3]))
+    world.place(OBJECT, [*world.scene.robot.workspace.centre, 0.06] + BESIDE, np.array([0.9, 0.1, 0.3, 0.3]))
     mujoco.mj_step(world.model, world.data, steps)
     return world.physics().tobytes()
 
@@ -47,20 +49,14 @@ def test_a_world_as_compiled_shares_its_scenes_model(robot: str, task: str):
 
 
 def test_a_varied_world_has_a_model_of_its_own_and_leaves_the_shared_one(world: World):
-    before = world.scene.model_bytes()
+    before, other = world.scene.model_bytes(), World(world.scene)
     world.vary(with_drawn(world.scene.nominal, HEAVY))
-    fall(world)
-    assert world.model is not world.scene.model
-    assert world.scene.model_bytes() == before
     assert World(world.scene).model is world.scene.model
-
-
-def test_two_varied_worlds_do_not_share_a_model(world: World):
-    other = World(world.scene)
-    world.vary(with_drawn(world.scene.nominal, {"size": 0.07}))
     other.vary(with_drawn(world.scene.nominal, {"size": 0.03}))
     assert world.extents(OBJECT)[0] == pytest.approx(0.07)
     assert other.extents(OBJECT)[0] == pytest.approx(0.03)
+    fall(world)
+    assert world.scene.model_bytes() == before
 
 
 @every_scene_with_an_object
@@ -120,17 +116,10 @@ def test_the_drawn_friction_counts_whatever_the_cube_touches(world: World):
 @pytest.mark.parametrize("edge", [0.03, 0.07])
 def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, edge: float):
     world.vary(with_drawn(world.scene.nominal, {"size": edge}))
-    world.place(OBJECT, np.array([0.6, 0.1, edge / 2 + 0.01]), UPRIGHT)
+    world.place(OBJECT, [*world.scene.robot.workspace.centre, edge / 2 + 0.01] + BESIDE, UPRIGHT)
     mujoco.mj_step(world.model, world.data, 400)
     world.update()
     assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
-
-
-def test_a_variation_of_another_length_is_refused_with_both(world: World):
-    with pytest.raises(MismatchError, match=r"size of the variation.*has 3, .*has 5"):
-        world.vary(np.ones(3))
-    with pytest.raises(MismatchError, match=r"has 5, .*has 0"):
-        World(build_scene("fetch", "reach")).vary(np.ones(5))
 
 
 @pytest.mark.parametrize("bad", [0.0, -0.01])
@@ -158,36 +147,39 @@ def test_a_restored_world_is_the_one_that_was_saved(world: World):
     world.update()
     other.restore(world.physics(), world.variation)
     assert other.physics().tobytes() == world.physics().tobytes()
-    for name in (OBJECT, "robot/robot0:gripper_link"):
+    for name in (OBJECT, f"robot/{world.scene.robot.ee.body}"):
         np.testing.assert_array_equal(other.pose(name).position, world.pose(name).position)
         np.testing.assert_array_equal(other.pose(name).rotation, world.pose(name).rotation)
 
 
-def test_physics_of_another_scene_is_refused_with_both_sizes(world: World):
-    with pytest.raises(MismatchError, match=rf"has 3, fetch pick_place has {world.scene.state_size}"):
+def test_numbers_of_another_scene_are_refused_with_both_sizes(world: World):
+    with pytest.raises(MismatchError, match=rf"has 3, {world.scene.name} has {world.scene.state_size}"):
         world.restore(np.zeros(3), world.scene.nominal)
+    with pytest.raises(MismatchError, match=r"size of the variation.*has 3, .*has 5"):
+        world.vary(np.ones(3))
+    with pytest.raises(MismatchError, match=r"has 5, .*has 0"):
+        World(build_scene("fetch", "reach")).vary(np.ones(5))
 
 
 def test_what_was_worked_out_is_known_until_the_world_moves(world: World):
-    asked = []
+    answers = itertools.count()
 
-    def work_out() -> int:
-        asked.append(1)
-        return len(asked)
+    def known() -> int:
+        return world.remember("answer", lambda: next(answers))
 
-    assert [world.remember("answer", work_out) for _ in range(3)] == [1, 1, 1]
+    assert [known(), known(), known()] == [0, 0, 0]
     world.update()
-    assert world.remember("answer", work_out) == 2
+    assert known() == 1
     world.vary(with_drawn(world.scene.nominal, HEAVY))
     world.update()
-    assert world.remember("answer", work_out) == 3
+    assert known() == 2
     world.restore(world.physics(), world.variation)
-    assert world.remember("answer", work_out) == 4
+    assert known() == 3
 
 
 def test_answers_follow_the_world(world: World):
     gripper = world.scene.gripper
-    for opening, x in ((0.02, 0.55), (0.08, 0.65)):
+    for opening, x in ((0.02, 0.55), (0.075, 0.65)):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.place(OBJECT, np.array([x, 0.1, 0.2]), UPRIGHT)
         world.place("goal", np.array([x, 0.0, 0.3]), UPRIGHT)
@@ -213,5 +205,6 @@ def test_what_cannot_be_placed_is_refused_by_name(world: World):
         world.place("objct", np.zeros(3), UPRIGHT)
     with pytest.raises(UnknownName, match="did you mean 'goal'"):
         world.pose("gaol")
-    with pytest.raises(ManipError, match="'robot/robot0:gripper_link' is neither an object nor a mocap body"):
-        world.place("robot/robot0:gripper_link", np.zeros(3), UPRIGHT)
+    hand = f"robot/{world.scene.robot.ee.body}"
+    with pytest.raises(ManipError, match=f"'{hand}' is neither an object nor a mocap body"):
+        world.place(hand, np.zeros(3), UPRIGHT)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import boto3
 import pytest
 
 from ..synthetic import make_episode, offline, spec
 from .hub_server import Hub
 from .hub_use import a_hub, make_policy
-from .s3 import KEY, SECRET, Proxy, running_moto, running_proxy, variables
+from .s3 import Proxy, client_of, running_moto, running_proxy, variables
 from .sshd import Sshd, running_sshd
 
 __all__ = ["make_episode", "offline", "spec"]
@@ -35,8 +34,7 @@ def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRe
     for name, value in variables(moto).items():
         monkeypatch.setenv(name, value)
     name = f"b{abs(hash(request.node.nodeid)):x}"
-    client = boto3.client("s3", endpoint_url=moto, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
-    client.create_bucket(Bucket=name)
+    client_of(moto).create_bucket(Bucket=name)
     return name
 
 

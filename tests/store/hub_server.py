@@ -1,4 +1,4 @@
-"""A Hub for tests, of git repositories: answers what the unmodified huggingface_hub client asks for push and pull."""
+"""A Hub for tests: answers what the unmodified huggingface_hub client asks for push and pull."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs
 
 import yaml
 
-from .hub_repo import LFS_SUFFIXES, Blob, Repo, WrongParentError
-from .hub_wire import Answer, Wire
+from .hub_repo import LFS_SUFFIXES, Repo, WrongParentError
+from .wire import Answer, Wire
 
 _API = r"/api/(?P<name>(?:models|datasets)/[^/]+/[^/]+)"
 LFS_SECRET = "signature-of-an-upload"  # stands in signed URLs: nothing may print it
@@ -122,7 +121,7 @@ def _create(hub: Hub, call: _Call) -> Answer:
     with hub.creating:
         if f"{kind}/{name}" in hub.repos:
             raise Refused(409, f"You already created this {kind[:-1]} repo", url=url)
-        hub.repos[f"{kind}/{name}"] = Repo(f"{kind}/{name}", hub.folder / kind / name, owner, bool(private))
+        hub.repos[f"{kind}/{name}"] = Repo(hub.folder / kind / name, owner, bool(private))
     return Answer(200, {"url": url, "name": name})
 
 
@@ -152,7 +151,7 @@ def _lfs_batch(hub: Hub, call: _Call, name: str) -> Answer:
     repo, objects = call.writable(name), []
     for one in call.json()["objects"]:
         entry = {"oid": one["oid"], "size": one["size"]}
-        if not repo.object_path(one["oid"]).exists():
+        if not (repo.lfs / one["oid"]).exists():
             base = f"{hub.url}/lfs/{name}/{one['oid']}"
             entry["actions"] = {
                 "upload": {"href": f"{base}?X-Amz-Signature={LFS_SECRET}"},
@@ -167,14 +166,14 @@ def _lfs_put(hub: Hub, call: _Call, name: str, oid: str) -> Answer:
         raise Refused(403, "not signed")
     if hashlib.sha256(call.body).hexdigest() != oid:
         raise Refused(400, "the sha256 of what arrived is another one")
-    path = hub.repo(name).object_path(oid)
+    path = hub.repo(name).lfs / oid
     path.with_suffix(".part").write_bytes(call.body)
     path.with_suffix(".part").replace(path)
     return Answer()
 
 
 def _lfs_verify(hub: Hub, call: _Call, name: str, oid: str) -> Answer:
-    path = call.writable(name).object_path(oid)
+    path = call.writable(name).lfs / oid
     if not path.exists() or path.stat().st_size != call.json()["size"]:
         raise Refused(404, "no such object")
     return Answer()
@@ -192,7 +191,7 @@ def _commit(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
         if one["path"] not in tree:
             raise Refused(404, "A file with this name doesn't exist", "EntryNotFound")
     for one in values["lfsFile"]:
-        if not repo.object_path(one["oid"]).exists():
+        if not (repo.lfs / one["oid"]).exists():
             raise Refused(400, f"LFS pointer of {one['path']} points to a file that does not exist")
     files = {one["path"]: base64.b64decode(one["content"]) for one in values["file"]}
     lfs = {one["path"]: (one["oid"], one["size"]) for one in values["lfsFile"]}
@@ -240,43 +239,25 @@ def _branch(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
     return Answer()
 
 
-def _info(hub: Hub, call: _Call, name: str, revision: str = "main") -> Answer:
+def _info(hub: Hub, call: _Call, name: str, revision: str | None) -> Answer:
     repo = call.readable(name)
-    commit = call.at(repo, revision)
+    commit = call.at(repo, revision or "main")
     siblings = [{"rfilename": path} for path in repo.tree(commit)]
     about = {"_id": "0", "id": name.split("/", 1)[1], "sha": commit, "private": repo.private, "siblings": siblings}
     return Answer(200, {**about, "tags": [], "downloads": 0, "likes": 0, "disabled": False, "gated": False})
 
 
-def _tree(hub: Hub, call: _Call, name: str, revision: str, path: str | None) -> Answer:
+def _tree(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
+    """Every file, and the folders at the root, as a client that asks for all folders gets them."""
     repo = call.readable(name)
     files = repo.tree(call.at(repo, revision))
-    inside = {key: blob for key, blob in files.items() if path is None or key.startswith(f"{path}/")}
-    if path is not None and not inside:
-        raise Refused(404, f"{path} does not exist on {revision}", "EntryNotFound")
-    start = len(path) + 1 if path else 0
-    deep = parse_qs(call.query).get("recursive", ["false"])[0].lower() == "true"
-    folders = {key[: key.index("/", start)] for key in inside if "/" in key[start:]}
-    shown = [_entry(key, blob) for key, blob in inside.items() if deep or "/" not in key[start:]]
-    return Answer(200, [*({"type": "directory", "path": one, "oid": "0" * 40, "size": 0} for one in folders), *shown])
-
-
-def _entry(path: str, blob: Blob) -> dict[str, Any]:
-    lfs = {"lfs": {"oid": blob.oid, "size": blob.size, "pointerSize": 130}} if blob.oid else {}
-    return {"type": "file", "path": path, "oid": blob.git_sha1, "size": blob.size, **lfs}
-
-
-def _paths_info(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
-    repo = call.readable(name)
-    files = repo.tree(call.at(repo, revision))
-    wanted = parse_qs(call.body.decode()).get("paths", [])
-    return Answer(200, [_entry(path, files[path]) for path in wanted if path in files])
-
-
-def _commits(hub: Hub, call: _Call, name: str, revision: str) -> Answer:
-    repo = call.readable(name)
-    about = {"authors": [{"user": repo.owner}], "date": "2025-01-01T00:00:00.000Z", "message": ""}
-    return Answer(200, [{"id": sha, "title": title, **about} for sha, title in repo.log(call.at(repo, revision))])
+    assert "recursive=true" in call.query.lower()
+    folders = sorted({path.partition("/")[0] for path in files if "/" in path})
+    found = [{"type": "directory", "path": path, "oid": "0" * 40, "size": 0} for path in folders]
+    for path, blob in files.items():
+        lfs = {"lfs": {"oid": blob.oid, "size": blob.size, "pointerSize": 130}} if blob.oid else {}
+        found.append({"type": "file", "path": path, "oid": blob.git_sha1, "size": blob.size, **lfs})
+    return Answer(200, found)
 
 
 def _resolve(hub: Hub, call: _Call, name: str, revision: str, path: str) -> Answer:
@@ -291,16 +272,11 @@ def _resolve(hub: Hub, call: _Call, name: str, revision: str, path: str) -> Answ
     return Answer(200, repo.read(blob), {"Content-Type": "application/octet-stream", **headers})
 
 
-def _whoami(hub: Hub, call: _Call) -> Answer:
-    return Answer(200, {"type": "user", "name": call.user().user, "orgs": []})
-
-
 _REVISION = r"(?P<revision>[^/]+)"
 _REPO = r"/(?P<name>(?:datasets/)?[^/]+/[^/]+)"
 _ROUTES: dict[str, Any] = {
     r"POST /api/repos/create": _create,
     r"POST /api/validate-yaml": _validate_yaml,
-    r"GET /api/whoami-v2": _whoami,
     rf"POST {_API}/preupload/{_REVISION}": _preupload,
     rf"POST {_REPO}\.git/info/lfs/objects/batch": _lfs_batch,
     r"PUT /lfs/(?P<name>[^/]+/[^/]+/[^/]+)/(?P<oid>[0-9a-f]{64})": _lfs_put,
@@ -310,12 +286,8 @@ _ROUTES: dict[str, Any] = {
     rf"POST {_API}/tag/{_REVISION}": _tag,
     rf"DELETE {_API}/tag/{_REVISION}": _untag,
     rf"POST {_API}/branch/{_REVISION}": _branch,
-    rf"GET {_API}(?:/revision/{_REVISION})?": lambda hub, call, name, revision: _info(
-        hub, call, name, revision or "main"
-    ),
-    rf"GET {_API}/tree/{_REVISION}(?:/(?P<path>.+))?": _tree,
-    rf"POST {_API}/paths-info/{_REVISION}": _paths_info,
-    rf"GET {_API}/commits/{_REVISION}": _commits,
+    rf"GET {_API}(?:/revision/{_REVISION})?": _info,
+    rf"GET {_API}/tree/{_REVISION}": _tree,
     rf"(?:GET|HEAD) {_REPO}/resolve/{_REVISION}/(?P<path>.+)": _resolve,
 }
 

@@ -11,9 +11,10 @@ import pytest
 from huggingface_hub import constants
 
 from manip_il.store.errors import Retry
+from manip_il.store.folder import open_remote
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
-from manip_il.store.remote import MANIFEST_FILE, Published, RemoteUrl, open_remote
+from manip_il.store.remote import MANIFEST_FILE, Published, RemoteUrl
 
 from ..learn.tiny_policies import write_checkpoint
 from .hub_server import Hub, hub_server
@@ -51,9 +52,8 @@ def do_pull(target: Path, url: str = DATASET) -> Pulled:
 
 def files_of_main(hub: Hub) -> dict[str, bytes]:
     """Path -> bytes of what a reader of the dataset's main branch sees."""
-    repo = hub.repo("datasets/user/demos")
-    tree = repo.tree(repo.refs("heads")["main"])
-    return {path: repo.read(blob) for path, blob in tree.items() if path not in (MANIFEST_FILE, ".gitattributes")}
+    files = hub.repo("datasets/user/demos").files
+    return {path: data for path, data in files.items() if path not in (MANIFEST_FILE, ".gitattributes")}
 
 
 def copy_sample(target: Path) -> Path:

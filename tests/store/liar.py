@@ -116,7 +116,7 @@ def endless(piece: bytes, status: str = "200 OK", **headers: str) -> Iterator[by
 
 
 def error_of_pull(url: str, folder: Path, capsys: pytest.CaptureFixture[str], token: str) -> str:
-    """The one line that a pull ends in, without the token; nothing is left of it."""
+    """The one line of the error that a pull ends in, without the token; nothing is left of it."""
     assert main(["pull", url, str(folder / "got"), "--quiet"]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1, error

@@ -5,17 +5,19 @@ from __future__ import annotations
 import contextlib
 import http.client
 import logging
-import re
-import threading
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import quote
 
+import boto3
 from moto.server import ThreadedMotoServer
+
+from .wire import Answer, Fault, Wire
 
 KEY, SECRET = "AKIATESTTESTTESTTEST", "a/secret/that+nobody/must/see"
 _HOP = ("connection", "transfer-encoding", "content-length", "date", "server")
+
+Change = Callable[[int, dict[str, str], bytes], tuple[int, dict[str, str], bytes]]
 
 
 @contextlib.contextmanager
@@ -44,113 +46,48 @@ def variables(endpoint: str) -> dict[str, str]:
     }
 
 
-Change = Callable[[int, dict[str, str], bytes], tuple[int, dict[str, str], bytes]]
+def client_of(endpoint: str) -> Any:
+    """boto3's client."""
+    return boto3.client("s3", endpoint_url=endpoint, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
 
 
-@dataclass
-class Fault:
-    """What happens to requests that match, so many times.
-
-    what: a status to refuse with (500, 429, 403), cut, flip (what is sent), flip_answer, slow, unconditional.
-    """
-
-    what: str
-    method: str
-    path: str = ""
-    times: int = 1
-    code: str = ""
-
-    def fits(self, method: str, path: str) -> bool:
-        if self.times <= 0 or method != self.method or not re.search(self.path, path):
-            return False
-        self.times -= 1
-        return True
+def refusal(match: str, status: int, code: str = "Busy", times: int = 10**6) -> Fault:
+    """A fault that is an error in S3's words."""
+    body = f"<Error><Code>{code}</Code><Message>no</Message></Error>".encode()
+    return Fault(match, times, status, {"Retry-After": "7"} if status == 429 else {}, body)
 
 
-@dataclass
-class Proxy:
-    """requests: method, path and body size of all that came."""
+class Proxy(Wire):
+    """Passes requests on to a store. change: what goes out in place of an answer."""
 
-    endpoint: str
-    faults: list[Fault] = field(default_factory=list)
-    requests: list[tuple[str, str, int]] = field(default_factory=list)
-    url: str = ""
-    before: Callable[[str, str], None] = lambda method, path: None
-    change: Change = lambda status, headers, data: (status, headers, data)  # what goes out in place of an answer
+    cuts_ranges = False  # the store does
 
-    def fault(self, method: str, path: str) -> Fault | None:
-        return next((fault for fault in self.faults if fault.fits(method, path)), None)
+    def __init__(self, endpoint: str):
+        self._host = endpoint.removeprefix("http://")
+        self.drops_conditions = False
+        self.before: Callable[[str], object] = lambda line: None  # gets every request's `METHOD /path?query`
+        self.change: Change = lambda status, headers, data: (status, headers, data)
+        super().__init__()
+
+    def take_fault(self, line: str) -> Fault:
+        self.before(line)
+        return super().take_fault(line)
+
+    def answer(self, method: str, path: str, query: str, headers: Any, body: bytes) -> Answer:
+        line = f"{quote(path)}?{query}" if query else quote(path)
+        dropped = "if-" if self.drops_conditions else "connection"
+        kept = {name: value for name, value in headers.items() if not name.lower().startswith(dropped)}
+        with contextlib.closing(http.client.HTTPConnection(self._host, timeout=120)) as connection:
+            connection.request(method, line, body, kept)
+            found = connection.getresponse()
+            status, changed, data = self.change(found.status, dict(found.getheaders()), found.read())
+        given = {key: value for key, value in changed.items() if key.lower() not in _HOP}
+        if method == "HEAD":
+            given["Content-Length"] = found.getheader("Content-Length") or "0"
+        return Answer(status, data, given)
 
 
 @contextlib.contextmanager
 def running_proxy(endpoint: str) -> Iterator[Proxy]:
-    proxy = Proxy(endpoint)
-    host = endpoint.removeprefix("http://")
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-        def handle_any(self) -> None:
-            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-            proxy.requests.append((self.command, self.path, len(body)))
-            proxy.before(self.command, self.path)
-            fault = proxy.fault(self.command, self.path)
-            what = fault.what if fault else ""
-            if what.isdecimal():
-                self._refuse(int(what), fault.code)
-                return
-            headers = dict(self.headers.items())
-            if what == "unconditional":
-                headers = {name: value for name, value in headers.items() if not name.lower().startswith("if-")}
-            if what == "flip" and body:
-                body = bytes([body[0] ^ 1]) + body[1:]
-            if what == "slow":
-                time.sleep(0.5)
-            self._forward(headers, body, what)
-
-        do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = handle_any  # noqa: N815
-
-        def _refuse(self, status: int, code: str) -> None:
-            text = f"<Error><Code>{code or 'Busy'}</Code><Message>no</Message></Error>".encode()
-            self.send_response(status)
-            if status == 429:
-                self.send_header("Retry-After", "7")
-            self.send_header("Content-Length", str(len(text)))
-            self.end_headers()
-            self.wfile.write(text)
-
-        def _forward(self, headers: dict[str, str], body: bytes, what: str) -> None:
-            connection = http.client.HTTPConnection(host, timeout=120)
-            try:
-                connection.request(self.command, self.path, body, headers)
-                answer = connection.getresponse()
-                data = answer.read()
-            finally:
-                connection.close()
-            status, headers, data = proxy.change(answer.status, dict(answer.getheaders()), data)
-            self.send_response(status)
-            for name, value in headers.items():
-                if name.lower() not in _HOP:
-                    self.send_header(name, value)
-            length = answer.getheader("Content-Length") if self.command == "HEAD" else str(len(data))
-            self.send_header("Content-Length", length or "0")
-            self.end_headers()
-            if what == "flip_answer" and data:
-                data = bytes([data[0] ^ 1]) + data[1:]
-            self.wfile.write(data[: len(data) // 2] if what == "cut" else data)
-            if what == "cut":
-                self.close_connection = True
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
-    thread.start()
-    proxy.url = f"http://127.0.0.1:{server.server_address[1]}"
-    try:
+    with contextlib.closing(Proxy(endpoint)) as proxy:
         yield proxy
-    finally:
-        server.shutdown()
-        server.server_close()

@@ -35,25 +35,20 @@ def run(tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def test_the_datasets_card_is_what_the_hub_reads():
-    text = card_for(SAMPLE, "dataset", URL)[CARD].decode()
+def test_the_datasets_card_is_what_the_hub_reads_and_shows_its_picture_by_a_relative_link():
+    files = card_for(SAMPLE, "dataset", URL)
+    text, picture = files[CARD].decode(), Image.open(io.BytesIO(files[PICTURE]))
     data = DatasetCard(text).data
     assert isinstance(data, DatasetCardData)
-    assert data.license == "apache-2.0"
-    assert data.task_categories == ["robotics"]
+    assert (data.license, data.task_categories) == ("apache-2.0", ["robotics"])
     assert {"LeRobot", "robotics", "panda", "pick_place"} <= set(data.to_dict()["tags"])
     assert data.to_dict()["configs"] == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     for fact in ("| episodes | 10 |", "375 at 20 a second", "10 of 10", "1000000 to 1000009", "model_sha256"):
         assert fact in text
     assert 'LeRobotDataset("user/demos")' in text
-
-
-def test_the_picture_is_a_png_that_the_card_shows_by_a_relative_link():
-    files = card_for(SAMPLE, "dataset", URL)
-    picture = Image.open(io.BytesIO(files[PICTURE]))
+    assert f"]({PICTURE})" in text
     assert picture.format == "PNG"
     assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 50
-    assert f"]({PICTURE})" in files[CARD].decode()
 
 
 def test_the_drawn_paths_begin_and_end_where_the_cubes_do():

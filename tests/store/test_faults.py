@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,55 +20,46 @@ from manip_il.store.errors import (
     redact,
     retry_after,
 )
+from manip_il.store.folder import scan
 from manip_il.store.pull import pull
 from manip_il.store.push import push
 
-from .s3 import KEY, SECRET, Fault, Proxy
+from .s3 import KEY, SECRET, Proxy, refusal
 from .trees import content, impatient, make_run, no_wait, unwatched
+from .wire import Fault
 
-OBJECT, MANIFEST = "/objects/[0-9a-f]{2}/", "manip_il_manifest"
+PUT_OBJECT, GET_OBJECT = ("^PUT .*/objects/[0-9a-f]{2}/", "^GET .*/objects/[0-9a-f]{2}/")
+OUTLIVED = {
+    "500 for objects": refusal(PUT_OBJECT, 500, "InternalError", 3),
+    "500 for a manifest": refusal("^PUT .*manip_il_manifest", 500, times=2),
+    "429 for objects": refusal(PUT_OBJECT, 429, times=2),
+    "other bytes arrive": Fault(PUT_OBJECT, corrupt=True),
+    "a slow upload": Fault(PUT_OBJECT, pause=0.02),
+    "a manifest whose answer is lost": Fault("^PUT .*manip_il_manifest", lost=True),
+    "500 for reading a manifest": refusal("^GET .*manip_il_manifest", 500, times=1),
+    "500 for an object": refusal(GET_OBJECT, 500, times=1),
+    "429 for an object": refusal(GET_OBJECT, 429, times=1),
+    "an object that is cut": Fault(GET_OBJECT, cut=300_000),
+    "other bytes come": Fault(GET_OBJECT, corrupt=True),
+    "a slow download": Fault(GET_OBJECT, pause=0.02),
+}
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        Fault("500", "PUT", OBJECT, 3, "InternalError"),
-        Fault("500", "PUT", MANIFEST, 2),
-        Fault("429", "PUT", OBJECT, 2),
-        Fault("flip", "PUT", OBJECT, 1),
-        Fault("slow", "PUT", OBJECT, 1),
-        Fault("500", "GET", MANIFEST, 1),
-        Fault("cut", "PUT", MANIFEST, 1),
-    ],
-    ids=lambda fault: f"{fault.what}-{fault.method}-{fault.path[:4]}",
-)
-def test_a_push_outlives_it(fault: Fault, proxy: Proxy, bucket: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("fault", OUTLIVED.values(), ids=OUTLIVED)
+def test_a_push_and_a_pull_outlive(fault: Fault, proxy: Proxy, bucket: str, tmp_path: Path) -> None:
     run, waits = make_run(tmp_path / "run", 1), list[float]()
-    proxy.faults = [fault]
+    proxy.faults = [replace(fault)]
     url, remote = impatient(f"s3://{bucket}/demos", waits)
     push(run, url, remote, unwatched)
-    assert proxy.faults[0].times == 0
-    pull(url, remote, tmp_path / "got", unwatched, retry=no_wait())
-    assert content(tmp_path / "got") == content(run)
-    if fault.what == "429":
-        assert max(waits) >= 7  # as Retry-After asked
-
-
-@pytest.mark.parametrize("what", ["500", "429", "cut", "flip_answer", "slow"])
-def test_a_pull_outlives_it(what: str, proxy: Proxy, bucket: str, tmp_path: Path) -> None:
-    run, waits = make_run(tmp_path / "run", 1), list[float]()
-    url, remote = impatient(f"s3://{bucket}/demos")
-    push(run, url, remote, unwatched)
-    proxy.faults = [Fault(what, "GET", OBJECT, 1)]
     pull(url, remote, tmp_path / "got", unwatched, retry=no_wait(waits))
     assert proxy.faults[0].times == 0
     assert content(tmp_path / "got") == content(run)
-    if what == "429":
-        assert max(waits) >= 7
+    if fault.status == 429:
+        assert max(waits) >= 7  # as Retry-After asked
 
 
 def test_a_store_that_keeps_other_bytes_is_named(proxy: Proxy, bucket: str, tmp_path: Path) -> None:
-    proxy.faults = [Fault("flip", "PUT", OBJECT, 10**6)]
+    proxy.faults = [Fault(PUT_OBJECT, 10**6, corrupt=True)]
     url, remote = impatient(f"s3://{bucket}/demos")
     with pytest.raises(RemoteError, match="the bytes that were sent"):
         push(make_run(tmp_path / "run", 1), url, remote, unwatched)
@@ -77,14 +69,14 @@ def test_a_store_that_keeps_other_bytes_is_named(proxy: Proxy, bucket: str, tmp_
 def test_a_remote_with_wrong_bytes_is_named(proxy: Proxy, bucket: str, tmp_path: Path) -> None:
     url, remote = impatient(f"s3://{bucket}/demos")
     push(make_run(tmp_path / "run", 1), url, remote, unwatched)
-    proxy.faults = [Fault("flip_answer", "GET", OBJECT, 10**6)]
+    proxy.faults = [Fault(GET_OBJECT, 10**6, corrupt=True)]
     with pytest.raises(HashError, match="does not match the manifest: its hash differs, twice"):
         pull(url, remote, tmp_path / "got", unwatched, retry=no_wait())
     assert not (tmp_path / "got").exists()
 
 
 def test_a_store_that_ignores_conditions_is_said_to(proxy: Proxy, bucket: str, tmp_path: Path) -> None:
-    proxy.faults = [Fault("unconditional", "PUT", "", 10**6)]
+    proxy.drops_conditions = True
     url, remote = impatient(f"s3://{bucket}/demos")
     push(make_run(tmp_path / "run", 1), url, remote, unwatched)
     assert remote.warnings == (
@@ -93,16 +85,15 @@ def test_a_store_that_ignores_conditions_is_said_to(proxy: Proxy, bucket: str, t
     push(make_run(tmp_path / "run2", 2), url, remote, unwatched)
 
 
-@pytest.mark.parametrize(
-    ("fault", "kind", "words"),
-    [
-        (Fault("403", "PUT", "", 10**6, "AccessDenied"), AuthError, "has no permission for it; ask the bucket's owner"),
-        (Fault("403", "GET", "", 10**6, "InvalidAccessKeyId"), AuthError, "set AWS_ACCESS_KEY_ID and"),
-        (Fault("507", "PUT", OBJECT, 10**6, "XMinioStorageFull"), NoSpaceError, "the store is full"),
-        (Fault("500", "PUT", OBJECT, 10**6), RemoteError, "tried 6 times, try again later"),
-    ],
-    ids=["no right", "wrong key", "full", "broken"],
-)
+REFUSED = {
+    "no right": (refusal("^PUT", 403, "AccessDenied"), AuthError, "has no permission for it; ask the bucket's owner"),
+    "wrong key": (refusal("^GET", 403, "InvalidAccessKeyId"), AuthError, "set AWS_ACCESS_KEY_ID and"),
+    "full": (refusal(PUT_OBJECT, 507, "XMinioStorageFull"), NoSpaceError, "the store is full"),
+    "broken": (refusal(PUT_OBJECT, 500), RemoteError, "tried 6 times, try again later"),
+}
+
+
+@pytest.mark.parametrize(("fault", "kind", "words"), REFUSED.values(), ids=REFUSED)
 def test_what_s3_refuses_is_one_clear_line(
     fault: Fault, kind: type[RemoteError], words: str, proxy: Proxy, bucket: str, tmp_path: Path
 ) -> None:
@@ -115,33 +106,30 @@ def test_what_s3_refuses_is_one_clear_line(
     assert SECRET not in str(caught.value)
 
 
-def test_no_such_bucket(bucket: str, tmp_path: Path) -> None:
-    url, remote = impatient("s3://no-such-bucket/demos")
-    for work in (lambda: push(make_run(tmp_path / "run", 1), url, remote, unwatched), remote.read):
-        with pytest.raises(NotFoundError, match="there is no bucket no-such-bucket; make it, or check the name"):
-            work()
+NOWHERE = {
+    "no bucket": ("s3://nowhere/x", {}, NotFoundError, "there is no bucket nowhere; make it, or check the name"),
+    "no host": ("sftp://no-such.invalid/x", {}, NotFoundError, r"there is no host no-such\.invalid; check the name"),
+    "no answer": (
+        "s3://bucket/x",
+        {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"},
+        RemoteError,
+        r"from http://127\.0\.0\.1:9",
+    ),
+    "no login": (
+        "s3://bucket/x",
+        {"AWS_ACCESS_KEY_ID": None, "AWS_SECRET_ACCESS_KEY": None},
+        AuthError,
+        "not logged in; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    ),
+}
 
 
-LOGIN = {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}
-
-
-@pytest.mark.parametrize(
-    ("variables", "words"),
-    [
-        (LOGIN, "not logged in; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"),
-        ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, r"no answer from http://127\.0\.0\.1:9"),
-    ],
-    ids=["nobody is logged in", "nobody answers"],
-)
-def test_an_environment_that_leads_nowhere(
-    variables: dict[str, str], words: str, bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("url", "variables", "kind", "words"), NOWHERE.values(), ids=NOWHERE)
+def test_what_leads_nowhere_is_named(url, variables, kind, words, bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-        if not value:
-            monkeypatch.delenv(name)
-    with pytest.raises(AuthError if variables is LOGIN else RemoteError, match=words):
-        impatient(f"s3://{bucket}/demos")[1].read()
+        monkeypatch.delenv(name) if value is None else monkeypatch.setenv(name, value)
+    with pytest.raises(kind, match=words):
+        impatient(url)[1].read()
 
 
 def test_nothing_there(place: str, tmp_path: Path) -> None:
@@ -191,8 +179,6 @@ def test_an_object_that_is_gone_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from manip_il.store.push import scan
-
     run = make_run(tmp_path / "run", 1)
     _, remote = impatient(place)
     scanned = scan(run, "policy")
@@ -235,11 +221,6 @@ class _Short:
         self.left -= min(self.left, len(data))
 
 
-def test_no_such_host() -> None:
-    with pytest.raises(NotFoundError, match=r"there is no host no-such-host\.invalid; check the name"):
-        impatient("sftp://no-such-host.invalid/x")[1].read()
-
-
 def attempts(error: RemoteError, waits: list[float]) -> tuple[str, int]:
     """What work that always fails ends in, and how often it was tried."""
     tries: list[int] = []
@@ -278,13 +259,11 @@ def test_retry_after_is_read_as_seconds_or_date() -> None:
         "Authorization: Bearer abcdef0123",
         "sftp://me:abcdef0123@h/x",
         "token hf_abcdef0123 is bad",
+        f"the key {SECRET} is not taken",
     ],
 )
-def test_secrets_are_taken_out_of_any_text(text: str) -> None:
-    assert "abcdef0123" not in redact(text)
-    assert "abcdef0123" not in str(RemoteError(text))
-
-
-def test_keys_of_the_environment_are_taken_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_secrets_are_taken_out_of_any_text(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", SECRET)
-    assert SECRET not in str(RemoteError(f"the key {SECRET} is not taken"))
+    for shown in (redact(text), str(RemoteError(text))):
+        assert "abcdef0123" not in shown
+        assert SECRET not in shown

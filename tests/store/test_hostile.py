@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from manip_il.store.errors import ManifestError, NotFoundError, RemoteError
 from manip_il.store.manifest import FileEntry, Manifest
 from manip_il.store.pull import pull
+from manip_il.store.push import push
 
-from .trees import content, impatient, no_wait, unwatched
+from .trees import content, impatient, make_run, no_wait, unwatched
 
 DATA = b"payload"
 SIZE = len(DATA)
@@ -149,6 +150,22 @@ def test_an_object_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(RemoteError, match="cannot read file://"):
         pull(url, remote, tmp_path / "target", unwatched)
     assert not (tmp_path / "target").exists()
+
+
+def test_a_push_puts_the_file_itself_in_place_of_an_object_that_is_a_link(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", 1)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_bytes(b"theirs")
+    (run / "note.txt").write_bytes(b"x" * len(str(elsewhere)))  # as long as the link: a file's size alone does not tell
+    url, remote = impatient(f"file://{tmp_path}/store")
+    push(run, url, remote, unwatched)
+    (path,) = (tmp_path / "store").glob(f"objects/*/{hashlib.sha256((run / 'note.txt').read_bytes()).hexdigest()}")
+    path.unlink()
+    path.symlink_to(elsewhere)
+    _, published = push(run, url, remote, unwatched)
+    assert (published.uploaded, path.is_symlink(), elsewhere.read_bytes()) == (1, False, b"theirs")
+    pull(url, remote, tmp_path / "target", unwatched)
+    assert content(tmp_path / "target") == content(run)
 
 
 def test_links_planted_in_the_staging_folder_are_not_written_through(tmp_path: Path) -> None:

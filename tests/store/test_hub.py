@@ -1,11 +1,13 @@
-"""Push and pull by the Hub's own client, against a Hub of git repositories on loopback."""
+"""Push and pull by the Hub's own client, against a Hub on loopback."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
+import subprocess
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -14,10 +16,12 @@ from huggingface_hub.utils import logging as hub_logging
 
 from manip_il.errors import UsageError
 from manip_il.store.cards import CARD, PICTURE
+from manip_il.store.disk import git_digest
 from manip_il.store.errors import ConflictError
+from manip_il.store.folder import open_remote, scan
 from manip_il.store.hub_session import hub_session
-from manip_il.store.push import check_source, push, scan
-from manip_il.store.remote import MANIFEST_FILE, RemoteUrl, open_remote
+from manip_il.store.push import check_source, push
+from manip_il.store.remote import MANIFEST_FILE, RemoteUrl
 
 from .hub_server import Hub
 from .hub_use import (
@@ -30,8 +34,8 @@ from .hub_use import (
     do_push,
     other_version,
 )
-from .hub_wire import Fault
-from .trees import content
+from .trees import content, wait_little
+from .wire import Fault
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +146,11 @@ def test_readers_see_one_version_or_the_other(hub: Hub, tmp_path: Path, other: P
     assert all(size in seen for size in sizes)
 
 
-def test_of_two_pushers_one_wins_and_the_other_is_told(hub: Hub, other: Path):
+@pytest.mark.parametrize("faults", [[], [Fault("/commit/", cut=10)]], ids=["answered", "the answer is lost"])
+def test_of_two_pushers_one_wins_and_the_other_is_told(
+    faults: list[Fault], hub: Hub, other: Path, monkeypatch: pytest.MonkeyPatch
+):
+    wait_little(monkeypatch)
     do_push(SAMPLE)
     remote, url = open_remote(RemoteUrl.parse(DATASET)), RemoteUrl.parse(DATASET)
     before = remote.read()
@@ -150,6 +158,7 @@ def test_of_two_pushers_one_wins_and_the_other_is_told(hub: Hub, other: Path):
     repo = hub.repo("datasets/user/demos")
     head = repo.refs("heads")["main"]
     scanned = scan(SAMPLE, check_source(SAMPLE, url))
+    hub.faults = faults
     with pytest.raises(ConflictError, match="changed by another push"):
         remote.publish(scanned.local, scanned.manifest, before, lambda count: None)
     assert repo.refs("heads")["main"] == head == repo.refs("tags")["v3.0"]
@@ -181,11 +190,8 @@ def test_of_two_first_pushes_at_once_one_wins(hub: Hub, other: Path):
         except ConflictError:
             results.append("conflict")
 
-    threads = [threading.Thread(target=one, args=(source,)) for source in (SAMPLE, other)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(one, (SAMPLE, other)))
     repo = hub.repo("datasets/user/demos")
     head = repo.refs("heads")["main"]
     assert sorted(results) == sorted(["conflict", head])
@@ -222,7 +228,7 @@ def test_an_edit_on_the_website_is_seen_and_overruled_by_the_next_push(hub: Hub,
     do_push(SAMPLE)
     repo = hub.repo("datasets/user/demos")
     head = repo.refs("heads")["main"]
-    text = repo.read(repo.tree(head)["meta/info.json"])
+    text = repo.files["meta/info.json"]
     edited = text.replace(b'"fps": 20', b'"fps": 21')  # the same size: only its hash tells
     assert edited != text
     repo.commit("refs/heads/main", head, {"meta/info.json": edited}, {}, [], "an edit")
@@ -231,6 +237,14 @@ def test_an_edit_on_the_website_is_seen_and_overruled_by_the_next_push(hub: Hub,
     assert do_push(SAMPLE).uploaded == 1
     do_pull(tmp_path / "mended")
     assert (tmp_path / "mended" / "meta" / "info.json").read_bytes() == text
+
+
+def test_the_id_of_a_file_is_gits():
+    data = (SAMPLE / "meta" / "info.json").read_bytes()
+    digest = git_digest(len(data))
+    digest.update(data)
+    said = subprocess.run(["git", "hash-object", "--stdin"], input=data, capture_output=True, check=True).stdout
+    assert digest.hexdigest() == said.decode().strip()
 
 
 def test_a_private_repository_is_private(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.store.cards import CARD
+from manip_il.store.folder import Scanned, policy_folder, scan, with_root_copies, without_root_copies
 from manip_il.store.manifest import FileEntry, Manifest
-from manip_il.store.push import Scanned, policy_folder, scan, with_root_copies, without_root_copies
 
 from .hub_server import Hub
 from .hub_use import POLICY, do_pull, do_push
@@ -72,9 +72,14 @@ def test_copies_are_of_the_newest_checkpoint_and_are_left_out_again():
     assert without_root_copies(scanned.manifest) == manifest(RUN)
 
 
-@pytest.mark.parametrize("there", ["config.json", "Model.safetensors", "config.json/notes.txt"])
-def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(there: str):
-    files = {**RUN, there: b"its own"}
+@pytest.mark.parametrize(
+    "files",
+    [
+        *({**RUN, name: b"its own"} for name in ("config.json", "Model.safetensors", "config.json/notes.txt")),
+        {"config.json": b"{}", "model.safetensors": b"weights"},  # a policy without a run
+    ],
+)
+def test_a_run_that_has_files_of_such_names_at_its_root_is_left_alone(files: dict[str, bytes]):
     assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
 
 
@@ -84,18 +89,11 @@ def test_root_copies_that_are_not_the_policy_any_more_come_along(changed: str):
     assert without_root_copies(manifest(files)) == manifest(files)
 
 
-def test_a_policy_that_lies_at_the_root_stays_as_it_is():
-    files = {"config.json": b"{}", "model.safetensors": b"weights"}
-    assert copied(files).manifest == manifest(files) == without_root_copies(manifest(files))
-
-
 def test_a_pushed_run_has_its_policy_at_the_root_whose_bytes_travel_once(hub: Hub, run: Path, tiny_policy: Path):
     do_push(run, POLICY)
     repo = hub.repo("models/user/policy")
-    tree = repo.tree(repo.refs("heads")["main"])
     for path, data in content(tiny_policy).items():
-        assert repo.read(tree[path]) == data
-        assert repo.read(tree[f"best/pretrained_model/{path}"]) == data
+        assert repo.files[path] == repo.files[f"best/pretrained_model/{path}"] == data
     large = {hashlib.sha256(path.read_bytes()).hexdigest() for path in tiny_policy.glob("*.safetensors")}
     sent = [one.path.rpartition("/")[2] for one in hub.requests("^PUT ")]
     assert sorted(sent) == sorted(large)
@@ -121,7 +119,6 @@ def test_a_better_policy_replaces_the_copy_at_the_root(hub: Hub, run: Path, tmp_
     better = run / "best" / "pretrained_model" / "config.json"
     better.write_bytes(better.read_bytes() + b"\n")
     assert do_push(run, POLICY).uploaded == 2  # where it lies, and at the root
-    repo = hub.repo("models/user/policy")
-    assert repo.read(repo.tree(repo.refs("heads")["main"])["config.json"]) == better.read_bytes()
+    assert hub.repo("models/user/policy").files["config.json"] == better.read_bytes()
     do_pull(tmp_path / "back", POLICY)
     assert not (tmp_path / "back" / "config.json").exists()

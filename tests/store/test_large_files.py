@@ -8,15 +8,15 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import boto3
 import pytest
 
 from manip_il.store import s3_store, s3_upload
 from manip_il.store.errors import AuthError, RemoteError
+from manip_il.store.folder import scan
 from manip_il.store.pull import pull
-from manip_il.store.push import push, scan
+from manip_il.store.push import push
 
-from .s3 import KEY, SECRET, Fault, Proxy
+from .s3 import Proxy, client_of, refusal
 from .trees import content, impatient, make_run, unwatched
 
 PART = 5 * 2**20  # the smallest that S3 takes [bytes]
@@ -44,17 +44,17 @@ def run(tmp_path: Path) -> Path:
 @pytest.fixture
 def client(bucket: str, moto: str) -> Any:
     """Past the proxy."""
-    return boto3.client("s3", endpoint_url=moto, aws_access_key_id=KEY, aws_secret_access_key=SECRET)
+    return client_of(moto)
 
 
 def test_a_cut_upload_is_gone_on_with(proxy: Proxy, bucket: str, client: Any, run: Path, tmp_path: Path) -> None:
     url, remote = impatient(f"s3://{bucket}/demos")
-    proxy.faults = [Fault("403", "PUT", "partNumber=3", 10**6, "AccessDenied")]
+    proxy.faults = [refusal("^PUT .*partNumber=3", 403, "AccessDenied")]
     with pytest.raises(AuthError):
         push(run, url, remote, unwatched)
     assert _sent(proxy) == [1, 2, 3]
     assert len(client.list_multipart_uploads(Bucket=bucket)["Uploads"]) == 1
-    proxy.faults, proxy.requests[:] = [], []
+    proxy.faults, proxy.log = [], []
     _, published = push(run, url, impatient(str(url))[1], unwatched)
     assert published is not None
     assert _sent(proxy) == [3, 4]
@@ -83,11 +83,11 @@ def test_somebody_else_ends_the_same_upload(
     url, remote = impatient(f"s3://{bucket}/demos")
     key, done = _key_of(run), list[str]()
 
-    def before(method: str, path: str) -> None:
-        if method != "POST" or "uploadId=" not in path or done:
+    def before(line: str) -> None:
+        if not line.startswith("POST") or "uploadId=" not in line or done:
             return
-        done.append(path)
-        place = {"Bucket": bucket, "Key": key, "UploadId": path.rpartition("uploadId=")[2].split("&")[0]}
+        done.append(line)
+        place = {"Bucket": bucket, "Key": key, "UploadId": line.rpartition("uploadId=")[2].split("&")[0]}
         if theirs == "aborted":
             client.abort_multipart_upload(**place)
             return
@@ -96,7 +96,7 @@ def test_somebody_else_ends_the_same_upload(
         client.complete_multipart_upload(**place, MultipartUpload={"Parts": named})
 
     proxy.before = before
-    proxy.faults = [Fault("404", "POST", "uploadId=", 1, "NoSuchUpload")] if is_told else []
+    proxy.faults = [refusal("^POST .*uploadId=", 404, "NoSuchUpload", 1)] if is_told else []
     push(run, url, remote, unwatched)
     assert done
     # What they made is taken where it is whole, and replaced where it is not.
@@ -104,12 +104,12 @@ def test_somebody_else_ends_the_same_upload(
     assert client.get_object(Bucket=bucket, Key=key)["Body"].read() == (run / "large.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize(("status", "code"), [("501", "NotImplemented"), ("403", "AccessDenied")])
+@pytest.mark.parametrize(("status", "code"), [(501, "NotImplemented"), (403, "AccessDenied")])
 def test_a_store_that_lists_no_uploads_is_sent_all(
-    status: str, code: str, proxy: Proxy, bucket: str, run: Path
+    status: int, code: str, proxy: Proxy, bucket: str, run: Path
 ) -> None:
     url, remote = impatient(f"s3://{bucket}/demos")
-    proxy.faults = [Fault(status, "GET", r"\?.*\buploads\b", 10**6, code)]
+    proxy.faults = [refusal(r"^GET .*\?.*\buploads\b", status, code)]
     push(run, url, remote, unwatched)
     assert proxy.faults[0].times < 10**6
     assert _sent(proxy) == [1, 2, 3, 4]
@@ -165,7 +165,7 @@ def test_uploads_on_every_page_are_cleared_away(names_uploads: bool) -> None:
 
 def _sent(proxy: Proxy) -> list[int]:
     """Numbers of the parts that went through the proxy."""
-    return [int(found[1]) for method, path, _ in proxy.requests if method == "PUT" and (found := PUT.search(path))]
+    return [int(found[1]) for one in proxy.requests("^PUT ") if (found := PUT.search(one.query))]
 
 
 def _key_of(run: Path) -> str:

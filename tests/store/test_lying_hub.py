@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,6 @@ def honest(line: str) -> list[bytes]:
 
 
 def pulled(hub: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a pull ends in; it is an error."""
     monkeypatch.setattr(constants, "ENDPOINT", hub.url)
     return error_of_pull(DATASET, folder, capsys, TOKEN)
 
@@ -119,16 +118,18 @@ def test_a_connection_that_was_made_anew_keeps_to_the_limits(tmp_path: Path) -> 
         assert authorized(thief) == [False]
 
 
-def same_origin(left: str, right: str) -> bool:
-    return hub_http._same_origin(httpx.URL(left), httpx.URL(right))
-
-
-def test_an_origin_is_scheme_host_and_port() -> None:
-    assert same_origin("https://hub.co/x", "https://HUB.co:443")
-    assert not same_origin("http://hub.co", "https://hub.co")
-    assert not same_origin("https://hub.co:444", "https://hub.co")
-    assert not same_origin("https://hub.co.evil.com", "https://hub.co")
-    assert not same_origin("https://hub.co@evil.com", "https://hub.co")
+@pytest.mark.parametrize(
+    ("left", "right", "is_same"),
+    [
+        ("https://hub.co/x", "https://HUB.co:443", True),
+        ("http://hub.co", "https://hub.co", False),
+        ("https://hub.co:444", "https://hub.co", False),
+        ("https://hub.co.evil.com", "https://hub.co", False),
+        ("https://hub.co@evil.com", "https://hub.co", False),
+    ],
+)
+def test_an_origin_is_scheme_host_and_port(left: str, right: str, is_same: bool) -> None:
+    assert hub_http._same_origin(httpx.URL(left), httpx.URL(right)) == is_same
 
 
 ENDLESS = {
@@ -231,15 +232,19 @@ def ends_well(hub: Liar, folder: Path, monkeypatch, capsys) -> None:
     assert {path.name for path in folder.iterdir()} <= {"got", ".got.pulling", "..got.pulling.lock"}
 
 
-def asked(what: str) -> Iterable[tuple[str, Any]]:
-    values = {"": [*WRONG, *WRONG_INFO], "/tree/": [*WRONG, *([file] for file in WRONG_FILES)], "/refs": WRONG_REFS}
-    return [(what, value) for value in values[what]]
+ANSWERS: dict[str, tuple[str, list[Any]]] = {
+    "about the repository": ("", [*WRONG, *WRONG_INFO]),
+    "the files": ("/tree/", [*WRONG, *([file] for file in WRONG_FILES)]),
+    "the branches": ("/refs", WRONG_REFS),
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["", "/tree/", "/refs"], ids=["about the repository", "the files", "the branches"])
-def test_answers_of_the_wrong_shape_end_in_one_line(what: str, tmp_path, monkeypatch, capsys) -> None:
-    for number, (_, value) in enumerate(asked(what)):
+@pytest.mark.parametrize(("what", "values"), ANSWERS.values(), ids=ANSWERS)
+def test_answers_of_the_wrong_shape_end_in_one_line(
+    what: str, values: list[Any], tmp_path, monkeypatch, capsys
+) -> None:
+    for number, value in enumerate(values):
 
         def script(line: str, value: Any = value) -> list[bytes]:
             if what == "/refs" and "/revision/" in line:  # then all branches are asked for

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +30,8 @@ def _somebody(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pulled(store: Liar, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a pull ends in; it is an error."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", store.url)
     return error_of_pull("s3://bucket/demos", folder, capsys, TOKEN)
-
-
-def endless_error(line: str) -> Iterator[bytes]:
-    return endless(b"<a>" * 10_000, "500 Never", Content_Type="application/xml")
 
 
 ENDLESS = {

@@ -15,8 +15,9 @@ import pytest
 from huggingface_hub.utils import _http as hub_http
 
 from manip_il.store.errors import Retry
+from manip_il.store.folder import open_remote
 from manip_il.store.object_store import ObjectRemote
-from manip_il.store.remote import RemoteUrl, open_remote
+from manip_il.store.remote import RemoteUrl
 
 
 def make_run(folder: Path, seed: int, files: int = 12, size: int = 20_000) -> Path:

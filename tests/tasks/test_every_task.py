@@ -18,20 +18,18 @@ from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName
 from manip_il.expert import Expert
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import NO_PHASE, phases
 
-from ..tables import every_scene, every_scene_with_an_object, every_task
+from ..scenes import SIZES, started, still
+from ..tables import every_scene, every_task
 
 SEEDS = stream_seeds("certificate", 2)
-SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))
 FALL = 0.002  # that progress may have where it should not fall at all
 
 
@@ -91,9 +89,8 @@ def expert_path(robot: str, task: str, other_cubes: bool) -> list[tuple[list[flo
     """Progress along the expert's path, solved episodes each with the environment as it ended."""
     paths = []
     for seed in SEEDS:
-        env = ManipEnv(robot, task, conditions=[SIZES] if other_cubes else [])
+        env = started(robot, task, seed, conditions=[SIZES] if other_cubes else [])
         expert, path = Expert(env.scene), []
-        env.start(seed)
         while not env.solved and len(path) < env.config.horizon:
             path.append(env.progress)
             env.advance(expert.label(env.get_state()).action)
@@ -101,24 +98,15 @@ def expert_path(robot: str, task: str, other_cubes: bool) -> list[tuple[list[flo
     return paths
 
 
-def check_progress(path: list[float], env: ManipEnv) -> None:
-    assert env.solved
-    assert 0 <= min(path) <= path[0] < 0.9
-    assert np.diff(path).min() > -FALL
-    assert max(path) <= 1
-    assert path[-1] > 1 - FALL
-
-
+@pytest.mark.parametrize("other_cubes", [False, True])
 @every_scene
-def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str, task: str):
-    for path, env in expert_path(robot, task, False):
-        check_progress(path, env)
-
-
-@every_scene_with_an_object
-def test_so_it_is_with_other_cubes(robot: str, task: str):
-    for path, env in expert_path(robot, task, True):
-        check_progress(path, env)
+def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str, task: str, other_cubes: bool):
+    for path, env in expert_path(robot, task, other_cubes):
+        assert env.solved
+        assert 0 <= min(path) <= path[0] < 0.9
+        assert np.diff(path).min() > -FALL
+        assert max(path) <= 1
+        assert path[-1] > 1 - FALL
 
 
 @every_scene
@@ -133,27 +121,20 @@ def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
 
 
 @every_scene
-def test_what_is_solved_is_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
+def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_not(robot: str, task: str):
     for _, env in expert_path(robot, task, False):
         assert env.solved
         assert TASKS[task].error(env.world) == env.distance() < env.config.tolerance
+        at = env.world.pose(TASKS[task].grasped[0]).position if TASKS[task].grasped else env.world.ee.position
+        assert np.linalg.norm(at - env.world.goal) < env.config.tolerance
         fresh = ManipEnv(robot, task)
         fresh.set_state(env.get_state())
-        at = fresh.world.goal + [0.0, 0.0, 0.1]
-        fresh.world.place(GOAL, at, UPRIGHT)
+        fresh.world.place(GOAL, fresh.world.goal + [0.0, 0.0, 0.1], UPRIGHT)
         fresh.world.update()
-        fresh.advance(fresh.scene.actions.join(fresh.data.ctrl[fresh.scene.arm_ctrl], 0.0))
+        fresh.advance(still(fresh, 0.0))
         assert fresh.distance() > fresh.config.tolerance
         assert not fresh.solved
         assert fresh.progress < env.progress
-
-
-@every_scene
-def test_a_solved_task_is_one_whose_things_are_at_the_goal(robot: str, task: str):
-    for _, env in expert_path(robot, task, False):
-        world = env.world
-        thing = world.pose(OBJECT).position if OBJECT in TASKS[task].grasped else world.ee.position
-        assert np.linalg.norm(thing - world.goal) < env.config.tolerance
 
 
 # Of one joint's motor, of one thing's weight, of the light: whatever it is, it is another model.
@@ -188,8 +169,7 @@ def test_the_fingerprint_is_the_scenes_and_the_settings(robot: str, task: str):
 
 @every_scene
 def test_a_datasets_words_fit_the_scene(robot: str, task: str):
-    spec, env = env_spec(EnvConfig(robot, task)), ManipEnv(robot, task)
-    env.start(SEEDS[0])
+    spec, env = env_spec(EnvConfig(robot, task)), started(robot, task)
     seen, state = env.observe(), env.get_state()
     assert len(spec.joint_names) == len(seen.state) == len(env.scene.actions)
     assert len(spec.environment_state_names) == len(seen.environment_state)

@@ -112,17 +112,17 @@ class CNNPolicy(MLPPolicy):
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
         encoders = [KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras]
         self.encoders = nn.ModuleList(encoders)
-        self.seen = sum(encoder.size for encoder in encoders)
+        self.keypoint_size = sum(encoder.size for encoder in encoders)
         width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width + self.seen, features[STATE].shape[0], config.network_shape())
-        self.privileged = nn.Linear(self.seen, config.privileged_size) if config.privileged_size else None
+        self.model = MLPNetwork(width + self.keypoint_size, features[STATE].shape[0], config.network_shape())
+        self.privileged = nn.Linear(self.keypoint_size, config.privileged_size) if config.privileged_size else None
         self.aux_weight = config.aux_weight
         self._privileged_by_index: Tensor | None = None
 
     @override
     def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        seen = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
-        return torch.cat([*(batch[key] for key in self.inputs), *seen], dim=-1)
+        keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
+        return torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -132,7 +132,7 @@ class CNNPolicy(MLPPolicy):
             if not self.training or privileged is None or self.privileged is None or batch.get(INDEX) is None:
                 return losses
             truth = privileged.to(inputs.device)[batch[INDEX].reshape(-1)]
-            return losses + self.aux_weight * (self.privileged(inputs[:, -self.seen :]) - truth).abs().mean(-1)
+            return losses + self.aux_weight * (self.privileged(inputs[:, -self.keypoint_size :]) - truth).abs().mean(-1)
 
     @override
     def _learn_columns(self, columns: Table, loss: str) -> None:
@@ -143,7 +143,7 @@ class CNNPolicy(MLPPolicy):
         size = values.shape[1]
         if self.privileged is None:
             cast(CNNConfig, self.config).privileged_size = size
-            self.privileged = nn.Linear(self.seen, size)
+            self.privileged = nn.Linear(self.keypoint_size, size)
         if self.privileged.out_features != size:
             return  # a checkpoint from another task goes on without
         statistics = fit_statistics(values, values, "mse")

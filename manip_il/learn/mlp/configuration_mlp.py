@@ -10,6 +10,7 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.network import Shape
 
 
@@ -28,10 +29,10 @@ class MLPConfig(PreTrainedConfig):
     Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of bounds.
     """
 
-    width: int = 256
-    depth: int = 3
+    width: int = MLPOptions.width
+    depth: int = MLPOptions.depth
     activation: str = "silu"
-    loss: str = "mse"
+    loss: str = MLPOptions.loss
     components: int = 5
     bins: int = 21
     clamp: float = 10.0

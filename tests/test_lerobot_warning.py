@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from manip_il.data.lerobot_log import NO_FFMPEG
+from manip_il.errors import NO_FFMPEG
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 STUB = r"raise RuntimeError('Could not load libtorchcodec.\n' + 'Traceback (most recent call last):\n' * 90)"
 CODE = """
 from manip_il.cli import main as program

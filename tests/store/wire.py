@@ -1,4 +1,4 @@
-"""HTTP of the tests' Hub: bodies, ranges, a log of what travelled, and faults on demand."""
+"""HTTP servers of the tests: bodies, ranges, a log of what travelled, and faults on demand."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,17 +19,19 @@ _CHUNK = 16 * 1024
 
 @dataclass
 class Fault:
-    """What goes wrong with the next `times` requests whose `METHOD /path` matches.
+    """What goes wrong with the next `times` requests whose `METHOD /path?query` matches.
 
-    status: answer this, with `headers`. cut: close the connection after so many bytes of the body, of the answer's for
-    GET, else of the request's. lost: do the work, then close the connection without an answer. corrupt: flip the
-    answer's first byte. pause: wait so long before every piece of the body [s].
+    status: answer this, with `headers` and `body`. cut: close the connection after so many bytes of the body, of the
+    answer's for GET, else of the request's. lost: do the work, then close the connection without an answer. corrupt:
+    flip the body's first byte, the answer's for GET, else the request's. pause: wait so long before every piece of the
+    body [s].
     """
 
     match: str
     times: int = 1
     status: int | None = None
     headers: dict[str, str] = field(default_factory=dict)
+    body: Any = field(default_factory=lambda: {"error": "told to fail"})
     cut: int | None = None
     lost: bool = False
     corrupt: bool = False
@@ -41,9 +44,9 @@ class Request:
 
     method: str
     path: str
+    query: str
     received: int  # bytes of its body
     sent: int  # bytes of the answer's body
-    status: int
 
 
 @dataclass(frozen=True)
@@ -61,20 +64,16 @@ class Answer:
 class Wire:
     """A threading HTTP server on a free port of loopback, with faults and a log.
 
-    `answer` gets every request that no fault took.
+    `answer` gets every request that no fault took; cuts_ranges: it gives whole files, whatever range was asked for.
     """
+
+    cuts_ranges = True
 
     def __init__(self) -> None:
         self.faults: list[Fault] = []
         self.log: list[Request] = []
         self._lock = threading.Lock()
-        wire = self
-
-        class Handler(_Handler):
-            pass
-
-        Handler.wire = wire
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"wire": self}))
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), daemon=True)
         self._thread.start()
@@ -91,13 +90,13 @@ class Wire:
         self._server.server_close()
         self._thread.join()
 
-    def take_fault(self, line: str) -> Fault | None:
+    def take_fault(self, line: str) -> Fault:
         with self._lock:
             for fault in self.faults:
                 if fault.times > 0 and re.search(fault.match, line):
                     fault.times -= 1
                     return fault
-        return None
+        return Fault("")
 
     def requests(self, match: str) -> list[Request]:
         """The logged requests whose `METHOD /path` matches."""
@@ -123,12 +122,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _handle(self) -> None:
         url = urlsplit(self.path)
         path, self._received, self._sent = unquote(url.path), 0, 0
-        self._fault = self.wire.take_fault(f"{self.command} {path}") or Fault("")
-        status = 0
+        self._fault = self.wire.take_fault(f"{self.command} {path}?{url.query}")
         try:
             body = self._read_body()
-            answer = self._answer(path, url.query, body)
-            status = answer.status
+            if self._fault.status is not None:
+                answer = Answer(self._fault.status, self._fault.body, self._fault.headers)
+            else:
+                answer = self.wire.answer(self.command, path, url.query, self.headers, body)
             if self._fault.lost:
                 raise _Cut
             self._send(answer)
@@ -137,25 +137,23 @@ class _Handler(BaseHTTPRequestHandler):
             with contextlib.suppress(OSError):
                 self.connection.shutdown(socket.SHUT_RDWR)  # else the client waits for more
         finally:
-            self.wire.log.append(Request(self.command, path, self._received, self._sent, status))
+            self.wire.log.append(Request(self.command, path, url.query, self._received, self._sent))
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = _handle  # noqa: N815 - http.server's names
-
-    def _answer(self, path: str, query: str, body: bytes) -> Answer:
-        if self._fault.status is not None:
-            return Answer(self._fault.status, {"error": "told to fail"}, self._fault.headers)
-        return self.wire.answer(self.command, path, query, self.headers, body)
 
     def _read_body(self) -> bytes:
         pieces: list[bytes] = []
         for piece in self._pieces_in():
             self._received += len(piece)
             pieces.append(piece)
-            if self._fault.pause and self.command != "GET":
-                threading.Event().wait(self._fault.pause)
-            if self._fault.cut is not None and self.command != "GET" and self._received >= self._fault.cut:
-                raise _Cut
-        return b"".join(pieces)
+            if self.command != "GET":
+                time.sleep(self._fault.pause)
+                if self._fault.cut is not None and self._received >= self._fault.cut:
+                    raise _Cut
+        return self._corrupted(b"".join(pieces), self.command != "GET")
+
+    def _corrupted(self, data: bytes, is_meant: bool) -> bytes:
+        return bytes([data[0] ^ 1]) + data[1:] if data and is_meant and self._fault.corrupt else data
 
     def _pieces_in(self) -> Iterator[bytes]:
         if "chunked" in self.headers.get("Transfer-Encoding", ""):
@@ -173,20 +171,17 @@ class _Handler(BaseHTTPRequestHandler):
             yield piece
 
     def _send(self, answer: Answer) -> None:
-        content = answer.content()
-        if self._fault.corrupt and content:
-            content = bytes([content[0] ^ 1]) + content[1:]
+        content, status = self._corrupted(answer.content(), self.command == "GET"), answer.status
         headers = {"Content-Type": "application/json", **answer.headers}
-        status = answer.status
-        if (span := self.headers.get("Range")) and status == 200 and self.command == "GET":
+        if (span := self.headers.get("Range")) and status == 200 and self.command == "GET" and self.wire.cuts_ranges:
             start = int(re.fullmatch(r"bytes=(\d+)-\d*", span)[1])
             headers["Content-Range"] = f"bytes {start}-{len(content) - 1}/{len(content)}"
             status = 206 if start < len(content) else 416
             content = content[start:]
+        headers.setdefault("Content-Length", str(len(content)))
         self.send_response(status)
         for name, value in headers.items():
             self.send_header(name, value)
-        self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         if self.command != "HEAD":
             self._write(content)
@@ -194,8 +189,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _write(self, content: bytes) -> None:
         end = len(content) if self._fault.cut is None else self._fault.cut
         for start in range(0, min(end, len(content)), _CHUNK):
-            if self._fault.pause:
-                threading.Event().wait(self._fault.pause)
+            time.sleep(self._fault.pause)
             piece = content[start : min(start + _CHUNK, end)]
             self.wfile.write(piece)
             self._sent += len(piece)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
+from manip_il.checks import DEEPEST_YAML, LARGEST_YAML, parse_yaml, read_yaml
 from manip_il.errors import UsageError
-from manip_il.yaml_file import DEEPEST, LARGEST, parse_yaml, read_yaml
 
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
@@ -20,7 +18,7 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
         BOMB,
         "&a [*a]",
         "[" * 100_000,
-        "[" * (DEEPEST + 1) + "]" * (DEEPEST + 1),
+        "[" * (DEEPEST_YAML + 1) + "]" * (DEEPEST_YAML + 1),
         "a: !!python/object/apply:os.getcwd []",
         "2001-99-99",
         "!!timestamp x",
@@ -28,35 +26,29 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "\n".join(
         "9" * 5_000,
         "a: [",
         "\0",
+        b"a: \xff",
     ],
 )
-def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str) -> None:
+def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path, text):
     path = tmp_path / "c.yaml"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(UsageError, match="is not YAML") as error:
         read_yaml(path, "a YAML file of options")
     assert len(str(error.value)) < len(str(path)) + 400
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path: Path) -> None:
+def test_a_file_that_takes_minutes_to_parse_is_refused_unread(tmp_path):
     path = tmp_path / "c.yaml"
-    path.write_text("a: 1\n" * LARGEST)
-    with pytest.raises(UsageError, match=f"has more than {LARGEST} bytes"):
+    path.write_text("a: 1\n" * LARGEST_YAML)
+    with pytest.raises(UsageError, match=f"has more than {LARGEST_YAML} bytes"):
         read_yaml(path, "a YAML file of options")
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "c.yaml"
-    path.write_bytes(b"a: \xff")
-    with pytest.raises(UsageError, match="is not YAML"):
-        read_yaml(path, "a YAML file of options")
-
-
-def test_plain_yaml_is_read() -> None:
+def test_plain_yaml_is_read():
     assert parse_yaml("a: [1, 2.5, yes, null, '*b']\nb: {c: d & e}") == {
         "a": [1, 2.5, True, None, "*b"],
         "b": {"c": "d & e"},
     }
-    deep = "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
+    deep = "[" * (DEEPEST_YAML - 1) + "]" * (DEEPEST_YAML - 1)
     assert isinstance(parse_yaml(deep), list)
