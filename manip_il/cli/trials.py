@@ -197,7 +197,7 @@ class Shot:
         title = f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
         return cls(job, episode, title, success=episode.success)
 
-    def film(self, *, strip: bool) -> tuple[Film, Strip | None]:
+    def film(self, *, strip: bool = False) -> tuple[Film, Strip | None]:
         """Return the episode as it looked, as a strip of pictures too. Raises `RenderError` without OpenGL."""
         from manip_il.evaluation.film import film, make_film, pictures_of
         from manip_il.evaluation.report_data import Strip
