@@ -42,8 +42,8 @@ from store.hub_server import Hub, hub_server  # pyright: ignore[reportMissingImp
 from store.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
 from store.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
 
+from manip_il.cli.push_pull import open_remote
 from manip_il.store.disk import sync_disk
-from manip_il.store.folder import open_remote
 from manip_il.store.pull import pull
 from manip_il.store.push import push
 from manip_il.store.remote import RemoteUrl

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import difflib
 import functools
-import logging
 import sys
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import logging
 
 _FEW = 3  # names that an error offers
 _BEGINNING = 3  # characters of a name that tell it from others
@@ -124,6 +127,8 @@ def shorten(text: str) -> str:
 
 def shorten_ffmpeg_warning() -> None:
     """Replace LeRobot's warning of missing FFmpeg libraries by one line; a second call changes nothing."""
+    import logging  # here, as help needs none
+
     logging.getLogger(_LOGGER).addFilter(_passes)
 
 

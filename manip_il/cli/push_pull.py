@@ -19,7 +19,7 @@ from manip_il.option import option
 
 if TYPE_CHECKING:
     from manip_il.store.push import Plan
-    from manip_il.store.remote import RemoteUrl
+    from manip_il.store.remote import Remote, RemoteUrl
 
 DISPLAY_EVERY = 0.1  # between two updates of the display [s]
 
@@ -84,7 +84,6 @@ class PushOptions:
 
     def run(self) -> None:
         """Examine, list, upload, switch over; print what was done."""
-        from manip_il.store.folder import open_remote
         from manip_il.store.push import push
         from manip_il.store.remote import RemoteUrl
 
@@ -141,7 +140,6 @@ class PullOptions:
 
     def run(self) -> None:
         """Fetch, verify, rename; print what was pulled."""
-        from manip_il.store.folder import open_remote
         from manip_il.store.pull import pull
 
         url = self._url()
@@ -175,3 +173,23 @@ class PullOptions:
         if url.revision not in (None, self.revision):
             raise UsageError(f"{url} and --revision={self.revision} differ; give one of them")
         return RemoteUrl.parse(f"{replace(url, revision=None)}@{self.revision}")
+
+
+def open_remote(url: RemoteUrl, *, private: bool = False) -> Remote:
+    """Return the remote of a URL, without connecting yet; the library of its scheme is imported here.
+
+    private: of a repository that a push creates on the Hub.
+    """
+    if url.scheme == "hf":
+        from manip_il.store.hub import HubRemote
+
+        return HubRemote(url, private)
+    if url.scheme == "s3":
+        from manip_il.store.s3_store import S3Blobs as Blobs
+    elif url.scheme == "sftp":
+        from manip_il.store.sftp_store import SftpBlobs as Blobs
+    else:
+        from manip_il.store.file_store import FileBlobs as Blobs
+    from manip_il.store.object_store import ObjectRemote
+
+    return ObjectRemote(Blobs(url))

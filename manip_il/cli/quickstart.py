@@ -205,7 +205,7 @@ class _Quickstart:
             caption = f"{'success' if episode.success else 'failure'}, seed {seed}"
             shots.append(Shot(job, episode, one.name, caption))
         self.stages.start("films", len(shots))
-        return film_shots(shots, self.stages)
+        return film_shots(shots, self.stages, strips=True)
 
     def _report(
         self, contestants: Sequence[Contestant], measured: dict[str, dict[str, EvalResult]], pictures: Pictures

@@ -197,9 +197,9 @@ class Shot:
         title = f"Seed {episode.seed}" + ("" if condition == NOMINAL.name else f", {condition}".lower())
         return cls(job, episode, title, success=episode.success)
 
-    def film(self) -> tuple[Film, Strip]:
-        """Return the episode as it looked. Raises `RenderError` where there is no OpenGL."""
-        from manip_il.evaluation.film import film, make_film, strip
+    def film(self, *, strip: bool = False) -> tuple[Film, Strip | None]:
+        """Return the episode as it looked, as a strip of pictures too. Raises `RenderError` without OpenGL."""
+        from manip_il.evaluation.film import film, make_film, pictures_of
         from manip_il.evaluation.report_data import Strip
         from manip_il.sim.conditions import NOMINAL, draw
 
@@ -207,7 +207,7 @@ class Shot:
         frames = film(self.episode, self.job.env, every=FILM_EVERY, drawn=drawn)
         fps = self.job.env.control_hz // FILM_EVERY or 1
         made = make_film(self.title, frames, fps, self.caption, success=self.success)
-        return made, Strip(self.title, strip(frames, fps), self.caption)
+        return made, Strip(self.title, pictures_of(frames, fps), self.caption) if strip else None
 
     def paths(self) -> Paths:
         """Return the paths of hand and object."""
@@ -227,16 +227,16 @@ class Pictures:
     note: str = ""
 
 
-def film_shots(shots: Sequence[Shot], stages: Stages) -> Pictures:
-    """Return every episode as a film and a strip, or all as paths, with a warning, where there is no OpenGL."""
-    made: list[tuple[Film, Strip]] = []
+def film_shots(shots: Sequence[Shot], stages: Stages, *, strips: bool = False) -> Pictures:
+    """Return every episode as a film, and a strip if wanted, or all as paths, with a warning, without OpenGL."""
+    made: list[tuple[Film, Strip | None]] = []
     try:
         for shot in shots:
-            made.append(shot.film())
+            made.append(shot.film(strip=strips))
             stages.step()
     except RenderError as error:
         warn([f"the report shows paths in place of films: {error}"])
         return Pictures(paths=tuple(shot.paths() for shot in shots), note=str(error))
     finally:
         stages.close()
-    return Pictures(tuple(film for film, _ in made), tuple(strip for _, strip in made))
+    return Pictures(tuple(film for film, _ in made), tuple(strip for _, strip in made if strip))

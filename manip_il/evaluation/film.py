@@ -88,7 +88,7 @@ def encode_mp4(frames: Frames, fps: int) -> bytes:
         return path.read_bytes()
 
 
-def strip(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
+def pictures_of(frames: Frames, fps: int, count: int = 6) -> tuple[tuple[float, bytes], ...]:
     """Return `count` frames, evenly apart, the first and the last among them: (time [s], PNG)."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     return tuple((index / fps, encode_picture(frames[index], "png")) for index in chosen.tolist())

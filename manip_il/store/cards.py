@@ -22,8 +22,7 @@ from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.errors import ManipError
 from manip_il.store.card_dataset import dataset_fields, draw_picture
 from manip_il.store.errors import redact
-from manip_il.store.folder import CARD, CONFIG, journals_of, policy_folder
-from manip_il.store.manifest import Kind
+from manip_il.store.manifest import CARD, CONFIG, Kind, journals_of, policy_folder
 
 PICTURE = "assets/episodes.png"
 _MADE_BY = "| made by | manip_il"  # a row of every card of ours

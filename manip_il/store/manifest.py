@@ -1,4 +1,4 @@
-"""The list of files of one version of a dataset or policy, with sizes and hashes.
+"""The list of files of one version of a dataset or policy, with sizes and hashes, and where among them a policy lies.
 
 It comes from outside: on construction it refuses everything but plain files inside a folder, on any system, and code.
 """
@@ -9,12 +9,20 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, cast
 
 from manip_il.store.errors import ManifestError
 
+CONFIG = "config.json"  # of every policy
+CARD = "README.md"
+JOURNALS = "journals"  # folder of a pushed dataset's journals; in a run every folder of that name holds some
+CHECKPOINTS = "checkpoints"
+LAST = "last"  # the link in `checkpoints` to the newest one: a pull makes it again
+_POLICY_FOLDERS = ("", "pretrained_model", "best/pretrained_model")
+_CHECKPOINT = re.compile(rf"{CHECKPOINTS}/(\d+)/pretrained_model")
 VERSION = 1
 MOST_FILES = 200_000
 LARGEST = 10**12  # of all files together [bytes]
@@ -226,3 +234,47 @@ def _reason(path: str) -> str:
     if folded.endswith(_CODE):
         return "it is code, and nothing from a remote is ever run"
     return ""
+
+
+def journals_of(root: Path) -> Path:
+    """Return the folder of a dataset's journals, beside it."""
+    return root.absolute().with_name(f"{root.absolute().name}.{JOURNALS}")
+
+
+def newest(checkpoints: Path) -> str | None:
+    """Return the name of the checkpoint with the highest step."""
+    steps = [path.name for path in checkpoints.iterdir() if path.name.isdecimal() and path.is_dir()]
+    return max(steps, key=int, default=None)
+
+
+def policy_folder(paths: Iterable[str]) -> str | None:
+    """Return the folder of a run's policy among its files' `paths`: empty for the root, None without a policy.
+
+    The best one, if the run has chosen it; else that of the newest checkpoint.
+    """
+    folders = {path.rpartition("/")[0] for path in paths if path.rpartition("/")[2] == CONFIG}
+    for folder in _POLICY_FOLDERS:
+        if folder in folders:
+            return folder
+    steps = {folder: int(found[1]) for folder in folders if (found := _CHECKPOINT.fullmatch(folder))}
+    return max(steps, key=lambda folder: steps[folder], default=None)
+
+
+def without_root_copies(manifest: Manifest) -> Manifest:
+    """Return a run without the copies at its root, if all are there with the same bytes."""
+    inside, there = policy_files(manifest), manifest.by_path
+    if any(name not in there or there[name].key != entry.key for name, entry in inside.items()):
+        return manifest
+    return replace(manifest, files=tuple(entry for entry in manifest.files if entry.path not in inside))
+
+
+def policy_files(manifest: Manifest) -> Mapping[str, FileEntry]:
+    """Return name -> file of a run's policy; empty for a dataset, and for a policy that is at the root alone."""
+    if manifest.kind != "policy":
+        return {}
+    folder = policy_folder(path for path in manifest.by_path if path != CONFIG)
+    if folder is None:
+        return {}
+    start = f"{folder}/"
+    inside = {path.removeprefix(start): entry for path, entry in manifest.by_path.items() if path.startswith(start)}
+    return {name: entry for name, entry in inside.items() if "/" not in name and name != CARD}

@@ -14,8 +14,16 @@ from manip_il.data import atomic
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.disk import HASHERS, Download, is_whole, sync_disk
 from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
-from manip_il.store.folder import CHECKPOINTS, JOURNALS, LAST, journals_of, newest, without_root_copies
-from manip_il.store.manifest import FileEntry, Manifest
+from manip_il.store.manifest import (
+    CHECKPOINTS,
+    JOURNALS,
+    LAST,
+    FileEntry,
+    Manifest,
+    journals_of,
+    newest,
+    without_root_copies,
+)
 from manip_il.store.object_store import in_threads
 from manip_il.store.remote import Progress, Remote, RemoteUrl, Snapshot
 

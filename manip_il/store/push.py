@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import NotWhole, Severity
 from manip_il.errors import UsageError
-from manip_il.store.disk import is_whole
-from manip_il.store.folder import Scanned, datasets_in, kind_of, scan, with_root_copies
-from manip_il.store.manifest import FileEntry, Kind, Manifest
-from manip_il.store.remote import Progress, Published, Remote, RemoteUrl, Snapshot
+from manip_il.store.disk import HASHERS, hash_file, is_whole
+from manip_il.store.errors import ManifestError
+from manip_il.store.manifest import (
+    CHECKPOINTS,
+    JOURNALS,
+    LAST,
+    FileEntry,
+    Kind,
+    Manifest,
+    check_path,
+    fold,
+    journals_of,
+    newest,
+    policy_files,
+)
+from manip_il.store.remote import MANIFEST_FILE, Progress, Published, Remote, RemoteUrl, Snapshot
+
+_LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
+_POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS, "best")
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """A folder's manifest, and its files by their paths in the manifest."""
+
+    manifest: Manifest
+    local: Mapping[str, Path]
 
 
 @dataclass(frozen=True)
@@ -91,3 +120,93 @@ def make_plan(scanned: Scanned, before: Snapshot | None, place: str) -> Plan:
     new = [entry for entry in manifest.files if not is_known(entry)]
     gone = tuple(path for path in old if path not in manifest.by_path)
     return Plan(manifest, before, tuple(entry.path for entry in new), sum(entry.size for entry in new), gone)
+
+
+def kind_of(root: Path) -> Kind:
+    """Return what a folder holds. Raises `UsageError` if it is neither a dataset nor a run."""
+    if not root.is_dir():
+        raise UsageError(f"{root} is not a folder; expected the folder of a dataset or of a run")
+    if (root / INFO).is_file():
+        return "dataset"
+    if any((root / name).exists() for name in _POLICY_FILES):
+        return "policy"
+    text = f"{root} is neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_POLICY_FILES)})"
+    raise UsageError(f"{text}; name the folder that holds one")
+
+
+def datasets_in(source: Path) -> Iterator[Path]:
+    """Yield the folders of datasets: `source` itself, or those of a run's rounds."""
+    for folder, names, _ in os.walk(source):
+        names[:] = sorted(name for name in names if not _LEFT_OUT.fullmatch(name))
+        if (Path(folder) / INFO).is_file():
+            names.clear()
+            yield Path(folder)
+
+
+def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None) -> Scanned:
+    """Return every file of a dataset or of a run, hashed.
+
+    journals: include a dataset's folder `<root>.journals` as `journals/`, and those inside a run. extra: files that
+    replace the folder's own, by path. Hidden files and what a killed writer left are skipped. Raises `ManifestError`
+    for links, and for what `FileEntry` refuses.
+    """
+    local = _files_below(root, journals)
+    if journals and kind == "dataset":
+        beside = journals_of(root)
+        if beside.is_dir():
+            local |= {f"{JOURNALS}/{name}": path for name, path in _files_below(beside, journals).items()}
+    local |= extra or {}
+    if not local:
+        raise ManifestError(f"{root} holds no file to push; expected a dataset or a run")
+    for path in local:
+        check_path(path)
+
+    def hashed(item: tuple[str, Path]) -> FileEntry:
+        digest = hashlib.sha256()
+        size = hash_file(item[1], digest)
+        return FileEntry(item[0], size, digest.hexdigest())
+
+    with ThreadPoolExecutor(HASHERS) as pool:
+        entries = tuple(pool.map(hashed, sorted(local.items())))
+    return Scanned(Manifest(kind, entries), local)
+
+
+def _files_below(folder: Path, journals: bool) -> dict[str, Path]:
+    """Return files by their paths inside a folder."""
+    folder = folder.absolute()
+    start = len(f"{folder}/")  # a slice is ten times as quick as `relative_to`
+    return {str(path)[start:]: path for path in _walk(folder, journals)}
+
+
+def _walk(folder: Path, journals: bool) -> Iterator[Path]:
+    with os.scandir(folder) as found:
+        entries = sorted(found, key=lambda entry: entry.name)
+    for entry in entries:
+        path = Path(entry.path)
+        if _LEFT_OUT.fullmatch(entry.name) or (entry.name == JOURNALS and not journals and entry.is_dir()):
+            continue
+        if entry.is_symlink():
+            is_last = (path.parent.name, path.name) == (CHECKPOINTS, LAST)
+            if not is_last or os.readlink(path) != newest(path.parent):
+                raise ManifestError(f"{path} is a link; links are not pushed: replace it with the file itself")
+        elif entry.is_dir():
+            yield from _walk(path, journals)
+        elif entry.is_file():
+            yield path
+        else:
+            raise ManifestError(f"{path} is not a regular file; move it out of the folder")
+
+
+def with_root_copies(scanned: Scanned) -> Scanned:
+    """Return a run with copies of its policy's files at the root, where LeRobot looks for them on the Hub.
+
+    The Hub stores equal bytes once. A run that has any file of such a name at its root is left as it is.
+    """
+    manifest = scanned.manifest
+    inside = policy_files(manifest)
+    taken = {fold(path.partition("/")[0]) for path in manifest.by_path}
+    if not inside or any(fold(name) in taken for name in inside):
+        return scanned
+    copies = tuple(replace(entry, path=name) for name, entry in inside.items())
+    local = {**scanned.local, **{name: scanned.local[entry.path] for name, entry in inside.items()}}
+    return Scanned(replace(manifest, files=manifest.files + copies), local)

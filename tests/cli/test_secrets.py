@@ -40,7 +40,7 @@ def _nowhere():
         raise RemoteError(f"cannot reach {url}, {url!r}")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("manip_il.store.folder.open_remote", refuse)
+        patch.setattr("manip_il.cli.push_pull.open_remote", refuse)
         yield
 
 

@@ -11,7 +11,7 @@ from manip_il.data import schema
 from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
-from manip_il.evaluation.film import encode_mp4, film, filmed_steps, make_film, paths, run_states, strip
+from manip_il.evaluation.film import encode_mp4, film, filmed_steps, make_film, paths, pictures_of, run_states
 from manip_il.sim.env import EnvConfig
 
 JOB = RolloutJob(EnvConfig(), "expert", label="last")
@@ -69,11 +69,11 @@ def test_a_films_poster_is_its_last_frame():
 
 
 def test_a_strip_goes_from_the_first_to_the_last_frame():
-    pictures_at = strip(frames(21), 10, count=6)
+    pictures_at = pictures_of(frames(21), 10, count=6)
     assert [seconds for seconds, _ in pictures_at] == [0.0, 0.4, 0.8, 1.2, 1.6, 2.0]
     pictures = [np.asarray(Image.open(io.BytesIO(png))) for _, png in pictures_at]
     assert [int(picture.mean()) for picture in pictures] == [0, 40, 80, 120, 160, 200]
-    assert len(strip(frames(2), 10, count=6)) == 2
+    assert len(pictures_of(frames(2), 10, count=6)) == 2
 
 
 def test_paths_end_with_the_object_at_the_goal(episode):

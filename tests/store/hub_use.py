@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from huggingface_hub import constants
 
+from manip_il.cli.push_pull import open_remote
 from manip_il.store.errors import Retry
-from manip_il.store.folder import open_remote
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
 from manip_il.store.remote import MANIFEST_FILE, Published, RemoteUrl

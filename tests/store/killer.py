@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
+from manip_il.cli.push_pull import open_remote
 from manip_il.store import cards, file_store, hub, s3_store, sftp_store
-from manip_il.store.folder import open_remote
 from manip_il.store.pull import pull
 from manip_il.store.push import push
 from manip_il.store.remote import RemoteUrl

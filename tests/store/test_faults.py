@@ -20,9 +20,8 @@ from manip_il.store.errors import (
     redact,
     retry_after,
 )
-from manip_il.store.folder import scan
 from manip_il.store.pull import pull
-from manip_il.store.push import push
+from manip_il.store.push import push, scan
 
 from .s3 import KEY, SECRET, Proxy, refusal
 from .trees import content, impatient, make_run, no_wait, unwatched

@@ -14,13 +14,13 @@ import pytest
 from huggingface_hub import HfApi, constants
 from huggingface_hub.utils import logging as hub_logging
 
+from manip_il.cli.push_pull import open_remote
 from manip_il.errors import UsageError
 from manip_il.store.cards import CARD, PICTURE
 from manip_il.store.disk import git_digest
 from manip_il.store.errors import ConflictError
-from manip_il.store.folder import open_remote, scan
 from manip_il.store.hub_session import hub_session
-from manip_il.store.push import check_source, push
+from manip_il.store.push import check_source, push, scan
 from manip_il.store.remote import MANIFEST_FILE, RemoteUrl
 
 from .hub_server import Hub

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.store.cards import CARD
-from manip_il.store.folder import Scanned, policy_folder, scan, with_root_copies, without_root_copies
-from manip_il.store.manifest import FileEntry, Manifest
+from manip_il.store.manifest import FileEntry, Manifest, policy_folder, without_root_copies
+from manip_il.store.push import Scanned, scan, with_root_copies
 
 from .hub_server import Hub
 from .hub_use import POLICY, do_pull, do_push

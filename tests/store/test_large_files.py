@@ -12,9 +12,8 @@ import pytest
 
 from manip_il.store import s3_store, s3_upload
 from manip_il.store.errors import AuthError, RemoteError
-from manip_il.store.folder import scan
 from manip_il.store.pull import pull
-from manip_il.store.push import push
+from manip_il.store.push import push, scan
 
 from .s3 import Proxy, client_of, refusal
 from .trees import content, impatient, make_run, unwatched

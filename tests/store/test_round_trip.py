@@ -19,9 +19,8 @@ from manip_il.doctor.finding import NotWhole
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.mdp import Episode
 from manip_il.store.errors import ConflictError, ManifestError, NotFoundError
-from manip_il.store.folder import scan
 from manip_il.store.pull import pull
-from manip_il.store.push import push
+from manip_il.store.push import push, scan
 
 from .s3 import Proxy
 from .trees import content, impatient, make_run, silent, unwatched

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from huggingface_hub.utils import _http as hub_http
 
+from manip_il.cli.push_pull import open_remote
 from manip_il.store.errors import Retry
-from manip_il.store.folder import open_remote
 from manip_il.store.object_store import ObjectRemote
 from manip_il.store.remote import RemoteUrl
 
