@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
+from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
@@ -27,6 +28,7 @@ HALF = 0.018  # of a cube's edge [m]
 SLOT = 0.032  # of where a cube is let go from the box's middle, along each side [m]
 SIDE = 0.235  # of the box's middle from the workspace's, left or right [m]
 APART = 0.08  # of the cubes at the start [m]
+ROOM = 0.03  # within reach around a cube at the start [m]
 FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
 
 
@@ -57,8 +59,6 @@ def _all_in(world: World) -> bool:
 
 def _rise(world: World) -> Target:
     """Stand over the box."""
-    from manip_il.tasks.grasp import hand_down
-
     return Target(world.pose(BOX).position + [0.0, 0.0, 0.2], hand_down(0.0), world.most_opening)
 
 
@@ -77,7 +77,7 @@ class ClearTable:
 
     name: str = "clear_table"
     instruction: str = "Put all cubes into the box."
-    limits: Limits = Limits(tolerance=0.005, horizon=400)
+    limits: Limits = Limits(tolerance=0.005, horizon=800)
     objects: tuple[str, ...] = tuple(COLOURS)
     grasped: tuple[str, ...] = tuple(COLOURS)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -99,7 +99,10 @@ class ClearTable:
             def fits(at: F64, others: list[F64] = others) -> bool:
                 return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
 
-            poses[name] = draw_until(lambda name=name: draw_resting(rng, world, name), fits, world, name), draw_yaw(rng)
+            poses[name] = (
+                draw_until(lambda name=name: draw_resting(rng, world, name, ROOM), fits, world, name),
+                draw_yaw(rng),
+            )
         return Start(poses)
 
     def observe(self, world: World) -> Observed:

@@ -175,7 +175,11 @@ def test_a_control_step_lasts_what_its_rate_says():
 
 
 @pytest.mark.parametrize(
-    "setting", [{"control_hz": 0}, {"control_hz": 30}, {"tolerance": 0.0}, {"success_steps": 0}, {"horizon": 4}]
+    "setting",
+    [
+        *({"control_hz": 0}, {"control_hz": 30}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
+        *({"success_steps": -1}, {"horizon": -1}, {"horizon": 4}),
+    ],
 )
 def test_a_setting_out_of_range_is_refused(setting: dict):
     with pytest.raises(UsageError, match=str(next(iter(setting.values())))):

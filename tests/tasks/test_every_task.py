@@ -31,6 +31,7 @@ from ..tables import every_scene, every_task
 
 SEEDS = stream_seeds("certificate", 2)
 FALL = 0.002  # that progress may have where it should not fall at all
+RARE = {"drawer": {"set_down", "put_aside", "make_way", "to_make_way", "leave"}}  # rungs with tests of their own
 
 
 @every_task
@@ -50,10 +51,9 @@ def test_phases_are_none_and_then_the_rungs_from_the_first_on(task: str):
 
 
 @every_scene
-def test_what_a_task_grasps_and_where_it_goes_are_in_its_scene(robot: str, task: str):
+def test_what_a_task_grasps_and_moves_is_in_its_scene(robot: str, task: str):
     scene = build_scene(robot, task)
-    assert set(TASKS[task].grasped) <= set(scene.objects)
-    assert scene.model.body_mocapid[scene.model.body(GOAL).id] >= 0
+    assert set(TASKS[task].grasped) <= set(TASKS[task].objects) <= set(scene.objects)
 
 
 @every_scene
@@ -74,14 +74,15 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
             np.testing.assert_allclose(target.rotation @ target.rotation.T, np.eye(3), atol=1e-9)
 
 
-@every_scene
-def test_every_rung_of_the_ladder_occurs(robot: str, task: str):
-    seen = set[int]()
-    for driver, conditions in (("expert", (STANDARD,)), ("random", ())):
-        job = RolloutJob(EnvConfig(robot, task, horizon=45), driver, hold=2, conditions=conditions)
+@every_task
+def test_every_rung_of_the_ladder_occurs(task: str):
+    seen = set[str]()
+    for driver, conditions, horizon in (("expert", (STANDARD,), 0), ("random", (), 45)):
+        job = RolloutJob(EnvConfig("panda", task, horizon=horizon), driver, hold=2, conditions=conditions)
         for episode in run_job(job, SEEDS):
-            seen |= set(episode.columns[EXPERT_PHASE].ravel().tolist())
-    assert seen - {0} == set(range(1, len(phases(TASKS[task]))))
+            seen |= {phases(TASKS[task])[phase] for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())}
+    missing = {rung.name for rung in TASKS[task].rungs} - seen
+    assert missing <= RARE.get(task, set())
 
 
 @cache
@@ -125,12 +126,16 @@ def test_what_is_solved_is_at_the_goal_within_the_tolerance_and_what_is_not_is_n
     for _, env in expert_path(robot, task, False):
         assert env.solved
         assert TASKS[task].error(env.world) == env.distance() < env.config.tolerance
-        at = env.world.pose(TASKS[task].grasped[0]).position if TASKS[task].grasped else env.world.ee.position
-        assert np.linalg.norm(at - env.world.goal) < env.config.tolerance
         fresh = ManipEnv(robot, task)
-        fresh.set_state(env.get_state())
-        fresh.world.place(GOAL, fresh.world.goal + [0.0, 0.0, 0.1], UPRIGHT)
-        fresh.world.update()
+        if env.world.has_goal:
+            world = env.world
+            at = world.pose(TASKS[task].objects[0]).position if TASKS[task].objects else world.ee.position
+            assert np.linalg.norm((at - world.goal)[:2]) < env.config.tolerance
+            fresh.set_state(env.get_state())
+            fresh.world.place(GOAL, fresh.world.goal + [0.1, 0.0, 0.0], UPRIGHT)
+            fresh.world.update()
+        else:
+            fresh.start(SEEDS[0])
         fresh.advance(still(fresh, 0.0))
         assert fresh.distance() > fresh.config.tolerance
         assert not fresh.solved
