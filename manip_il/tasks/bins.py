@@ -19,7 +19,7 @@ F64 = NDArray[np.float64]
 
 WALL, THIN = 0.05, 0.003  # of a box: its height, half the thickness of walls and floor [m]
 DROP = 0.02  # of an object's bottom over a box's floor where it is let go [m]
-OVER_WALL = Lift(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way there
+OVER_WALL = Lift(most=0.065, slope=2.5, free=0.012, rise_first=0.03, max_step=0.045)  # on the way there
 OVER = 0.11  # of the hand over an object on its way to it [m]
 _AT = (0.035, 0.05)  # of the hand from an object in a box that it is still at: sideways, above [m]
 _RISE = 0.10  # of the hand over an object that it has let go of [m]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import angle_ahead, angle_from_down, hand_down, lie_of
 from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go, nearness
-from manip_il.tasks.objects import GREY, RED, WOOD, add_cube, add_furniture, add_part
+from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw

@@ -27,11 +27,9 @@ OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may de
 OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
 PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
 WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a metre narrower [rad/m]
-FINGER = (
-    0.028,
-    0.010,
-    0.016,
-)  # of a finger: beyond the object, half its width, and where it is free of a neighbour [m]
+FUNNEL_STEEP = 4.0  # the same where something stands around the object
+FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
+SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
@@ -93,7 +91,8 @@ def lie_of(world: World, name: str) -> Lie:
 
 def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
-    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM, world.neighbours(name))
+    neighbours = world.neighbours(name)
+    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM, neighbours)
     angle = angle_from_down(ee.rotation, yaw)
     x, y, z = position.tolist()
     ee_x, ee_y, ee_z = ee.position.tolist()
@@ -101,7 +100,8 @@ def _grasp(world: World, name: str) -> Grasp:
     room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
     off = math.hypot(dx, dy) + ANGLE_AS_LENGTH * max(0.0, angle - free)
-    funnel = FUNNEL_SLOPE * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
+    slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
+    funnel = slope * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
     half = lie.tall / 2
     return Grasp(
         offset=tuple(a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()),
@@ -140,19 +140,19 @@ def _nearest(
             abs(g[0] - at)
             + PREFER_ZERO * abs(g[0])
             + WIDTH_AS_ANGLE * (g[1] - narrowest)
-            + CROWDED * _crowding(g, neighbours),
+            + CROWDED * _crowding(g[0], widest, neighbours),
             g[0],
         ),
     )
 
 
-def _crowding(grasp: tuple[float, float, float], neighbours: Sequence[tuple[float, float]]) -> float:
-    """Return how much the fingers of a grasp would meet a neighbour of the object, 0 to 1."""
-    (yaw, width, _), (beyond, half, clear) = grasp, FINGER
+def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
+    """Return how much the open fingers of a grasp would meet a neighbour of the object, 0 to 1."""
+    thick, half, clear = FINGER
     c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
     for x, y in neighbours:
         along, across = abs(s * x - c * y), abs(c * x + s * y)  # of the fingers' motion
-        lack = min(1.0, max(0.0, (width / 2 + beyond - along) / beyond))
+        lack = min(1.0, max(0.0, (widest / 2 + thick - along) / SHORT))
         worst = max(worst, lack * min(1.0, max(0.0, (clear - across) / (clear - half))))
     return worst
 

@@ -173,10 +173,14 @@ def pick_progress(world: World, name: str) -> float:
 
 
 def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> float:
-    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the way left on `carry`'s path."""
+    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the way left on `carry`'s path.
+
+    That is up to its height, sideways, and down.
+    """
     way = to - world.pose(name).position
     off = math.hypot(way[0], way[1])
-    return nearness(off + abs(way[2] + lift.over(off)))
+    height = lift.over(off)
+    return nearness(abs(way[2] + height) + off + height)
 
 
 def nearness(rest: float) -> float:

@@ -29,13 +29,13 @@ from manip_il.tasks.objects import CUBE_HALF
 from manip_il.tasks.table import TASKS
 
 from ..scenes import SEED, bits, cube, drive_until, in_hand, started, still
-from ..tables import GRASPING, every_scene, every_task
+from ..tables import WITH_A_CUBE, every_scene, every_task
 
 MOMENT = 7
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 
 
-@pytest.fixture(params=GRASPING, ids="-".join)
+@pytest.fixture(params=WITH_A_CUBE, ids="-".join)
 def env(request) -> ManipEnv:
     return started(*request.param)
 

@@ -8,11 +8,10 @@ import pytest
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names, joint_state
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
-
 from manip_il.tasks.table import TASKS
 
 from ..scenes import cube, started
-from ..tables import every_scene, every_scene_with_an_object
+from ..tables import every_scene, every_scene_that_grasps
 
 
 def values_of(env: ManipEnv) -> dict[str, float]:
@@ -35,7 +34,7 @@ def test_the_hand_and_a_goal_are_shown_where_they_are(robot: str, task: str):
         np.testing.assert_allclose(env.world.goal, env.data.mocap_pos[0])
 
 
-@every_scene_with_an_object
+@every_scene_that_grasps
 def test_the_cubes_numbers_are_what_their_names_say(robot: str, task: str):
     env = started(robot, task)
     values = values_of(env)

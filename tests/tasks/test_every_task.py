@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -22,12 +23,13 @@ from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import GOAL, World
+from manip_il.tasks import NAMES
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import NO_PHASE, phases
 
 from ..scenes import SIZES, started, still
-from ..tables import every_scene, every_task
+from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task
 
 SEEDS = stream_seeds("certificate", 2)
 FALL = 0.002  # that progress may have where it should not fall at all
@@ -39,6 +41,19 @@ def test_a_task_has_the_name_that_it_is_called_by(task: str):
     assert get_task(task) is TASKS[task]
     assert TASKS[task].name == task
     assert TASKS[task].instruction.endswith(".")
+
+
+def test_help_names_every_task():
+    assert list(NAMES) == list(TASKS)
+
+
+def test_docs_show_every_task():
+    docs = Path(__file__).parents[2] / "docs"
+    page, plugin = (docs / "tasks.md").read_text(), (docs / "lerobot.md").read_text()
+    for task in TASKS:
+        assert f"## `{task}`" in page
+        assert (docs / "tasks" / f"{task}.jpg").stat().st_size < 150_000
+        assert f"`Panda{task.title().replace('_', '')}-v0`" in plugin
 
 
 @every_task
@@ -99,8 +114,10 @@ def expert_path(robot: str, task: str, other_cubes: bool) -> list[tuple[list[flo
     return paths
 
 
-@pytest.mark.parametrize("other_cubes", [False, True])
-@every_scene
+@pytest.mark.parametrize(
+    ("robot", "task", "other_cubes"),
+    [*((*scene, False) for scene in SCENES), *((*scene, True) for scene in WITH_A_CUBE)],
+)
 def test_progress_never_falls_along_the_experts_path_and_ends_at_one(robot: str, task: str, other_cubes: bool):
     for path, env in expert_path(robot, task, other_cubes):
         assert env.solved

@@ -24,7 +24,7 @@ from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import Start
 
 from ..scenes import SEED
-from ..tables import GRASPING, SCENES, every_robot, every_scene, every_scene_with_an_object
+from ..tables import GRASPING, SCENES, every_robot, every_scene, every_scene_that_grasps
 
 seeds = st.integers(0, 2**40)
 edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's own [m]
@@ -130,7 +130,7 @@ def test_half_the_goals_of_pick_and_place_are_on_the_table(robot: str):
     assert 150 <= on_table <= 250  # five standard deviations of a fair coin
 
 
-@every_scene_with_an_object
+@every_scene_that_grasps
 def test_starts_reach_into_every_quarter_of_the_table(robot: str, task: str):
     world, centre = world_of(robot, task), get_robot(robot).workspace.centre
     first = get_task(task).objects[0]
