@@ -87,6 +87,7 @@ class World:
         self._plain = self.model, self.data
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._cache: dict[Any, Any] = {}  # until the world moves
+        self._bodies: dict[str, int] = {}
         self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
 
     # Physics
@@ -158,7 +159,7 @@ class World:
     def pose(self, name: str) -> Pose:
         """Return the pose of a body. Raises `UnknownName`."""
         one = self.scene.objects.get(name)
-        body = one.body if one is not None else self._body(name).id
+        body = one.body if one is not None else self._body_id(name)
         return Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
 
     @property
@@ -237,6 +238,11 @@ class World:
     @cached_property
     def _mocap_goal(self) -> int:
         return int(self._body(GOAL).mocapid[0])
+
+    def _body_id(self, name: str) -> int:
+        if name not in self._bodies:  # MuJoCo's own look-up takes 10 us
+            self._bodies[name] = self._body(name).id
+        return self._bodies[name]
 
     def _body(self, name: str) -> Any:
         try:

@@ -38,8 +38,8 @@ def add_bin(spec: mujoco.MjSpec, name: str, inside: tuple[float, float], colour:
 
 def is_in(world: World, name: str, box: str, inside: tuple[float, float]) -> bool:
     """Return whether an object's centre is between a box's walls."""
-    x, y, z = (world.pose(name).position - world.pose(box).position).tolist()
-    return abs(x) < inside[0] and abs(y) < inside[1] and z < WALL + 0.01
+    (x, y, z), (box_x, box_y, box_z) = world.pose(name).position.tolist(), world.pose(box).position.tolist()
+    return abs(x - box_x) < inside[0] and abs(y - box_y) < inside[1] and z - box_z < WALL + 0.01
 
 
 def drop_rungs(

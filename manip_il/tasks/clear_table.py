@@ -32,8 +32,13 @@ ROOM = 0.03  # within reach around a cube at the start [m]
 FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
 
 
+def _left(world: World) -> tuple[str, ...]:
+    """Cubes that are not in the box; computed once a state."""
+    return world.remember("left", lambda: tuple(name for name in COLOURS if not is_in(world, name, BOX, INSIDE)))
+
+
 def _inside(world: World, name: str) -> bool:
-    return is_in(world, name, BOX, INSIDE)
+    return name not in _left(world)
 
 
 def current(world: World) -> str:
@@ -42,8 +47,11 @@ def current(world: World) -> str:
 
 
 def _current(world: World) -> str:
-    left = [name for name in COLOURS if not _inside(world, name)]
-    return next((name for name in left if held(world, name)), left[0] if left else list(COLOURS)[-1])
+    left, ee = _left(world), world.ee.position
+    nearest = min(left, key=lambda name: math.dist(world.pose(name).position, ee), default="")
+    if nearest and held(world, nearest):
+        return nearest
+    return left[0] if left else list(COLOURS)[-1]
 
 
 def _to(world: World) -> F64:
@@ -54,7 +62,7 @@ def _to(world: World) -> F64:
 
 
 def _all_in(world: World) -> bool:
-    return all(_inside(world, name) for name in COLOURS)
+    return not _left(world)
 
 
 def _rise(world: World) -> Target:
@@ -123,11 +131,11 @@ class ClearTable:
     def error(self, world: World) -> float:
         """Return how far the cubes that are not in the box are from its middle, together [m]."""
         at = world.pose(BOX).position
-        return sum(math.dist(world.pose(name).position, at) for name in COLOURS if not _inside(world, name))
+        return sum(math.dist(world.pose(name).position, at) for name in _left(world))
 
     def progress(self, world: World) -> float:
         """Return progress by the cubes in the box, and of the next one."""
-        done = sum(_inside(world, name) for name in COLOURS)
+        done = len(COLOURS) - len(_left(world))
         if done == len(COLOURS):
             return 1.0
         name = current(world)
