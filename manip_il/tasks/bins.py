@@ -75,7 +75,7 @@ def drop_rungs(
 
 
 def drop_progress(world: World, name: str, to: F64) -> float:
-    """Return progress of carrying a held object to where it is let go, 0 to 1."""
+    """Return progress of carrying a held object to where it is let go, (3,) [m]: 0 to 1."""
     return carry_progress(world, name, to, OVER_WALL)
 
 

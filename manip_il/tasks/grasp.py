@@ -36,7 +36,7 @@ _QUARTER = math.pi / 2
 
 
 class Lie(NamedTuple):
-    """How an object lies.
+    """Pose of an object at rest, as a hand sees it.
 
     grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
     for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how

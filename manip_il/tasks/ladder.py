@@ -38,7 +38,7 @@ _GRASPED = 0.5  # progress of an object that is held
 
 
 class Lift(NamedTuple):
-    """How high a carried object is over its goal, by the horizontal distance still to go [m].
+    """Height of a carried object over its goal, by the horizontal distance still to go [m].
 
     most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
     rise_first: this far under its height, it only rises [m]. max_step: how far ahead of the hand its target runs [m].

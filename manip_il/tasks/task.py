@@ -75,7 +75,7 @@ class Task(Protocol):
 
     @property
     def limits(self) -> Limits:
-        """What solves an episode and how long it may take, unless an environment's settings say otherwise."""
+        """Limits that solve and end an episode, unless an environment's settings say otherwise."""
         ...
 
     @property
