@@ -10,6 +10,7 @@ from manip_il.errors import UsageError
 from manip_il.option import option, option_of
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
+from manip_il.tasks import NAMES
 
 if TYPE_CHECKING:
     from manip_il.learn.checkpoint import CheckpointMeta
@@ -71,7 +72,7 @@ class MaybeRobotGroup:
 class MaybeTaskGroup:
     """`--task.*` where a checkpoint may say it."""
 
-    type: str | None = option(None, f"reach, lift or pick_place; by default the policy's, else {EnvConfig.task}")
+    type: str | None = option(None, f"{', '.join(NAMES)}; by default the policy's, else {EnvConfig.task}")
 
 
 @dataclass

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.robots import ROBOTS
+from manip_il.tasks import NAMES
 
 DT_SIM = 0.002  # [s]
 
@@ -16,7 +17,7 @@ class EnvConfig:
     """Settings of one environment; every field is part of the fingerprint. Raises `UsageError` for a wrong number."""
 
     robot: str = option("panda", " or ".join(ROBOTS))
-    task: str = option("pick_place", "reach, lift or pick_place")
+    task: str = option("pick_place", ", ".join(NAMES))
     control_hz: int = option(20, "control steps a second")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
     success_steps: int = option(

@@ -26,6 +26,7 @@ from manip_il.sim.variation import Object
 F64 = NDArray[np.float64]
 T = TypeVar("T")
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_BESIDE, _NEAR = (-0.02, 0.07), 0.08  # of what stands around an object, in height and sideways: a hand may meet it [m]
 GOAL = "goal"  # the mocap body that shows where things are to go
 
 
@@ -86,6 +87,7 @@ class World:
         self._plain = self.model, self.data
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._cache: dict[Any, Any] = {}  # until the world moves
+        self._bodies: dict[str, int] = {}
         self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
 
     # Physics
@@ -157,7 +159,7 @@ class World:
     def pose(self, name: str) -> Pose:
         """Return the pose of a body. Raises `UnknownName`."""
         one = self.scene.objects.get(name)
-        body = one.body if one is not None else self._body(name).id
+        body = one.body if one is not None else self._body_id(name)
         return Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
 
     @property
@@ -192,6 +194,37 @@ class World:
         geoms = (self.scene.objects[name].geom,)
         return self.remember(("touched", name), lambda: self.scene.gripper.touches(self.model, self.data, geoms))
 
+    def neighbours(self, name: str) -> list[tuple[float, float]]:
+        """Return the ways from an object's centre to the nearest points of what stands around it, x and y, within 8 cm.
+
+        Furniture and other objects count as boxes along x and y, from just under the object's centre to a hand over it.
+        """
+        others = self._standing[name]
+        if not len(others):
+            return []
+        at, half = self.pose(name).position, self.model.geom_size[others]
+        away = self.data.geom_xpos[others] - at
+        nearest = away - np.minimum(np.maximum(away, -half), half)  # 0 along an axis on which they overlap
+        x, y, z = nearest.T
+        distance = np.hypot(x, y)
+        low, high = _BESIDE
+        near = (z > low) & (z < high) & (distance > 0) & (distance < _NEAR)
+        return list(zip(x[near].tolist(), y[near].tolist(), strict=True))
+
+    @cached_property
+    def _standing(self) -> Mapping[str, NDArray[np.int64]]:
+        """For each object, the geoms of furniture and of the other objects."""
+        model, objects = self.scene.model, self.scene.objects
+        furniture = [
+            geom
+            for geom, root in enumerate(model.body_rootid[model.geom_bodyid])
+            if model.body_mocapid[root] >= 0 and model.geom_contype[geom]
+        ]
+        return {
+            name: np.array([*furniture, *(one.geom for other, one in objects.items() if other != name)], dtype=np.int64)
+            for name in objects
+        }
+
     @cached_property
     def reach(self) -> Reach:
         """Map of the points that the hand, pointing down, gets to."""
@@ -205,6 +238,11 @@ class World:
     @cached_property
     def _mocap_goal(self) -> int:
         return int(self._body(GOAL).mocapid[0])
+
+    def _body_id(self, name: str) -> int:
+        if name not in self._bodies:  # MuJoCo's own look-up takes 10 us
+            self._bodies[name] = self._body(name).id
+        return self._bodies[name]
 
     def _body(self, name: str) -> Any:
         try:

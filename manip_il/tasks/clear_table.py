@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
+from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
@@ -27,11 +28,17 @@ HALF = 0.018  # of a cube's edge [m]
 SLOT = 0.032  # of where a cube is let go from the box's middle, along each side [m]
 SIDE = 0.235  # of the box's middle from the workspace's, left or right [m]
 APART = 0.08  # of the cubes at the start [m]
+ROOM = 0.03  # within reach around a cube at the start [m]
 FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
 
 
+def _left(world: World) -> tuple[str, ...]:
+    """Cubes that are not in the box; computed once a state."""
+    return world.remember("left", lambda: tuple(name for name in COLOURS if not is_in(world, name, BOX, INSIDE)))
+
+
 def _inside(world: World, name: str) -> bool:
-    return is_in(world, name, BOX, INSIDE)
+    return name not in _left(world)
 
 
 def current(world: World) -> str:
@@ -40,8 +47,11 @@ def current(world: World) -> str:
 
 
 def _current(world: World) -> str:
-    left = [name for name in COLOURS if not _inside(world, name)]
-    return next((name for name in left if held(world, name)), left[0] if left else list(COLOURS)[-1])
+    left, ee = _left(world), world.ee.position
+    nearest = min(left, key=lambda name: math.dist(world.pose(name).position, ee), default="")
+    if nearest and held(world, nearest):
+        return nearest
+    return left[0] if left else list(COLOURS)[-1]
 
 
 def _to(world: World) -> F64:
@@ -52,13 +62,11 @@ def _to(world: World) -> F64:
 
 
 def _all_in(world: World) -> bool:
-    return all(_inside(world, name) for name in COLOURS)
+    return not _left(world)
 
 
 def _rise(world: World) -> Target:
     """Stand over the box."""
-    from manip_il.tasks.grasp import hand_down
-
     return Target(world.pose(BOX).position + [0.0, 0.0, 0.2], hand_down(0.0), world.most_opening)
 
 
@@ -77,7 +85,7 @@ class ClearTable:
 
     name: str = "clear_table"
     instruction: str = "Put all cubes into the box."
-    limits: Limits = Limits(tolerance=0.005, horizon=400)
+    limits: Limits = Limits(tolerance=0.005, horizon=800)
     objects: tuple[str, ...] = tuple(COLOURS)
     grasped: tuple[str, ...] = tuple(COLOURS)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -99,7 +107,10 @@ class ClearTable:
             def fits(at: F64, others: list[F64] = others) -> bool:
                 return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
 
-            poses[name] = draw_until(lambda name=name: draw_resting(rng, world, name), fits, world, name), draw_yaw(rng)
+            poses[name] = (
+                draw_until(lambda name=name: draw_resting(rng, world, name, ROOM), fits, world, name),
+                draw_yaw(rng),
+            )
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
@@ -120,11 +131,11 @@ class ClearTable:
     def error(self, world: World) -> float:
         """Return how far the cubes that are not in the box are from its middle, together [m]."""
         at = world.pose(BOX).position
-        return sum(math.dist(world.pose(name).position, at) for name in COLOURS if not _inside(world, name))
+        return sum(math.dist(world.pose(name).position, at) for name in _left(world))
 
     def progress(self, world: World) -> float:
         """Return progress by the cubes in the box, and of the next one."""
-        done = sum(_inside(world, name) for name in COLOURS)
+        done = len(COLOURS) - len(_left(world))
         if done == len(COLOURS):
             return 1.0
         name = current(world)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
-from manip_il.tasks.ladder import CLOSED, grasp_progress, grasp_rungs, held, nearness
-from manip_il.tasks.objects import GREY, RED, WOOD, add_cube, add_furniture, add_part
+from manip_il.tasks.grasp import angle_ahead, angle_from_down, hand_down, lie_of
+from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go, nearness
+from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
@@ -29,7 +29,11 @@ WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height o
 ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
 MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
 BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
-OPEN, OPEN_ENOUGH, SHUT = 0.125, 0.105, 0.008  # how far the drawer is pulled, may be for the object to go in, is shut [m]
+OPEN, OPEN_ENOUGH, SHUT = (
+    0.125,
+    0.105,
+    0.008,
+)  # how far the drawer is pulled, may be for the object to go in, is shut [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
 HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
@@ -38,8 +42,13 @@ HOVER, SLOPE = 0.08, 2.0  # of the hand over the handle on its way there [m]; he
 BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.055  # of the object from the closed drawer's handle at the start [m]
 DROP = 0.018  # of the object over the drawer's floor where it is let go [m]
 OVER = 0.13  # of the hand over the object on its way to it [m]
-LIFT, LIFT_SLOPE, FREE = 0.10, 2.5, 0.012  # of the carried object over that; per distance; distance without [m]
-_STEP = 0.04  # how far ahead of the hand its target runs while it moves drawer or object [m]
+OVER_FRONT = Lift(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way into the drawer
+OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # on the way to beside it
+LEFT = (0.03, 0.06, 0.03)  # of the hand off the handle where it need not rise from it any more: x, y, z [m]
+# In the cabinet's frame: where an object is in the handle's way, x and y; where it lies before the handle of the shut
+# drawer, x; and where it is put aside [m].
+WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.10, -0.06, (-0.04, 0.15)
+_STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
 
 
 def pulled(world: World) -> float:
@@ -64,8 +73,7 @@ def _bar(world: World) -> F64:
 
 def _yaw(world: World) -> float:
     """Yaw of a hand whose fingers close along the drawer's way: of two, the nearer one [rad]."""
-    x = world.ee.rotation[:, 0]
-    at, quarter = math.atan2(x[1], x[0]), math.pi / 2
+    at, quarter = angle_ahead(world.ee.rotation), math.pi / 2
     return min((quarter, -quarter), key=lambda turn: (abs(turn - at), turn))
 
 
@@ -111,61 +119,124 @@ def _is_open(world: World) -> bool:
 def _hand_is_in(world: World) -> bool:
     """Whether the hand is at the object."""
     x, y, z = (world.ee.position - world.pose(OBJECT).position).tolist()
-    return math.hypot(x, y) < 0.06 and z < 0.09
+    return math.hypot(x, y) < 0.05 and z < 0.07
 
 
-def _up(world: World) -> Target:
-    """Open the fingers about the object, then rise."""
-    ee, g = world.ee, grasp_of(world, OBJECT)
-    free = world.opening > g.width + 0.012 and not world.touched(OBJECT)
-    yaw = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
-    up = ee.position[2] + (0.1 if free else 0.0)
-    return Target(np.array([*ee.position[:2], up]), hand_down(yaw), g.width + 0.025)
+def _let_go(world: World) -> Target:
+    return let_go(world, OBJECT, HOVER)
 
 
 def _carry(world: World) -> Target:
     """Lift the object, move it over the drawer and lower it."""
-    at = world.pose(OBJECT).position
-    way = _middle(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP] - at
-    off = math.hypot(way[0], way[1])
-    missing = way[2] + min(LIFT, LIFT_SLOPE * max(0.0, off - FREE))
-    sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) if off > FREE else 1.0
-    step = np.array([sideways * way[0], sideways * way[1], missing])
-    return Target(world.ee.position + step, hand_down(0.0), CLOSED, max_step=0.06)
+    return carry(world, OBJECT, _place(world), OVER_FRONT)
 
 
-def _is_low_at_bar(world: World) -> bool:
-    x, y, z = (world.ee.position - _bar(world)).tolist()
-    return abs(x) < 0.045 and abs(y) < 0.07 and z < 0.05
+def _place(world: World) -> F64:
+    """Where the object's centre is let go in the drawer, (3,)."""
+    return _middle(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
 
 
-def _rise(world: World) -> Target:
+def _leave(world: World) -> Target:
+    """Straight up from the handle."""
     ee = world.ee.position
     return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), FINGERS)
 
 
-def _put_down(world: World) -> Target:
-    """Lower the object to the table, then open the fingers."""
+def _is_around_bar(world: World) -> bool:
+    x, y, z = (world.ee.position - _bar(world)).tolist()
+    return abs(x) < LEFT[0] and abs(y) < LEFT[1] and z < LEFT[2]
+
+
+def _from_cabinet(world: World) -> tuple[float, float]:
+    """The object in the cabinet's frame, x and y [m]."""
+    x, y = (world.pose(OBJECT).position - world.pose(CABINET).position)[:2].tolist()
+    return x, y
+
+
+def _is_in_way(world: World) -> bool:
+    """Whether the object lies where the handle passes over it, so that the hand cannot grasp it there."""
+    x, y = _from_cabinet(world)
+    return WAY_X[0] < x < WAY_X[1] and abs(y) < WAY_Y
+
+
+def _must_shut(world: World) -> bool:
+    """Whether the object lies in the way of a drawer that is out, and before the handle of one that is shut."""
+    return _is_in_way(world) and _from_cabinet(world)[0] < BEFORE and not _is_shut(world)
+
+
+def _must_open(world: World) -> bool:
+    """Whether the drawer is to be opened: always, unless the object lies before it and must be moved first."""
+    return not _is_open(world) and not (_is_in_way(world) and _from_cabinet(world)[0] < BEFORE)
+
+
+def _is_set_down(world: World) -> bool:
     low = world.pose(OBJECT).position[2] - lie_of(world, OBJECT).tall / 2
-    ee = world.ee.position
-    to = np.array([*ee[:2], ee[2] - max(0.0, low)])
-    return Target(to, hand_down(0.0), CLOSED if low > 0.008 else world.most_opening)
+    return low < 0.008 and not _is_in_way(world)
+
+
+def _put_aside(world: World) -> Target:
+    """Carry the object to the table beside the drawer, on the side where there is more of it."""
+    cabinet = world.pose(CABINET).position
+    side = math.copysign(ASIDE[1], world.scene.robot.workspace.centre[1] - cabinet[1])
+    to = np.array([cabinet[0] + ASIDE[0], cabinet[1] + side, lie_of(world, OBJECT).tall / 2])
+    return carry(world, OBJECT, to, OVER_TABLE)
 
 
 _RUNGS = (
     Rung("done", "the object is in the drawer, and it is shut", lambda w: is_inside(w) and _is_shut(w), _to_bar),
-    Rung("let_go", "the object is in the drawer, and the hand lets go of it", lambda w: is_inside(w) and _hand_is_in(w), _up),
-    Rung("push", "the object is in the drawer, and the hand pushes it shut",
-         lambda w: is_inside(w) and _at_bar(w), lambda w: _move_drawer(w, -0.01)),
+    Rung(
+        "let_go",
+        "the object is in the drawer, and the hand lets go of it",
+        lambda w: is_inside(w) and _hand_is_in(w),
+        _let_go,
+    ),
+    Rung(
+        "push",
+        "the object is in the drawer, and the hand pushes it shut",
+        lambda w: is_inside(w) and _at_bar(w),
+        lambda w: _move_drawer(w, -0.01),
+    ),
     Rung("to_push", "the object is in the drawer, and the hand goes to the handle", is_inside, _to_bar),
-    Rung("carry", "the object is in the hand, on its way to the open drawer", lambda w: held(w, OBJECT) and _is_open(w), _carry),
-    Rung("put_down", "the object is in the hand, and the drawer is not open", lambda w: held(w, OBJECT), _put_down),
-    Rung("pull", "the hand is at the handle and pulls the drawer open",
-         lambda w: not _is_open(w) and _at_bar(w), lambda w: _move_drawer(w, OPEN)),
-    Rung("to_pull", "the drawer is not open, and the hand goes to the handle", lambda w: not _is_open(w), _to_bar),
-    Rung("leave", "the drawer is open, and the hand rises from the handle", _is_low_at_bar, _rise),
+    Rung(
+        "carry",
+        "the object is in the hand, on its way to the open drawer",
+        lambda w: held(w, OBJECT) and _is_open(w),
+        _carry,
+    ),
+    Rung(
+        "set_down",
+        "the object is in the hand on the table, and the drawer is not open",
+        lambda w: held(w, OBJECT) and _is_set_down(w),
+        _let_go,
+    ),
+    Rung(
+        "put_aside",
+        "the object is in the hand, on its way to beside the drawer, which is not open",
+        lambda w: held(w, OBJECT),
+        _put_aside,
+    ),
+    Rung(
+        "make_way",
+        "the object lies in the way of the open drawer, and the hand pushes it shut",
+        lambda w: _must_shut(w) and _at_bar(w),
+        lambda w: _move_drawer(w, -0.01),
+    ),
+    Rung(
+        "to_make_way",
+        "the object lies in the way of the open drawer, and the hand goes to the handle",
+        _must_shut,
+        _to_bar,
+    ),
+    Rung(
+        "pull",
+        "the hand is at the handle and pulls the drawer open",
+        lambda w: _must_open(w) and _at_bar(w),
+        lambda w: _move_drawer(w, OPEN),
+    ),
+    Rung("to_pull", "the drawer is not open, and the hand goes to the handle", _must_open, _to_bar),
+    Rung("leave", "the drawer is as it should be, and the hand rises from its handle", _is_around_bar, _leave),
     *grasp_rungs(lambda w: OBJECT, OVER),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -174,7 +245,7 @@ class Drawer:
 
     name: str = "drawer"
     instruction: str = "Put the red cube in the drawer and close it."
-    limits: Limits = Limits(tolerance=SHUT, horizon=250)
+    limits: Limits = Limits(tolerance=SHUT, horizon=400)
     objects: tuple[str, ...] = (OBJECT,)
     grasped: tuple[str, ...] = (OBJECT,)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -188,9 +259,13 @@ class Drawer:
         deep, wide = length + 2 * THIN, width + 3 * THIN  # of the cabinet, half
         back = front + 2 * deep
         for side, sign in (("left", 1), ("right", -1)):
-            add_part(cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD)
+            add_part(
+                cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD
+            )
         add_part(cabinet, "cabinet back", (THIN, wide + 2 * THIN, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-        add_part(cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
+        add_part(
+            cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD
+        )
         tray = cabinet.add_body(name=TRAY)
         tray.add_joint(
             name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN + 0.01],
@@ -246,7 +321,7 @@ class Drawer:
                 return 0.75
             return 0.8 + 0.05 * nearness(math.dist(world.ee.position, _bar(world))) + 0.15 * (1 - opened)
         if held(world, OBJECT) and _is_open(world):
-            return 0.5 + 0.25 * nearness(math.dist(world.pose(OBJECT).position, _middle(world)))
+            return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
             return 0.3 + 0.2 * grasp_progress(world, OBJECT)
         return 0.1 * nearness(math.dist(world.ee.position, _bar(world))) + 0.2 * opened

@@ -27,12 +27,16 @@ OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may de
 OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
 PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the hand's
 WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a metre narrower [rad/m]
+FUNNEL_STEEP = 4.0  # the same where something stands around the object
+FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
+SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
+CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
 
 
 class Lie(NamedTuple):
-    """How an object lies.
+    """Pose of an object at rest, as a hand sees it.
 
     grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
     for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how
@@ -87,7 +91,8 @@ def lie_of(world: World, name: str) -> Lie:
 
 def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
-    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM)
+    neighbours = world.neighbours(name)
+    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM, neighbours)
     angle = angle_from_down(ee.rotation, yaw)
     x, y, z = position.tolist()
     ee_x, ee_y, ee_z = ee.position.tolist()
@@ -95,7 +100,8 @@ def _grasp(world: World, name: str) -> Grasp:
     room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
     off = math.hypot(dx, dy) + ANGLE_AS_LENGTH * max(0.0, angle - free)
-    funnel = FUNNEL_SLOPE * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
+    slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
+    funnel = slope * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
     half = lie.tall / 2
     return Grasp(
         offset=tuple(a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()),
@@ -113,20 +119,42 @@ def _grasp(world: World, name: str) -> Grasp:
     )
 
 
-def _nearest(grasps: Sequence[tuple[float, float, float]], hand: F64, widest: float) -> tuple[float, float, float]:
+def _nearest(
+    grasps: Sequence[tuple[float, float, float]],
+    hand: F64,
+    widest: float,
+    neighbours: Sequence[tuple[float, float]],
+) -> tuple[float, float, float]:
     """The grasp whose yaw is nearest to the hand's, with a small preference for 0 and for a narrow one.
 
     hand: rotation of `ee`, (3, 3). Nearest to the hand, not to zero: a learner that averages both sides of the boundary
     between two grasps then leaves it by any turn, and does not stand still in the middle. widest: what the fingers go
-    around [m].
+    around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
     """
-    at = math.atan2(hand[1, 0], hand[0, 0])
+    at = angle_ahead(hand)
     narrowest = min(width for _, width, _ in grasps)
     fitting = [grasp for grasp in grasps if grasp[1] <= max(widest, narrowest)]
     return min(
         fitting,
-        key=lambda g: (abs(g[0] - at) + PREFER_ZERO * abs(g[0]) + WIDTH_AS_ANGLE * (g[1] - narrowest), g[0]),
+        key=lambda g: (
+            abs(g[0] - at)
+            + PREFER_ZERO * abs(g[0])
+            + WIDTH_AS_ANGLE * (g[1] - narrowest)
+            + CROWDED * _crowding(g[0], widest, neighbours),
+            g[0],
+        ),
     )
+
+
+def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
+    """Return how much the open fingers of a grasp would meet a neighbour of the object, 0 to 1."""
+    thick, half, clear = FINGER
+    c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
+    for x, y in neighbours:
+        along, across = abs(s * x - c * y), abs(c * x + s * y)  # of the fingers' motion
+        lack = min(1.0, max(0.0, (widest / 2 + thick - along) / SHORT))
+        worst = max(worst, lack * min(1.0, max(0.0, (clear - across) / (clear - half))))
+    return worst
 
 
 def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
@@ -165,6 +193,11 @@ def hand_down(yaw: float) -> F64:
     """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def angle_ahead(rotation: F64) -> float:
+    """Return the yaw of the x axis of a rotation (3, 3) [rad]."""
+    return math.atan2(rotation[1, 0], rotation[0, 0])
 
 
 def angle_from_down(rotation: F64, yaw: float) -> float:

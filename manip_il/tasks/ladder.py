@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import HOVER, LOWEST_EE, grasp_of, hand_down
+from manip_il.tasks.grasp import HOVER, LOWEST_EE, angle_ahead, grasp_of, hand_down
 from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
@@ -26,19 +27,35 @@ RISE_FIRST = 0.03  # this far under the funnel, the hand only rises [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
 CLOSING = (0.022, 0.015, 0.022)  # the same once they have begun to close [m]
-IN_HAND = (
-    0.009,
-    0.020,
-    0.011,
-)  # object's centre in the ee frame, in x and z beyond half its size: between the fingers [m]
+IN_HAND = (0.009, 0.020, 0.011)  # object's centre in the ee frame, in x and z beyond half its size: in the hand [m]
 MAX_TILT = 0.3  # of the object off a face: wait over it until it has settled [rad]
-CARRY_LIFT = 0.05  # of the object over the goal's height on the way there [m]
-CARRY_SLOPE = 0.6  # lift per horizontal distance still to go
-CARRY_FREE = 0.015  # horizontal distance at which no lift is left [m]
+RELEASE = 0.03  # how far the fingers open about an object to let it go, beyond its width, where there is so much [m]
+FREED = 0.4  # share of that at which it is free
 AT_GOAL = 0.01  # [m]
 CLOSED = 0.0  # commanded opening of a hand that grips [m]
 _HALFWAY = 0.2  # way still to go at which half of a part's progress is made [m]
 _GRASPED = 0.5  # progress of an object that is held
+
+
+class Lift(NamedTuple):
+    """Height of a carried object over its goal, by the horizontal distance still to go [m].
+
+    most: height far from the goal [m]. slope: height per distance beyond `free`. free: distance without height [m].
+    rise_first: this far under its height, it only rises [m]. max_step: how far ahead of the hand its target runs [m].
+    """
+
+    most: float = 0.05
+    slope: float = 0.6
+    free: float = 0.015
+    rise_first: float = math.inf
+    max_step: float = 0.12
+
+    def over(self, distance: float) -> float:
+        """Return the height over the goal at a horizontal distance from it [m]."""
+        return min(self.most, self.slope * max(0.0, distance - self.free))
+
+
+CARRY = Lift()  # to a goal that nothing stands around
 
 
 def held(world: World, name: str) -> bool:
@@ -76,18 +93,25 @@ def close_on(world: World, name: str) -> Target:
     return Target(np.array(g.at), hand_down(g.yaw), CLOSED)
 
 
-def carry(world: World, name: str, to: F64) -> Target:
+def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
     """Carry the held object's centre to a point (3,) [m], above it first and then down."""
     way = to - world.pose(name).position
-    lift = carry_lift(math.hypot(way[0], way[1]))
-    position = world.ee.position + way + [0.0, 0.0, lift]
+    off = math.hypot(way[0], way[1])
+    height = lift.over(off)
+    if off > lift.free:
+        way[:2] *= min(1.0, max(0.0, 1.0 - (way[2] + height) / lift.rise_first))
+    position = world.ee.position + way + [0.0, 0.0, height]
     position[2] = max(position[2], LOWEST_EE)
-    return Target(position, hand_down(0.0), CLOSED)
+    return Target(position, hand_down(0.0), CLOSED, max_step=lift.max_step)
 
 
-def carry_lift(distance: float) -> float:
-    """Return how high over its goal an object is carried at a horizontal distance from it [m]."""
-    return min(CARRY_LIFT, CARRY_SLOPE * max(0.0, distance - CARRY_FREE))
+def let_go(world: World, name: str, height: float) -> Target:
+    """Open the fingers about an object, no wider than frees it; then straight up to a height over its centre [m]."""
+    g, ee = grasp_of(world, name), world.ee
+    beyond = min(RELEASE, world.most_opening - g.width)
+    free = world.opening > g.width + FREED * beyond and not world.touched(name)
+    up = world.pose(name).position[2] + height if free else ee.position[2]
+    return Target(np.array([*ee.position[:2], up]), hand_down(angle_ahead(ee.rotation)), g.width + beyond)
 
 
 def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:
@@ -144,11 +168,19 @@ def grasp_progress(world: World, name: str) -> float:
 def pick_progress(world: World, name: str) -> float:
     """Return progress of grasping an object and carrying it to the goal, 0 to 1, by the way left on that path."""
     if held(world, name):
-        way = world.goal - world.pose(name).position
-        along = math.hypot(way[0], way[1])
-        rest = along + abs(way[2] + carry_lift(along))
-        return _GRASPED + (1 - _GRASPED) * nearness(rest)
+        return _GRASPED + (1 - _GRASPED) * carry_progress(world, name, world.goal)
     return 0.9 * _GRASPED * grasp_progress(world, name)
+
+
+def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> float:
+    """Return progress of carrying a held object to a point (3,) [m], 0 to 1, by the way left on `carry`'s path.
+
+    That is up to its height, sideways, and down.
+    """
+    way = to - world.pose(name).position
+    off = math.hypot(way[0], way[1])
+    height = lift.over(off)
+    return nearness(abs(way[2] + height) + off + height)
 
 
 def nearness(rest: float) -> float:

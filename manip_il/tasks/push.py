@@ -123,7 +123,7 @@ class Push:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the puck, and a goal some way off such that the hand reaches behind the puck."""
-        at, height = draw_resting(rng, world, PUCK), resting_height(world, PUCK)
+        at, height = draw_resting(rng, world, PUCK, ROOM + 0.02), resting_height(world, PUCK)
         space = world.scene.robot.workspace
 
         def fits(goal: F64) -> bool:

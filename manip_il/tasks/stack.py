@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import grasp_of, hand_down, lie_of
-from manip_il.tasks.ladder import CLOSED, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.grasp import grasp_of, lie_of
+from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go
 from manip_il.tasks.objects import BLUE, RED, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -22,13 +22,11 @@ F64 = NDArray[np.float64]
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
 ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # off the place on the base: sideways, in height [m]; tilt [rad]
-LIFT, LIFT_SLOPE = 0.06, 2.5  # of the carried cube over its place; per horizontal distance still to go [m]
-CLEAR = 0.005  # of the carried cube over its place while it is not above it [m]
-FREE = 0.008  # horizontal distance at which it may be all the way down [m]
-AWAY = 0.06  # of the hand over the stack's top once it has let go [m]
+OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # of the carried cube over its place
+AWAY, AWAY_ENOUGH = 0.06, 0.035  # of the hand over the stack's top once it has let go; at which it is away [m]
 APART = 0.09  # of the cubes at the start [m]
+ROOM = 0.05  # within reach around each of them at the start [m]
 _HAND = 0.05  # what a hand that is still at the cube counts for as an error [m]
-_STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
 
 
 def place_on_base(world: World) -> F64:
@@ -45,31 +43,23 @@ def stands(world: World) -> bool:
 
 def _hand_is_away(world: World) -> bool:
     g = grasp_of(world, TOP)
-    return bool(world.ee.position[2] > world.pose(TOP).position[2] + g.half + 0.6 * AWAY)
+    return bool(world.ee.position[2] > world.pose(TOP).position[2] + g.half + AWAY_ENOUGH)
 
 
 def _let_go(world: World) -> Target:
-    """Open the fingers, then rise straight up."""
-    g, ee = grasp_of(world, TOP), world.ee
-    up = world.pose(TOP).position[2] + g.half + AWAY if g.open_enough or world.opening > 0.9 * world.most_opening else ee.position[2]
-    yaw = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
-    return Target(np.array([*ee.position[:2], up]), hand_down(yaw), world.most_opening)
+    return let_go(world, TOP, grasp_of(world, TOP).half + AWAY)
 
 
 def _carry(world: World) -> Target:
-    """Lift the cube, move it over its place and set it down."""
-    at, place = world.pose(TOP).position, place_on_base(world)
-    way = place - at
-    off = math.hypot(way[0], way[1])
-    lift = min(LIFT, LIFT_SLOPE * max(0.0, off - FREE))
-    missing = way[2] + lift  # height that it must gain
-    sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) if off > FREE else 1.0
-    step = np.array([sideways * way[0], sideways * way[1], missing])
-    return Target(world.ee.position + step, hand_down(0.0), CLOSED, max_step=_STEP)
+    return carry(world, TOP, place_on_base(world), OVER_BASE)
+
+
+def _is_done(world: World) -> bool:
+    return stands(world) and _hand_is_away(world)
 
 
 _RUNGS = (
-    Rung("done", "the cube stands on the other, and the hand is away", lambda w: stands(w) and _hand_is_away(w), _let_go),
+    Rung("done", "the cube stands on the other, and the hand is away", _is_done, _let_go),
     Rung("let_go", "the cube stands on the other, and the hand lets go of it", stands, _let_go),
     Rung("carry", "the cube is in the hand, on its way to the other", lambda w: held(w, TOP), _carry),
     *grasp_rungs(lambda w: TOP),
@@ -82,7 +72,7 @@ class Stack:
 
     name: str = "stack"
     instruction: str = "Stack the red cube on the blue cube."
-    limits: Limits = Limits(success_steps=20, horizon=200)
+    limits: Limits = Limits(success_steps=20, horizon=300)
     objects: tuple[str, ...] = (TOP, BASE)
     grasped: tuple[str, ...] = (TOP,)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -94,8 +84,10 @@ class Stack:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw both cubes on the table, apart, at any yaw."""
-        base = draw_resting(rng, world, BASE)
-        top = draw_until(lambda: draw_resting(rng, world, TOP), lambda at: math.dist(at, base) > APART, world, TOP)
+        base = draw_resting(rng, world, BASE, ROOM)
+        top = draw_until(
+            lambda: draw_resting(rng, world, TOP, ROOM), lambda at: math.dist(at, base) > APART, world, TOP
+        )
         return Start({TOP: (top, draw_yaw(rng)), BASE: (base, draw_yaw(rng))})
 
     def observe(self, world: World) -> Observed:
@@ -119,7 +111,5 @@ class Stack:
                 return 1.0
             return 0.9 + 0.1 * min(1.0, world.opening / world.most_opening)
         if held(world, TOP):
-            way = place_on_base(world) - world.pose(TOP).position
-            off = math.hypot(way[0], way[1])
-            return 0.5 + 0.4 * nearness(off + abs(way[2] + min(LIFT, LIFT_SLOPE * max(0.0, off - FREE))))
+            return 0.5 + 0.4 * carry_progress(world, TOP, place_on_base(world), OVER_BASE)
         return 0.45 * grasp_progress(world, TOP)

@@ -18,21 +18,31 @@ LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
 _MOST_DRAWS = 1_000
 
 
-def draw_resting(rng: np.random.Generator, world: World, name: str) -> F64:
-    """Draw where an object's centre rests on the table, (3,) [m], not under the hand."""
-    return draw_resting_place(rng, world, name, resting_height(world, name))
+def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:
+    """Draw where an object's centre rests on the table, (3,) [m], not under the hand; room: see `has_room`."""
+    return draw_resting_place(rng, world, name, resting_height(world, name), room)
 
 
-def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float) -> F64:
+def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
     """Draw a place on the table, (3,) [m], where the hand reaches to a height [m] and does not begin."""
     centre = np.array(world.scene.robot.workspace.centre)
 
     def draw() -> F64:
         return np.append(_xy(rng, world), height)
 
-    return draw_until(
-        draw, lambda at: bool(np.linalg.norm(at[:2] - centre) >= FROM_HAND) and world.reach.has(at), world, name
-    )
+    def fits(at: F64) -> bool:
+        return bool(np.linalg.norm(at[:2] - centre) >= FROM_HAND) and has_room(world, at, room)
+
+    return draw_until(draw, fits, world, name)
+
+
+def has_room(world: World, at: F64, room: float) -> bool:
+    """Return whether the hand reaches to a point (3,) and to `room` around it on the table [m].
+
+    A thing that is knocked then stays within reach.
+    """
+    around = ((room, 0, 0), (-room, 0, 0), (0, room, 0), (0, -room, 0)) if room else ()
+    return world.reach.has(at) and all(world.reach.has(at + np.array(way)) for way in around)
 
 
 def draw_goal(rng: np.random.Generator, world: World, height: float, in_air: float = IN_AIR) -> F64:

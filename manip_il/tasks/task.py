@@ -58,9 +58,9 @@ class Limits:
 class Task(Protocol):
     """A task, for every arm that can do it.
 
-    objects: what the arm moves and must reach, the first being what events move. grasped: those of them that the gripper
-    must go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that
-    the expert can label any state.
+    objects: what the arm moves and must reach, the first being what events move. grasped: those of them that the
+    gripper must go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone,
+    so that the expert can label any state.
     """
 
     @property
@@ -75,7 +75,7 @@ class Task(Protocol):
 
     @property
     def limits(self) -> Limits:
-        """What solves an episode and how long it may take, unless an environment's settings say otherwise."""
+        """Limits that solve and end an episode, unless an environment's settings say otherwise."""
         ...
 
     @property

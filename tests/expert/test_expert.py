@@ -23,7 +23,7 @@ from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
 
 from ..scenes import SIZES, started
-from ..tables import SCENES, every_robot, every_scene, every_scene_with_an_object
+from ..tables import SCENES, every_robot, every_scene, every_scene_with_a_cube
 
 DRIVERS = {"expert": (), "random": (), "varied": (SIZES,)}  # the last is the expert with cubes of many sizes
 STEEPEST = 50.0  # change of a joint target per change of the object's position [rad/m]
@@ -149,7 +149,7 @@ def test_an_arm_outside_its_limits_is_led_back(robot: str, task: str):
 
 @pytest.mark.parametrize("size", [1e-6, 1e-5, 1e-4])
 @pytest.mark.parametrize("driver", DRIVERS)
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, task: str, driver: str, size: float):
     expert, scene, rng = expert_of(robot, task), build_scene(robot, task), np.random.default_rng(0)
     compared, arm = 0, scene.actions.arm
@@ -166,7 +166,7 @@ def test_within_a_rung_the_label_follows_the_object_continuously(robot: str, tas
 @pytest.mark.parametrize(
     ("move", "reason"), [((1.0, 0, 0), "object out of reach"), ((0, 0, -0.3), "object off the table")]
 )
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str, move, reason: str):
     expert, scene = expert_of(robot, task), build_scene(robot, task)
     state = with_object(scene, visited_states(robot, task, "expert")[3], np.array(move, float))
@@ -199,7 +199,7 @@ def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label(robot: str):
     assert reasons == {"", "no joint step brings the hand nearer"}
 
 
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_a_label_is_for_the_cube_that_the_state_says(robot: str, task: str):
     scene = build_scene(robot, task)
     expert, answers = expert_of(robot, task), dict[float, list[bytes]]()
@@ -211,7 +211,7 @@ def test_a_label_is_for_the_cube_that_the_state_says(robot: str, task: str):
     assert len({same[0] for same in answers.values()}) == 3
 
 
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_a_heavier_cube_is_grasped_alike(robot: str, task: str):
     # A label is geometry: what the cube weighs is felt on the next step, not foreseen.
     scene, expert = build_scene(robot, task), expert_of(robot, task)
@@ -221,7 +221,7 @@ def test_a_heavier_cube_is_grasped_alike(robot: str, task: str):
 
 
 @pytest.mark.parametrize("offset", np.linspace(-0.3, 0.3, 7).tolist())
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_an_object_is_solved_for_or_said_to_be_out_of_reach(robot: str, task: str, offset: float):
     """A valid label moves the arm, all along the table towards the base and away from it."""
     env = started(robot, task)

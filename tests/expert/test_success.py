@@ -12,21 +12,21 @@ from manip_il.sim.events import KINDS, Perturbation, kinds_for
 from manip_il.tasks.table import TASKS
 
 from ..scenes import SIZES
-from ..tables import GRASPING, SCENES
+from ..tables import SCENES, WITH_A_CUBE
 
 SMALL = Condition("small", size=(0.03, 0.03), mass=(0.3, 0.3))
 KNOCKED = Condition("knocked", action_noise=(0.05, 0.05), knock=(0.05, 0.08))
 LARGE = Condition("large", size=(0.07, 0.07), mass=(0.05, 0.05))
 CASES = [
     *((*scene, NOMINAL) for scene in SCENES),
-    *((*scene, condition) for scene in GRASPING for condition in (SIZES, SMALL, LARGE, KNOCKED)),
+    *((*scene, condition) for scene in WITH_A_CUBE for condition in (SIZES, SMALL, LARGE, KNOCKED)),
 ]
 CHANGED = [
     (robot, task, kind, at)
     for robot, task in SCENES
     for kind in kinds_for(TASKS[task])
     if KINDS[kind].change is not None
-    for at in ((6, 16) if TASKS[task].grasped else (6,))  # on the way to the cube; with it in the hand
+    for at in ((6, 16) if (robot, task) in WITH_A_CUBE else (6,))  # on the way to the cube; with it in the hand
 ]
 
 
@@ -53,7 +53,7 @@ def test_the_expert_solves_every_task_from_40_starts(robot: str, task: str, cond
 @pytest.mark.parametrize(("robot", "task", "kind", "at"), CHANGED)
 def test_the_expert_recovers(robot: str, task: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
-    config, condition = EnvConfig(robot, task, horizon=at + 100), Perturbation(kind, {seed: at})
+    config, condition = EnvConfig(robot, task, horizon=at + TASKS[task].limits.horizon), Perturbation(kind, {seed: at})
     [episode] = run_job(RolloutJob(config, "expert", hold=0, conditions=(condition,)), [seed])
     assert episode.success
     assert len(episode) > at

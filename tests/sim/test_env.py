@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
+from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.register import ENV_IDS, register_envs
 from manip_il.sim.world import GOAL
 from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.table import TASKS
 
 from ..scenes import SEED, bits, drive, started, still
 from ..tables import SCENES, every_robot, every_scene
@@ -51,9 +55,10 @@ def test_every_robot_and_task_has_a_name_in_gymnasium():
     register_envs()
     register_envs()
     assert {"manip_il/PandaPickPlace-v0", "manip_il/FetchReach-v0"} <= set(ENV_IDS)
-    assert sorted(ENV_IDS.values()) == sorted(SCENES)
+    assert sorted(ENV_IDS.values()) == sorted(itertools.product(ROBOTS, TASKS))
+    assert set(SCENES) <= set(ENV_IDS.values())
     for env_id, (robot, task) in ENV_IDS.items():
-        env = gymnasium.make(env_id, horizon=6)
+        env = gymnasium.make(env_id, horizon=6, success_steps=1)
         config = env.unwrapped.config  # pyright: ignore[reportAttributeAccessIssue]
         assert (config.robot, config.task, config.horizon) == (robot, task, 6)
         assert env.reset(seed=1)[0]["agent_pos"].dtype == np.float32
@@ -175,7 +180,11 @@ def test_a_control_step_lasts_what_its_rate_says():
 
 
 @pytest.mark.parametrize(
-    "setting", [{"control_hz": 0}, {"control_hz": 30}, {"tolerance": 0.0}, {"success_steps": 0}, {"horizon": 4}]
+    "setting",
+    [
+        *({"control_hz": 0}, {"control_hz": 30}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
+        *({"success_steps": -1}, {"horizon": -1}, {"horizon": 4}),
+    ],
 )
 def test_a_setting_out_of_range_is_refused(setting: dict):
     with pytest.raises(UsageError, match=str(next(iter(setting.values())))):

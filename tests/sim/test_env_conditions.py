@@ -12,7 +12,7 @@ from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
 
 from ..scenes import started
-from ..tables import every_robot, every_scene, every_scene_with_an_object
+from ..tables import every_robot, every_scene, every_scene_with_a_cube
 
 HEAVY = Condition("heavy", mass=(0.3, 0.3), size=(0.06, 0.06), friction=(0.7, 0.7))
 LATE = Condition("late", delay=(3, 3))
@@ -31,14 +31,14 @@ def drive(env: ManipEnv, seed: int, steps: int) -> list[tuple[bytes, list[float]
     return path
 
 
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_a_nominal_episode_is_the_plain_environments_to_the_bit(robot: str, task: str):
     plain, other = ManipEnv(robot, task), ManipEnv(robot, task, conditions=[HEAVY, NOMINAL])
     for seed in (2, 3, 5):  # 2 leaves another cube behind
         assert (drive(plain, seed, 15) == drive(other, seed, 15)) == (seed % 2 == 1)
 
 
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_the_cube_has_the_drawn_mass_size_and_friction(robot: str, task: str):
     env = started(robot, task, conditions=[HEAVY])
     model, q = env.world.model, env.scene.objects["object"].q

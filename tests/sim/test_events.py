@@ -29,13 +29,13 @@ from manip_il.tasks.objects import CUBE_HALF
 from manip_il.tasks.table import TASKS
 
 from ..scenes import SEED, bits, cube, drive_until, in_hand, started, still
-from ..tables import GRASPING, every_scene, every_task
+from ..tables import WITH_A_CUBE, every_scene, every_task
 
 MOMENT = 7
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 
 
-@pytest.fixture(params=GRASPING, ids="-".join)
+@pytest.fixture(params=WITH_A_CUBE, ids="-".join)
 def env(request) -> ManipEnv:
     return started(*request.param)
 
@@ -87,8 +87,8 @@ def test_a_dropped_object_falls_onto_the_table(env: ManipEnv, seed: int):
 def test_a_scene_without_an_object_has_none_to_knock(robot: str, task: str):
     env = started(robot, task)
     before = bits(env)
-    assert move_object(env.world, np.random.default_rng(0), (0.05, 0.08)) == bool(TASKS[task].grasped)
-    assert (bits(env) == before) == (not TASKS[task].grasped)
+    assert move_object(env.world, np.random.default_rng(0), (0.05, 0.08)) == bool(TASKS[task].objects)
+    assert (bits(env) == before) == (not TASKS[task].objects)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -258,7 +258,7 @@ def test_what_is_drawn_follows_from_the_seed(env: ManipEnv, kind: str):
 
 @every_task
 def test_without_an_object_neither_it_nor_the_gripper_matters(task: str):
-    expected = KINDS if TASKS[task].grasped else ["jolt", "random", "opposite"]
+    expected = KINDS if TASKS[task].objects else ["jolt", "random", "opposite"]
     assert list(kinds_for(TASKS[task])) == list(expected)
 
 

@@ -18,13 +18,13 @@ from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 
 from ..scenes import world_at_home
-from ..tables import GRASPING, every_scene, every_scene_with_an_object
+from ..tables import WITH_A_CUBE, every_scene, every_scene_with_a_cube
 
 BESIDE = np.array([-0.04, 0.1, 0.0])  # of the hand [m]
 HEAVY = {"size": 0.07, "mass": 0.3, "friction": 0.7}
 
 
-@pytest.fixture(params=GRASPING, ids="-".join)
+@pytest.fixture(params=WITH_A_CUBE, ids="-".join)
 def world(request) -> World:
     return world_at_home(*request.param)
 
@@ -59,7 +59,7 @@ def test_a_varied_world_has_a_model_of_its_own_and_leaves_the_shared_one(world: 
     assert world.scene.model_bytes() == before
 
 
-@every_scene_with_an_object
+@every_scene_with_a_cube
 def test_back_to_nominal_is_never_having_varied(robot: str, task: str):
     scene = build_scene(robot, task)
     plain, varied = World(scene), World(scene)

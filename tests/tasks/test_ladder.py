@@ -14,21 +14,26 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from manip_il.sim.world import Pose
+from manip_il.tasks.grasp import (
+    FUNNEL_RADIUS,
+    HOVER,
+    LOWEST_EE,
+    OPEN_SLACK,
+    angle_between,
+    angle_from_down,
+    grasp_of,
+    hand_down,
+    lie_of,
+)
 from manip_il.tasks.ladder import (
     AT_GOAL,
     AT_GRASP_ANGLE,
     CLEAR,
-    FUNNEL_RADIUS,
-    HOVER,
-    LOWEST_EE,
     MAX_TILT,
-    OPEN_SLACK,
-    angle_between,
-    angle_from_down,
-    cube_yaw,
-    grasp_of,
-    grasp_yaw,
-    hand_down,
+    Lift,
+    carry,
+    carry_progress,
+    let_go,
     nearness,
     pick_progress,
     pick_rungs,
@@ -54,12 +59,19 @@ class Placed:
     edge: float = EDGE
     touching: bool = False
     most_opening: float = OPEN
+    around: tuple[tuple[float, float], ...] = ()
 
     def pose(self, name: str) -> Pose:
         return {"object": self.cube}[name]
 
     def extents(self, name: str) -> tuple[float, ...]:
         return (self.edge,) * 3
+
+    def kind(self, name: str) -> int:
+        return int(mujoco.mjtGeom.mjGEOM_BOX)
+
+    def neighbours(self, name: str) -> tuple[tuple[float, float], ...]:
+        return self.around
 
     def touched(self, name: str) -> bool:
         return self.touching
@@ -83,6 +95,18 @@ def at(x: float, y: float, z: float, yaw: float = 0.0, tilt: float = 0.0, edge: 
     cube = np.array([0.5, 0.1, edge / 2])
     hand = Pose(cube + [x, y, z], hand_down(yaw))
     return Placed(hand, Pose(cube, about((1, 0, 0), tilt)), np.array([0.4, -0.1, 0.2]), edge=edge, **changes)
+
+
+def turned(rotation: np.ndarray, **changes: Any) -> Placed:
+    """The cube turned, and the hand over it."""
+    world = at(0, 0, 0.1, **changes)
+    return replace(world, cube=Pose(world.cube.position, rotation))
+
+
+def cube_yaw(rotation: np.ndarray) -> tuple[float, float]:
+    """Yaw and tilt of a cube [rad]."""
+    lie = lie_of(turned(rotation), "object")
+    return lie.yaw, lie.tilt
 
 
 def held(to_goal: tuple[float, float, float], edge: float = EDGE) -> Placed:
@@ -202,9 +226,41 @@ def test_a_larger_cube_is_held_farther_from_its_middle(edge: float, holds: bool)
 
 
 def test_a_turned_hand_does_not_close():
-    turned = at(0, 0, 0, AT_GRASP_ANGLE + 0.1)
-    assert rung(turned)[0] == "descend"
-    np.testing.assert_allclose(rung(turned)[1].rotation, hand_down(0.0))
+    askew = at(0, 0, 0, AT_GRASP_ANGLE + 0.1)
+    assert rung(askew)[0] == "descend"
+    np.testing.assert_allclose(rung(askew)[1].rotation, hand_down(0.0))
+
+
+@pytest.mark.parametrize(("way", "yaw"), [((0.03, 0.0), 0.0), ((0.0, 0.03), np.pi / 2), ((0.0, -0.07), 0.0)])
+def test_the_fingers_go_down_where_no_neighbour_stands(way: tuple[float, float], yaw: float):
+    world = at(0, 0, 0.1, around=(way,))
+    assert abs(grasp_of(world, "object").yaw) == pytest.approx(yaw)
+
+
+def test_what_has_to_rise_first_does_so_without_moving_sideways():
+    world, to = held((0, 0, 0)), np.array([0.3, 0.1, 0.15])
+    low = carry(world, "object", to, Lift(most=0.05, slope=1.0, free=0.01, rise_first=0.03))
+    np.testing.assert_allclose(low.position - world.ee.position, [0, 0, 0.05])
+    np.testing.assert_allclose(carry(world, "object", to).position - world.ee.position, [-0.2, 0, 0.05])
+
+
+@given(st.floats(0, 0.3), st.floats(0, 0.3))
+def test_the_farther_the_higher_an_object_is_carried(one: float, other: float):
+    near, far = (Lift().over(distance) for distance in sorted((one, other)))
+    assert 0 <= near <= far <= Lift().most
+
+
+def test_carrying_is_done_where_the_object_is_to_go_and_nowhere_else():
+    world = held((0, 0, 0))
+    at_place, beside = (carry_progress(world, "object", world.cube.position + [x, 0, 0]) for x in (0, 0.05))
+    assert beside < at_place == 1
+
+
+def test_a_hand_lets_go_before_it_rises():
+    grips, free = (at(0, 0, 0, opening=opening, touching=opening == EDGE) for opening in (EDGE, EDGE + 0.02))
+    np.testing.assert_array_equal(let_go(grips, "object", 0.1).position, grips.ee.position)
+    assert let_go(free, "object", 0.1).position[2] == pytest.approx(free.cube.position[2] + 0.1)
+    assert let_go(grips, "object", 0.1).opening == let_go(free, "object", 0.1).opening > EDGE
 
 
 def test_over_an_object_that_has_not_settled_the_hand_waits():
@@ -263,7 +319,7 @@ def test_nearness_grows_as_the_way_gets_shorter(one: float, other: float):
 
 @given(st.floats(-np.pi / 4, np.pi / 4), st.floats(-np.pi, np.pi))
 def test_a_grasp_is_one_of_the_cubes_own_and_no_far_turn(object_yaw: float, hand_yaw: float):
-    yaw = grasp_yaw(object_yaw, hand_down(hand_yaw))
+    yaw = grasp_of(turned(about((0, 0, 1), object_yaw), yaw=hand_yaw), "object").yaw
     assert np.exp(4j * yaw) == pytest.approx(np.exp(4j * object_yaw), abs=1e-9)
     assert abs(yaw) <= 3 * np.pi / 4
 

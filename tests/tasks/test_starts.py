@@ -20,11 +20,11 @@ from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import FROM_HAND, LIFT, draw_until, draw_yaw
-from manip_il.tasks.table import get_task
+from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import Start
 
 from ..scenes import SEED
-from ..tables import GRASPING, SCENES, every_robot, every_scene, every_scene_with_an_object
+from ..tables import GRASPING, SCENES, every_robot, every_scene, every_scene_that_grasps
 
 seeds = st.integers(0, 2**40)
 edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's own [m]
@@ -50,27 +50,33 @@ def position(drawn: Start, name: str) -> np.ndarray:
 def test_everything_that_is_drawn_is_within_reach(scene: tuple[str, str], edge: float | None, seed: int):
     world = world_of(*scene, edge)
     poses = start(world, seed).poses
-    assert GOAL in poses
+    assert (GOAL in poses) == world.has_goal
+    assert set(TASKS[scene[1]].objects) <= set(poses)
     for name, (at, quaternion) in poses.items():
-        assert world.reach.has(at), f"{name} at {at}"
+        if name == GOAL or name in world.scene.objects:
+            assert world.reach.has(at), f"{name} at {at}"
         assert np.linalg.norm(quaternion) == pytest.approx(1)
 
 
 @given(st.sampled_from(GRASPING), edges, seeds)
 def test_an_object_rests_on_the_table_and_not_under_the_hand(scene: tuple[str, str], edge: float | None, seed: int):
     world = world_of(*scene, edge)
-    space, at = world.scene.robot.workspace, position(start(world, seed), OBJECT)
-    from_centre = at[:2] - space.centre
-    assert at[2] == (edge or 0.05) / 2
-    assert np.abs(from_centre).max() <= space.half_width
-    assert np.hypot(*from_centre) >= FROM_HAND
+    space, drawn = world.scene.robot.workspace, start(world, seed)
+    for name in get_task(scene[1]).objects:
+        at = position(drawn, name)
+        from_centre = at[:2] - space.centre
+        assert at[2] == world.extents(name)[2] / 2
+        assert np.abs(from_centre).max() <= space.half_width
+        assert np.hypot(*from_centre) >= FROM_HAND
 
 
 @given(st.sampled_from(GRASPING), seeds)
 def test_an_object_is_turned_about_the_vertical_by_an_eighth_turn_at_most(scene: tuple[str, str], seed: int):
-    w, x, y, z = start(world_of(*scene), seed).poses[OBJECT][1]
-    assert x == y == 0
-    assert abs(2 * np.arctan2(z, w)) <= np.pi / 4 + 1e-12
+    drawn = start(world_of(*scene), seed)
+    for name in get_task(scene[1]).objects:
+        w, x, y, z = drawn.poses[name][1]
+        assert x == y == 0
+        assert abs(2 * np.arctan2(z, w)) <= np.pi / 4 + 1e-12
 
 
 @every_scene
@@ -124,10 +130,11 @@ def test_half_the_goals_of_pick_and_place_are_on_the_table(robot: str):
     assert 150 <= on_table <= 250  # five standard deviations of a fair coin
 
 
-@every_scene_with_an_object
+@every_scene_that_grasps
 def test_starts_reach_into_every_quarter_of_the_table(robot: str, task: str):
     world, centre = world_of(robot, task), get_robot(robot).workspace.centre
-    quarters = {tuple(position(start(world, seed), OBJECT)[:2] > centre) for seed in range(100)}
+    first = get_task(task).objects[0]
+    quarters = {tuple(position(start(world, seed), first)[:2] > centre) for seed in range(100)}
     assert len(quarters) == 4
 
 

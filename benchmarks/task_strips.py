@@ -1,0 +1,58 @@
+"""A film strip of every task, solved by the expert, and the table beside them: what `docs/tasks.md` shows.
+
+Usage: MUJOCO_GL=egl python benchmarks/task_strips.py [TASK ...]; writes docs/tasks/TASK.jpg.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from manip_il.expert import Expert
+from manip_il.seeding import stream_seeds
+from manip_il.sim.config import FILM
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.render import Picture
+from manip_il.tasks.table import TASKS
+
+FRAMES = 6  # of a strip
+CROP = (slice(90, 450), slice(130, 610))  # of the front camera's picture, where things happen [pixels]
+HEIGHT = 180  # of a strip [pixels]
+DOCS = Path(__file__).parent.parent / "docs" / "tasks"
+
+
+def film(task: str) -> list[Picture]:
+    """Return a picture of every other control step of one solved episode, and of its end."""
+    env = ManipEnv("panda", task, look=FILM, render_mode="rgb_array")
+    expert, pictures = Expert(env.scene), []
+    env.start(stream_seeds("training", 4)[3])
+    for step in range(env.config.horizon):
+        picture = env.render() if step % 2 == 0 else None
+        pictures += [picture] if picture is not None else []
+        env.advance(expert.label(env.get_state()).action)
+        if env.solved:
+            break
+    last = env.render()
+    return [*pictures, last] if last is not None else pictures
+
+
+def strip(pictures: list[Picture]) -> Image.Image:
+    """Return pictures from the beginning to the end, side by side."""
+    chosen = np.linspace(0, len(pictures) - 1, FRAMES).round().astype(int)
+    whole = Image.fromarray(np.hstack([pictures[i][CROP] for i in chosen]))
+    return whole.resize((whole.width * HEIGHT // whole.height, HEIGHT), Image.Resampling.LANCZOS)
+
+
+def main() -> None:
+    DOCS.mkdir(exist_ok=True)
+    for task in sys.argv[1:] or TASKS:
+        path = DOCS / f"{task}.jpg"
+        strip(film(task)).save(path, quality=85)
+        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
