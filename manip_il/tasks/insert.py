@@ -41,13 +41,15 @@ SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the ri
 FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
 LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
 CLEAR = 0.03  # of the hand over the peg once it has let go [m]
+AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
-ASIDE = math.radians(40)  # yaw, to either side, at which a hand that sets the peg up points: wrists get there [rad]
+ASIDE = (math.radians(30), math.radians(65))  # yaw, to either side, at which a hand that sets the peg up points: wrists get there [rad]
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
 ASLANT = 0.35  # of the hand off straight down: it does not carry the peg like that, but sets it up [rad]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
+IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
 _QUARTER = math.pi / 2
@@ -207,7 +209,11 @@ def _to_stand(world: World) -> Way:
     hand, axis = world.ee.rotation, upper_axis(world)
     upright = _upright(axis) @ hand
     y, at = float(world.ee.position[1]) - world.scene.robot.workspace.centre[1], azimuth(hand)
-    yaw = min((ASIDE, -ASIDE), key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)))
+    least, most = ASIDE
+    yaw = min(
+        (math.copysign(min(most, max(least, side * at)), side) for side in (1.0, -1.0)),
+        key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)),
+    )
     turn = yaw - azimuth(upright)
     c, s = math.cos(turn), math.sin(turn)
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ upright
@@ -262,7 +268,7 @@ def _lift(world: World) -> float:
     error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
     if _is_entered(world) or error <= 0:
         return 0.0
-    return DEPTH + 0.001 + min(LIFT, LIFT_SLOPE * error)
+    return DEPTH + 0.0005 + min(LIFT, LIFT_SLOPE * error)
 
 
 def _bring(world: World) -> Target:
@@ -286,7 +292,9 @@ def _move(world: World, way: Way, missing: float, sideways_at: float, exact: boo
     """Move the peg with the hand. missing: height [m]; sideways_at: how little may be missing for a move sideways."""
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
     turn = 0.6 * min(1.0, max(0.05, 1.0 - missing / 0.06))
-    position = world.ee.position + np.array([*(sideways * way.off), missing])
+    if abs(way.low - DEPTH) < AT_RIM:
+        missing = max(missing, -GENTLE)
+    position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
     return Target(position, way.rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
 
@@ -300,6 +308,27 @@ def _is_up(world: World) -> bool:
 def _hand_is_at(world: World) -> bool:
     x, y, z = (world.ee.position - lower_end(world)).tolist()
     return math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR
+
+
+def _falls(world: World) -> bool:
+    """Whether the peg, between the fingers or just under their tips, neither stands nor lies."""
+    peg, ee = world.pose(PEG), world.ee
+    way = ee.position - peg.position
+    along = float(peg.rotation[:, 2] @ way)
+    beside = ee.rotation.T @ (way - along * peg.rotation[:, 2])
+    between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
+    if not between or abs(along) > world.extents(PEG)[2] / 2:
+        return False
+    return lie_of(world, PEG).tilt > 0.06 or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
+
+
+def _catch(world: World) -> Target:
+    """Close the fingers, and go with the peg."""
+    peg, ee = world.pose(PEG), world.ee
+    axis = upper_axis(world)
+    along = float(axis @ (ee.position - peg.position))
+    down = (world.extents(PEG)[2] / 2 - FROM_END - along) * axis
+    return Target(ee.position + down, ee.rotation.copy(), CLOSED)
 
 
 def _let_stand(world: World) -> Target:
@@ -350,6 +379,7 @@ _RUNGS = (
     Rung("carry", "the peg hangs from the hand, on its way to over the hole", _hangs, _bring),
     Rung("let_stand", "the peg has been set up on the table, and the hand lets go of it", _is_up, _let_stand),
     Rung("set_up", "the peg is held aslant, and set up on the table", held, _set_up),
+    Rung("catch", "the peg falls between the open fingers, and they close", _falls, _catch),
     Rung("grasp", "the fingers are around the peg and close, but do not hold it yet", _at_grip, _close),
     Rung("open", "the fingers are closed, or not open wide enough to go around the peg",
          lambda w: not grip_of(w).open_enough, _approach),
