@@ -29,7 +29,7 @@ DEPTH, WALL = 0.04, 0.018  # of the hole, and thickness of the walls around it [
 FROM_END = 0.03  # of the grip from the peg's upper end [m]
 LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
 STANDS = 0.4  # tilt under which the peg is grasped as it stands, from above [rad]
-LEAN = math.radians(45)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
+LEAN = math.radians(60)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
 LEAN_BY_ROOM = 3.0  # the same at most, by how much farther the arm reaches: its wrist is that far out [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand off its grip: close, keep closing [m]
 AT_ANGLE = 0.25  # [rad]
@@ -44,10 +44,10 @@ CLEAR = 0.03  # of the hand over the peg once it has let go [m]
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
-ASIDE = (math.radians(30), math.radians(65))  # yaw, to either side, at which a hand that sets the peg up points: wrists get there [rad]
+ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand that sets the peg up points: wrists get there [rad]
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
-ASLANT = 0.35  # of the hand off straight down: it does not carry the peg like that, but sets it up [rad]
+ASLANT = 0.40  # of the hand off straight down: it does not carry the peg like that, but sets it up [rad]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
 IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 APART = 0.14  # of the peg from the hole at the start [m]
@@ -95,9 +95,8 @@ def hand_at(yaw: float, pitch: float) -> F64:
 
 
 def azimuth(rotation: F64) -> float:
-    """Return the yaw of `hand_at` that a hand (3, 3) has at whatever pitch from 0 to a quarter turn [rad]."""
-    x, y, _ = (rotation[:, 0] + rotation[:, 2]).tolist()
-    return math.atan2(y, x)
+    """Return the yaw of `hand_at` that a hand (3, 3) has, whatever its pitch [rad]: its fingers' motion is level."""
+    return math.atan2(rotation[0, 1], -rotation[1, 1])
 
 
 def lower_end(world: World) -> F64:
