@@ -76,7 +76,7 @@ class Expert:
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(self, q: F64, position: F64, rotation: F64, exact: bool) -> tuple[F64, float] | None:
-        """A joint step [rad] and what it leaves of the error; where `exact`, aimed again, off by what a first one misses."""
+        """A joint step [rad] and what it leaves of the error; `exact`: aimed again, off by what the first misses."""
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most)
         if first is None or not exact:
