@@ -71,7 +71,7 @@ def test_either_end_of_the_peg_may_be_the_lower_one():
 def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
     env = ManipEnv("panda", task)
     expert = Expert(env.scene)
-    for seed in SEEDS:
+    for seed in SEEDS[:3]:  # one of them lies
         env.start(seed)
         for _ in range(env.config.horizon):
             env.advance(expert.label(env.get_state()).action)
