@@ -5,6 +5,7 @@ from __future__ import annotations
 from manip_il.errors import UnknownName
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
+from manip_il.tasks.insert import Insert
 from manip_il.tasks.lift import Lift
 from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.press import Press
@@ -22,6 +23,8 @@ TASKS: dict[str, Task] = {
     "stack": Stack(),
     "drawer": Drawer(),
     "clear_table": ClearTable(),
+    "insert": Insert(),
+    "insert_tight": Insert("insert_tight", play=0.0005),
 }
 
 

@@ -19,7 +19,8 @@ Observed = Mapping[str, "F64 | float"]
 class Target(NamedTuple):
     """Goal of the expert's next step: a pose of `ee`, position (3,) [m] and rotation (3, 3), and an opening [m].
 
-    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad].
+    max_step: how far ahead of the hand its target may run [m]; max_turn: [rad]. exact: do not let the arm's posture,
+    which inverse kinematics keeps near home, pull the hand off its target by a millimetre; for fits tighter than that.
     """
 
     position: F64
@@ -27,6 +28,7 @@ class Target(NamedTuple):
     opening: float
     max_step: float = 0.12
     max_turn: float = 0.6
+    exact: bool = False
 
 
 @dataclass(frozen=True)

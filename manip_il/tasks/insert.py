@@ -1,0 +1,202 @@
+"""Insert: a square peg into a hole, from wherever it stands or lies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+from manip_il.tasks.grasp import angle_between, lie_of
+from manip_il.tasks.ladder import CLOSED, nearness
+from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
+from manip_il.tasks.peg import (
+    HOLE,
+    LIFT,
+    LIFT_SLOPE,
+    PEG,
+    PEG_RUNGS,
+    Way,
+    azimuth,
+    hangs,
+    held,
+    lower_end,
+    move,
+    peg_progress,
+    upper_axis,
+    way_to,
+)
+from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+SIDE, LENGTH, MASS = 0.03, 0.10, 0.08  # of the peg [m], [m], [kg]
+DEPTH, WALL = 0.04, 0.018  # of the hole, and thickness of the walls around it [m]
+FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
+AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
+EXACT = 0.02  # error under which the hand is placed exactly [m]
+IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
+APART = 0.14  # of the peg from the hole at the start [m]
+NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
+_QUARTER = math.pi / 2
+
+
+def is_in(world: World) -> bool:
+    """Return whether the peg is at the hole's floor."""
+    return math.dist(lower_end(world), world.pose(HOLE).position) < IN
+
+
+def to_hole(world: World) -> Way:
+    """Return what is left to do for a peg that hangs from the hand; computed once a state."""
+    return world.remember("to hole", lambda: _to_hole(world))
+
+
+def _to_hole(world: World) -> Way:
+    """Turn the peg with the hand, as it lies in it, to one of the four ways in which it fits the hole."""
+    peg, hole, hand = world.pose(PEG), world.pose(HOLE), world.ee.rotation
+    in_hand = peg.rotation.T @ hand
+    flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
+    turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
+    best = min(turns, key=lambda turn: angle_between(hand, turn) + abs(azimuth(turn)))
+    return way_to(world, best, lambda world, end: hole.position)
+
+
+def _quarter(hole: F64, k: int, flip: float) -> F64:
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[k]
+    return hole @ np.array([[c, -s * flip, 0.0], [s, c * flip, 0.0], [0.0, 0.0, flip]])
+
+
+def _is_entered(world: World) -> bool:
+    way = to_hole(world)
+    return way.low < DEPTH - 0.002 and math.hypot(*way.off) < 0.006
+
+
+def _play(world: World) -> float:
+    return 2 * float(world.model.geom("hole left").pos[1] - WALL / 2) - world.extents(PEG)[0]
+
+
+def _lift(world: World) -> float:
+    """How high over the hole's floor the peg's lower end is to be [m]."""
+    error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
+    if _is_entered(world) or error <= 0:
+        return 0.0
+    return DEPTH + 0.0005 + min(LIFT, LIFT_SLOPE * error)
+
+
+def _bring(world: World) -> Target:
+    """Up, over the hole, the nearer the lower, and slowly down into it."""
+    way = to_hole(world)
+    missing = _lift(world) - way.low
+    if abs(way.low - DEPTH) < AT_RIM:
+        missing = max(missing, -GENTLE)
+    far = math.hypot(*way.off) > 0.01
+    return move(world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT)
+
+
+def _hold(world: World) -> Target:
+    if held(world):
+        return _bring(world)
+    return Target(world.ee.position.copy(), world.ee.rotation.copy(), CLOSED)
+
+
+_RUNGS = (
+    Rung("inserted", "the peg is at the floor of the hole", is_in, _hold),
+    Rung("insert", "the peg hangs from the hand and goes down into the hole",
+         lambda w: hangs(w) and _lift(w) < DEPTH, _bring),
+    Rung("carry", "the peg hangs from the hand, on its way to over the hole", hangs, _bring),
+    *PEG_RUNGS,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Insert:
+    """Put a peg into the hole that it fits. play: how much wider the hole is than the peg [m]."""
+
+    name: str = "insert"
+    instruction: str = "Put the peg into the hole."
+    play: float = 0.002
+    limits: Limits = field(default=Limits(tolerance=0.004, horizon=400))
+    objects: tuple[str, ...] = (PEG,)
+    grasped: tuple[str, ...] = (PEG,)
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the peg, and four walls around the hole."""
+        add_object(spec, PEG, "box", [SIDE / 2, SIDE / 2, LENGTH / 2], MASS, RED)
+        hole = add_furniture(spec, HOLE)
+        inner = (SIDE + self.play) / 2
+        for side, sign in (("left", 1), ("right", -1)):
+            at = sign * (inner + WALL / 2)
+            add_part(hole, f"hole {side}", (inner + WALL, WALL / 2, DEPTH / 2), (0, at, DEPTH / 2), GREY)
+        for side, sign in (("far", 1), ("near", -1)):
+            at = sign * (inner + WALL / 2)
+            add_part(hole, f"hole {side}", (WALL / 2, inner, DEPTH / 2), (at, 0, DEPTH / 2), GREY)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw where the hole is and its yaw, and the peg apart from it, half of the time lying, at any yaw."""
+        centre = world.scene.robot.workspace.centre
+        side, _, length = world.extents(PEG)
+
+        hole = draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
+        lies = rng.uniform() < 0.5
+        height = (side if lies else length) / 2
+
+        farthest = centre[0] + (NOT_FARTHER if lies else math.inf)
+
+        def fits(at: F64) -> bool:
+            return math.dist(at[:2], hole[:2]) > APART and at[0] < farthest
+
+        peg = draw_until(lambda: draw_resting_place(rng, world, PEG, height), fits, world, PEG)
+        turn = draw_yaw(rng, np.pi)
+        if lies:
+            mujoco.mju_mulQuat(turn, turn.copy(), np.array([math.cos(_QUARTER / 2), 0.0, math.sin(_QUARTER / 2), 0.0]))
+        return Start({PEG: (peg, turn), HOLE: (hole, draw_yaw(rng))})
+
+    def observe(self, world: World) -> Observed:
+        """Return hand, peg and hole, the ways between them, and how the hand is to turn for the peg to fit."""
+        peg, hole, lie = world.pose(PEG).position, world.pose(HOLE), lie_of(world, PEG)
+        yaw = math.atan2(hole.rotation[1, 0], hole.rotation[0, 0])
+        way = to_hole(world)
+        return {
+            **observe_hand(world),
+            PEG: peg,
+            "peg.axis": upper_axis(world),
+            "peg.cos4yaw": math.cos(4 * lie.yaw),
+            "peg.sin4yaw": math.sin(4 * lie.yaw),
+            HOLE: hole.position,
+            "hole.cos4yaw": math.cos(4 * yaw),
+            "hole.sin4yaw": math.sin(4 * yaw),
+            "peg_from_ee": peg - world.ee.position,
+            "hole_from_peg": hole.position - lower_end(world),
+            "turn": _rotation_vector(way.rotation @ world.ee.rotation.T),
+        }
+
+    def error(self, world: World) -> float:
+        """Return the distance of the peg's lower end from the middle of the hole's floor [m]."""
+        return math.dist(lower_end(world), world.pose(HOLE).position)
+
+    def progress(self, world: World) -> float:
+        """Return progress of grasping, carrying and inserting, by the way that is left."""
+        if is_in(world):
+            return 1.0
+        if not hangs(world):
+            return 0.6 * peg_progress(world)
+        way = to_hole(world)
+        if _is_entered(world):
+            return 0.9 + 0.1 * max(0.0, 1.0 - way.low / DEPTH)
+        height = max(0.0, _lift(world) - DEPTH)
+        rest = math.hypot(*way.off) + abs(DEPTH + height - way.low) + height + 0.1 * way.angle
+        return 0.6 + 0.3 * nearness(rest)
+
+
+def _rotation_vector(rotation: F64) -> F64:
+    """Return the axis of a rotation (3, 3) times its angle, (3,) [rad]."""
+    quaternion, vector = np.empty(4), np.empty(3)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return vector

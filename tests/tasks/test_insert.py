@@ -1,0 +1,81 @@
+"""The task `insert`: where the peg starts, how the hand turns it, and that it ends up in the hole."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from manip_il.expert import Expert
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.world import World
+from manip_il.tasks.grasp import hand_down
+from manip_il.tasks.insert import APART
+from manip_il.tasks.peg import HOLE, PEG, azimuth, hand_at, lower_end, upper_axis
+from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.table import TASKS
+
+from ..tables import every_robot
+
+PLAYS = {"insert": 0.002, "insert_tight": 0.0005}
+SEEDS = stream_seeds("certificate", 6)
+
+
+@pytest.mark.parametrize(("task", "play"), PLAYS.items())
+def test_the_hole_is_wider_than_the_peg_by_the_play(task: str, play: float):
+    world = World(build_scene("panda", task))
+    left, right = (world.model.geom(f"hole {side}") for side in ("left", "right"))
+    between = left.pos[1] - left.size[1] - (right.pos[1] + right.size[1])
+    assert between - world.extents(PEG)[0] == pytest.approx(play)
+
+
+@every_robot
+def test_the_peg_starts_standing_or_lying_apart_from_the_hole(robot: str):
+    env, up = ManipEnv(robot, "insert"), set[bool]()
+    for seed in SEEDS:
+        env.start(seed)
+        peg, hole = env.world.pose(PEG), env.world.pose(HOLE)
+        up.add(abs(peg.rotation[2, 2]) > 0.5)
+        assert math.dist(peg.position[:2], hole.position[:2]) > APART
+        corners = peg.position[2] - np.abs(peg.rotation[2]) @ np.array(env.world.extents(PEG)) / 2
+        assert corners == pytest.approx(0.0, abs=1e-9)
+    assert up == {True, False}
+
+
+@pytest.mark.parametrize("pitch", [-1.0, 0.0, 1.0, math.pi / 2])
+@pytest.mark.parametrize("yaw", [-1.5, 0.0, 0.7])
+def test_a_hand_has_the_azimuth_that_it_was_turned_to_at_any_pitch(yaw: float, pitch: float):
+    hand = hand_at(yaw, pitch)
+    np.testing.assert_allclose(hand @ hand.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(hand) == pytest.approx(1.0)
+    assert azimuth(hand) == pytest.approx(yaw)
+    np.testing.assert_allclose(hand_at(yaw, 0.0), hand_down(yaw), atol=1e-12)
+
+
+def test_either_end_of_the_peg_may_be_the_lower_one():
+    world = World(build_scene("panda", "insert"))
+    for upside_down in (UPRIGHT, np.array([0.0, 1.0, 0.0, 0.0])):
+        world.place(PEG, np.array([0.5, 0.1, 0.05]), upside_down)
+        world.place(HOLE, np.array([0.5, 0.1, 0.0]), UPRIGHT)
+        world.update()
+        np.testing.assert_allclose(lower_end(world), [0.5, 0.1, 0.0], atol=1e-12)
+        np.testing.assert_allclose(upper_axis(world), [0.0, 0.0, 1.0], atol=1e-12)
+        assert TASKS["insert"].error(world) == pytest.approx(0.0, abs=1e-12)
+        assert TASKS["insert"].progress(world) == 1.0
+
+
+@pytest.mark.parametrize("task", PLAYS)
+def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
+    env = ManipEnv("panda", task)
+    expert = Expert(env.scene)
+    for seed in SEEDS[:3]:  # one of them lies
+        env.start(seed)
+        for _ in range(env.config.horizon):
+            env.advance(expert.label(env.get_state()).action)
+            if env.solved:
+                break
+        assert env.solved
+        assert lower_end(env.world)[2] < 0.004
