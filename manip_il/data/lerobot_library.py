@@ -103,7 +103,7 @@ class Metadata(LeRobotDatasetMetadata):
         return np.concatenate([numbers[piece] for numbers, piece in zip(self.task_numbers, pieces, strict=True)])
 
     def numbered(self, datasets: Sequence[LeRobotDataset]) -> Sequence[Any]:
-        """Return the datasets, one for each root, with frames, episodes and tasks numbered on, as `read_tables` does."""
+        """Return the datasets, one for each root, with frames, episodes and tasks numbered as in `read_tables`."""
         if len(datasets) == 1:
             return datasets
         starts = np.cumsum([(0, 0), *zip(self.frames, self.episodes_of, strict=True)], axis=0).tolist()
@@ -113,9 +113,9 @@ class Metadata(LeRobotDatasetMetadata):
 
 @dataclass(frozen=True)
 class _Numbered:
-    """A dataset in a row of several. frames, episodes: of those before it. tasks: the joint number of its every task."""
+    """A dataset in a row of several. frames, episodes: of those before it. tasks: joint number of its every task."""
 
-    dataset: LeRobotDataset
+    dataset: Any  # LeRobot's
     frames: int
     episodes: int
     tasks: I64
@@ -124,7 +124,7 @@ class _Numbered:
         return len(self.dataset)
 
     def __getitem__(self, row: int) -> Frame:
-        frame = self.dataset[row]
+        frame: Frame = self.dataset[row]
         task = int(frame["task_index"])
         more = {"index": self.frames, "episode_index": self.episodes, "task_index": int(self.tasks[task]) - task}
         return frame | {key: frame[key] + number for key, number in more.items()}

@@ -55,9 +55,9 @@ class PolicyTrainer:
     """Policy, processors, optimiser and data of one run that clones the labels of the dataset in `root`, or of several.
 
     spec, fingerprint, look: see `CheckpointMeta.of`. weights: how often each frame is drawn, relative to the others,
-    (N,); by default each once an epoch, or as `sources`, the datasets of `root`, have it. on_frames: sees how many frames more have been decoded into the cache. On one
-    CPU the same data, config and threads give the same bits, resumed or not. Started by `accelerate launch` or
-    `torchrun`, every process takes `batch_size` samples a step.
+    (N,); by default each once an epoch, or as `sources`, the datasets of `root`, have it. on_frames: sees how many
+    frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
+    resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
     on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.

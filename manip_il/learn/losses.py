@@ -189,7 +189,7 @@ class CategoricalHead(Distribution):
 
     @override
     def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
-        """Return the log-probability of the bin of each row's target (B, n), between two centres in proportion, (B,)."""
+        """Return log-probability of each row's target (B, n), between two bins' centres in proportion, (B,) [nats]."""
         log_prob, place = self._logits(params).log_softmax(-1), self._place(target)
         lower = place.floor().clamp(max=self.total - 2)
         upper_share = place - lower

@@ -72,9 +72,9 @@ def fit(
 
     table: the schema's `observation.state`, `observation.environment_state`, `action` and, where
     there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
-    to the others, (N,); by default each once an epoch, or as `sources`, the datasets that the table was read from, have
-    it. Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the data. The
-    same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
+    to the others, (N,); by default each once an epoch, or as `sources`, the datasets of the table, have it.
+    Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the
+    data. The same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
     `metrics.jsonl`, and where the config says.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for

@@ -13,7 +13,7 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.network import Shape
 
-SIGMA = 2.0  # [bins]
+SIGMA = 3.0  # [bins]
 
 
 @PreTrainedConfig.register_subclass("mlp")
