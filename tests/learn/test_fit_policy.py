@@ -171,7 +171,7 @@ def edit_tasks(root: Path, text: str) -> None:
     """Give a dataset of one instruction another."""
     path = root / "meta" / "tasks.parquet"
     tasks = pd.read_parquet(path)
-    tasks.rename(index={tasks.index[0]: text}).to_parquet(path)
+    tasks.rename(index=lambda _: text).to_parquet(path)
 
 
 def test_held_out_episodes_are_never_learnt_from(demos) -> None:
