@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.errors import UnknownName, UsageError
@@ -132,7 +133,11 @@ _LEARNER_ALONE = BetaSchedule("constant", 0.0)
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Options of `manip-il dagger` by their names; round 0 is always the expert's own demonstrations.
+    """Options of `manip-il dagger` by their names; round 0 is the expert's own demonstrations unless it is given.
+
+    datasets: recorded demonstrations, in place of those that round 0 would record. start: a `pretrained_model` folder
+    that is round 0's policy, in place of cloning; without datasets, round 0 then has no demonstrations. Later rounds
+    begin with its weights, and have its architecture.
 
     method: a name in `ALGORITHMS` (`check_method`). rounds: after round 0, fewer where label_budget, the sound labels
     of all rounds together, is reached before. beta: the share of a round's steps that the expert drives. label,
@@ -171,6 +176,8 @@ class RunConfig:
     )
     cameras: CameraConfig | None = None
     seed: int = 0
+    datasets: tuple[Path, ...] = ()
+    start: Path | None = None
 
     def __post_init__(self) -> None:
         from manip_il.seeding import MAX_ROUNDS
@@ -198,6 +205,10 @@ class RunConfig:
             raise UsageError("label is 'takeover' and query 'every': the expert would drive from the first step on")
         if rule.kind == "ensemble" and self.ensemble < 2:
             raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
+        if self.start is not None and self.ensemble > 1:
+            raise UsageError(
+                f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with; leave it out"
+            )
         if rule.kind != "ensemble" and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
 

@@ -79,12 +79,15 @@ def fit_table(
 
 
 def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0) -> FitConfig:
-    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble."""
+    """Return the options of one round's fit. init_from: where a warm one starts from. member: of the ensemble.
+
+    Any other starts from the run's start policy, where there is one.
+    """
     steps = config.fit.steps or (None if config.fit.is_mlp else CHUNK_STEPS)
     if init_from is not None:
         steps = config.refit_steps or steps
     seed = stream_base("training", config.seed) + member
-    return replace(config.fit, steps=steps, seed=seed, init_from=init_from)
+    return replace(config.fit, steps=steps, seed=seed, init_from=init_from or config.start)
 
 
 def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:

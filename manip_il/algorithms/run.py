@@ -28,15 +28,16 @@ from manip_il.algorithms.fitting import fit_round, round_fit
 from manip_il.algorithms.rounds import Drive, Fitted, Rollouts, RoundResult, best_round
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
-from manip_il.data.build import Recording, merge_datasets
+from manip_il.data.build import Recording, dataset_sha256, merge_datasets
 from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.lerobot_read import dataset_info, read_table
+from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
 from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
-from manip_il.errors import NothingToLearnError
+from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
+from manip_il.learn.checkpoint import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.recording import MAX_TRIES, Collected, check_journals, collect, collect_successes, provenance, record
 from manip_il.seeding import stream_seeds
@@ -68,7 +69,9 @@ class Run:
         self._seconds: dict[str, float] = {}
 
     def demonstrations(self, count: int, round_: int = 0) -> Rollouts:
-        """Record `count` successful episodes of the expert as a round's."""
+        """Record `count` successful episodes of the expert as a round's; round 0 may be given, see `RunConfig`."""
+        if round_ == 0 and (self.config.datasets or self.config.start):
+            return self._given()
         self._watch.on_stage("collect", round_, count)
         with self._timed("collect"):
             if not self._is_recorded(round_):
@@ -114,6 +117,10 @@ class Run:
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
         """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
         config, before, round_ = self.config, self._fitted, data[-1].round
+        if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
+            with self._timed("fit"):
+                self._fitted = Fitted(round_, (self._take(config.start, round_),))
+            return self._fitted
         roots = [one.dataset for one in data if one.dataset is not None]
         starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
         members: list[Path] = []
@@ -140,7 +147,7 @@ class Run:
             labels=sum(one.labels for one in so_far),
             queries=sum(one.queries for one in so_far) + self._held_out_queries,
             episodes=sum(one.episodes for one in so_far),
-            rollout_success=here.successes / here.episodes,
+            rollout_success=here.successes / max(1, here.episodes),
             policy=policy.path,
             validation=validation,
             seconds={stage: round(took, 2) for stage, took in seconds.items()},
@@ -201,6 +208,33 @@ class Run:
         except NothingToLearnError:
             _LOG.warning("round %d: no labels, as the expert was queried in none of its rollouts", job.round)
 
+    def _given(self) -> Rollouts:
+        """Return round 0 made of the datasets that were given, if any; they are copied into the run."""
+        root, datasets = self._folder(0) / DATASET, self.config.datasets
+        if not datasets:
+            self._seconds["collect"] = 0.0
+            self._made[0] = Rollouts(0, None, 1.0, labels=0, queries=0, episodes=0, successes=0)
+            return self._made[0]
+        found = {str(one): dataset_sha256(one) for one in datasets}
+        with self._timed("collect"):
+            if not self._is_recorded(0):
+                merge_datasets(datasets, root, repo_id=self._repo_id(0), provenance={"given": found})
+        for (one, ours), theirs in zip(found.items(), read_provenance(root).get("given", {}).values(), strict=True):
+            if ours != theirs:
+                raise MismatchError("content of a dataset", one, ours, f"the run in {self.folder}", theirs)
+        info = dataset_info(root)
+        labels = int(read_table(root, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum())
+        self._made[0] = Rollouts(0, root, 1.0, labels, labels, info.episodes, info.success or 0)
+        return self._made[0]
+
+    def _take(self, policy: Path, round_: int) -> Path:
+        """Copy a policy into a round that has nothing to fit; return its `pretrained_model`."""
+        last = self._folder(round_) / POLICY / "checkpoints" / "last"
+        if not last.is_dir():
+            with new_folder(last) as new:
+                shutil.copytree(policy, new / PRETRAINED_MODEL)
+        return last / PRETRAINED_MODEL
+
     def _keep(self, round_: int, beta: float, queried_everywhere: bool) -> Rollouts:
         """Return what lies on disk of a round's rollouts."""
         here = self._folder(round_)
@@ -224,9 +258,11 @@ class Run:
     def _finish(self, best: RoundResult) -> None:
         shutil.rmtree(self.folder / BEST, ignore_errors=True)
         with new_folder(self.folder / BEST) as new:
-            shutil.copytree(best.policy, new / "pretrained_model")
+            shutil.copytree(best.policy, new / PRETRAINED_MODEL)
         root, config = self.folder / DATASET, self.config
         rounds = [one.dataset for one in self._made.values() if one.dataset is not None]
+        if not rounds:
+            return
         if root.is_dir() and dataset_info(root).episodes == sum(dataset_info(one).episodes for one in rounds):
             return
         shutil.rmtree(root, ignore_errors=True)

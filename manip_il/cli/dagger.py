@@ -13,7 +13,7 @@ from manip_il.algorithms.config import BetaSchedule, RunConfig, Sampling, check_
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.table import ALGORITHMS, Method, check_method, run_algorithm
 from manip_il.cli import common_options as common
-from manip_il.cli.inputs import start_policy
+from manip_il.cli.inputs import check_given, require_dataset, round_policy
 from manip_il.cli.options import Open, command_line, to_plain
 from manip_il.cli.outputs import (
     CONFIG_FILE,
@@ -27,24 +27,33 @@ from manip_il.cli.outputs import (
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
 from manip_il.errors import ManipError
-from manip_il.learn.fit_config import MLP_STEPS, FitConfig
+from manip_il.learn.fit_config import MLP_STEPS, FitConfig, check_weights
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import LearningCurve
+    from manip_il.sim.config import CameraConfig
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
 
 
 @dataclass
+class GivenGroup:
+    """`--dataset.*` of what a run begins with."""
+
+    root: list[Path] = option(list, "recorded demonstrations to begin with, in place of recording round 0's")
+
+
+@dataclass
 class DaggerOptions(common.EnvOptions):
     """Roll out the policy, ask the expert in every visited state, aggregate, refit, and repeat.
 
-    Round 0 is behaviour cloning on the expert's own demonstrations. --policy.type is mlp, cnn or any policy of
-    LeRobot's; its options are those of `manip-il train`. OUTPUT_DIR/best holds the round with the highest
+    Round 0 is behaviour cloning on the expert's own demonstrations, or on those in --dataset.root. With --policy.path
+    it is that policy, and there are no demonstrations but those in --dataset.root. --policy.type is mlp, cnn or any
+    policy of LeRobot's; its options are those of `manip-il train`. OUTPUT_DIR/best holds the round with the highest
     validation success.
     """
 
@@ -52,6 +61,7 @@ class DaggerOptions(common.EnvOptions):
     method: Method = option(
         "dagger", f"who drives after round 0: {', '.join(one.driver for one in ALGORITHMS.values())}"
     )
+    dataset: GivenGroup = field(default_factory=GivenGroup)
     demonstrations: int = option_of(RunConfig, "demonstrations")
     rounds: int = option_of(RunConfig, "rounds", help_text="DAgger rounds after round 0; a resumed run may have more")
     episodes_per_round: int = option_of(RunConfig, "episodes_per_round")
@@ -92,6 +102,10 @@ class DaggerOptions(common.EnvOptions):
         """Refuse what paths and values show to be wrong."""
         common.require_workers(self.workers)
         require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
+        if self.dataset.root:
+            check_weights(self.dataset.root, ())
+        for root in self.dataset.root:
+            require_dataset(root)
         self._config()
 
     def run(self) -> None:
@@ -107,7 +121,8 @@ class DaggerOptions(common.EnvOptions):
             _report(self, config, results).write(folder / REPORT_FILE)
         best = folder / "best" / "pretrained_model"
         say(f"best policy: {best}")
-        say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
+        if (folder / "dataset").is_dir():
+            say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
         say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
 
@@ -115,17 +130,22 @@ class DaggerOptions(common.EnvOptions):
         """Return what `run_algorithm` takes; `UsageError` for what does not go together."""
         config = self._config()
         check_labels(config)
+        check_given(config)
         return config
 
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
         from manip_il.engine.drivers import QueryRule  # which imports numpy
 
-        same = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        policy, start = round_policy(self.policy)
+        observation, cameras = self._pictures(start)
+        same = ("steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         made = {
             "env": self.env_config(),
-            "fit": FitConfig(policy=start_policy(self.policy), **{name: getattr(self, name) for name in same}),
-            "cameras": self.image.config(self.cameras),
+            "fit": FitConfig(policy=policy, observation=observation, **{name: getattr(self, name) for name in same}),
+            "cameras": cameras,
+            "datasets": tuple(self.dataset.root),
+            "start": start,
             "beta": BetaSchedule.parse(self.beta),
             "query_rule": None if self.query is None else QueryRule.parse(self.query),
         }
@@ -134,6 +154,17 @@ class DaggerOptions(common.EnvOptions):
         check_cameras(config)
         check_method(config)
         return config
+
+    def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
+        """Return observation and cameras: those given, else those of the policy to begin with."""
+        cameras = self.image.config(self.cameras)
+        if start is None:
+            return self.observation, cameras
+        from manip_il.engine.environments import policy_cameras
+        from manip_il.learn.pretrained import observation_of, read_interface
+
+        observation = self.observation or observation_of(read_interface(start).columns)
+        return observation, cameras or policy_cameras(start)
 
     @classmethod
     def more_help(cls, words: Sequence[str]) -> str:
@@ -168,7 +199,8 @@ def _report(options: DaggerOptions, config: RunConfig, results: list[RoundResult
 
     best = best_round(results)
     kind = ALGORITHMS[config.method].title
-    names = ["cloning (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
+    first = "cloning" if config.start is None else "the policy given"
+    names = [f"{first} (round 0)", *(f"{kind}, round {result.round}" for result in results[1:])]
     rows = [
         PolicyRow.of(name, result.validation, result.labels, kind="dagger" if result.round else "cloning")
         for name, result in zip(names, results, strict=True)

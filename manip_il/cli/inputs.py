@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.options import Open
 from manip_il.cli.progress import warn
-from manip_il.errors import UsageError
+from manip_il.errors import MismatchError, UsageError
 
 if TYPE_CHECKING:  # the environment and the learner take a second to import
+    from manip_il.algorithms.config import RunConfig
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.checkpoint import CheckpointMeta
     from manip_il.mdp import Observation
@@ -79,6 +80,49 @@ def start_policy(settings: Open) -> Open:
     if not isinstance(path, str) or not path:
         raise UsageError(f"--policy.path is {path!r}; expected a checkpoint or a run")
     return {**settings, "path": str(find_policy(Path(path).expanduser()))}
+
+
+def round_policy(settings: Open) -> tuple[Open, Path | None]:
+    """Return `--policy.*` of a run's later rounds, and the `pretrained_model` folder that it begins with, if any.
+
+    Of an mlp to begin with, the options are spelled out: it has a loop of its own.
+    """
+    if "path" not in settings:
+        return settings, None
+    from manip_il.learn.pretrained import mlp_options
+
+    settings = start_policy(settings)
+    start = Path(settings["path"])
+    if (options := mlp_options(start)) is None:
+        return settings, start
+    if "type" in settings:
+        raise UsageError("give one of --policy.path=DIR and --policy.type=...: the type is in the checkpoint")
+    return options | {name: value for name, value in settings.items() if name != "path"}, start
+
+
+def check_given(config: RunConfig) -> None:
+    """Raise `MismatchError` unless what a run begins with, datasets or a policy, fits its environment; warn as others.
+
+    Raises what `check_policy` raises.
+    """
+    from manip_il.data.lerobot_read import read_fingerprint, read_spec
+    from manip_il.engine.environments import env_spec
+    from manip_il.learn.checkpoint import read_meta
+    from manip_il.learn.sources import check_same_sources
+
+    here, run = env_spec(config.env, config.cameras), f"{config.env.robot} {config.env.task} of this run"
+    specs = [read_spec(root) for root in config.datasets]
+    for root, spec in zip(config.datasets, specs, strict=True):
+        check_same_sources((root, Path(run)), (spec, here), pictures=config.cameras is not None, language=False)
+        check_dataset(root, spec, read_fingerprint(root))
+    if config.start is None:
+        return
+    meta = read_meta(config.start)
+    cameras = check_policy(config.start, meta, config.env, draw=False, trust=config.fit.trust)
+    for what in ("names", "height", "width"):
+        theirs, ours = (getattr(one, what, None) for one in (cameras, config.cameras))
+        if theirs != ours:
+            raise MismatchError(f"cameras' {what}", str(config.start), theirs, "this run", ours)
 
 
 def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:

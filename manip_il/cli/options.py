@@ -150,9 +150,11 @@ def decode(option_type: Any, value: Any, *, is_word: bool = False) -> Any:
             value = [item.strip().strip("'\"") for item in inner.split(",")] if inner.strip() else []
             if "" in value:
                 raise ValueError
+        item_type = typing.get_args(option_type)[0]
+        if item_type is Path and isinstance(value, str):
+            value = [value]  # in YAML one path stands for a list of one
         if not isinstance(value, list):
             raise ValueError
-        item_type = typing.get_args(option_type)[0]
         return [decode(item_type, item) for item in value]
     if named := choices(option_type):
         if value not in named:

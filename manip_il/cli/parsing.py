@@ -25,6 +25,7 @@ CONFIG_HEADER = "# manip-il"  # how every file from `dump_yaml` begins
 _FEW = 3
 _NEAR = 0.65  # ratio of difflib from which on a name is offered
 _AS_NEAR = 0.1  # of the best one: others that are offered beside it
+_PATHS = (Path, list[Path])
 _LONGEST = 100  # [characters] of a name that is compared
 
 
@@ -224,7 +225,7 @@ def unexpected_word(word: str, known: Mapping[str, Option], command: str) -> Usa
         return unknown_option("option", name, known, "--", command)
     if word.endswith((".yaml", ".yml")):
         return UsageError(f"{text}; a file of options is given as --config_path={word}")
-    paths = [one.name for one in known.values() if without_none(one.type) is Path and one.name != "output_dir"]
+    paths = [one.name for one in known.values() if without_none(one.type) in _PATHS and one.name != "output_dir"]
     opens = [f"{one.name}.path" for one in known.values() if one.is_open and one.name == "policy"]
     if paths or opens:
         return UsageError(f"{text}; options are written --name=value (did you mean --{(paths or opens)[0]}={word}?)")

@@ -1,4 +1,4 @@
-"""`manip-il train`: behaviour cloning on one dataset, with any policy that LeRobot knows."""
+"""`manip-il train`: behaviour cloning on datasets, with any policy that LeRobot knows."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
 from manip_il.cli.options import Open
 from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
-from manip_il.cli.progress import Stages, progress, say, set_quiet
+from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
 from manip_il.data.atomic import exclusive
-from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option, option_of
+
+if TYPE_CHECKING:  # the learner takes a second to import
+    from manip_il.data.schema import RobotTaskSpec
+    from manip_il.learn.lerobot_config import LeRobotFit
+    from manip_il.learn.sources import Sources
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
@@ -29,13 +34,14 @@ _FREE = (
 class SourceGroup:
     """`--dataset.*` of what is learnt from."""
 
-    root: Path = option(MISSING, "folder of a LeRobot v3.0 dataset")
+    root: list[Path] = option(MISSING, "folder of a LeRobot v3.0 dataset; several to learn from all")
+    weights: list[float] = option(list, "share of the samples drawn from each of several; by default by its frames")
     eval_split: float = option_of(FitConfig, "eval_split")
 
 
 @dataclass
 class TrainOptions:
-    """Fit a policy to the labels of a dataset (behaviour cloning).
+    """Fit a policy to the labels of a dataset, or of several of one robot (behaviour cloning).
 
     --policy.type is mlp, cnn or any policy of LeRobot's (act, diffusion, vqbet, ...); its options have LeRobot's names:
     manip-il train --policy.type=act --help lists them. The checkpoint is LeRobot's:
@@ -70,21 +76,21 @@ class TrainOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         self._fit_config()
-        require_dataset(self.dataset.root)
+        check_weights(self.dataset.root, self.dataset.weights)
+        for root in self.dataset.root:
+            require_dataset(root)
         if _is_first_process():
             require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
-        """Read the dataset, fit, and say where the checkpoint is."""
-        from manip_il.data.lerobot_read import read_fingerprint, read_spec
+        """Read the datasets, fit, and say where the checkpoint is."""
         from manip_il.learn.lerobot_config import LeRobotFit
 
         if not _is_first_process():
             set_quiet(True)
         config = self._fit_config()
-        LeRobotFit(config)  # refuses what LeRobot would, before anything is written
-        spec, fingerprint = read_spec(self.dataset.root), read_fingerprint(self.dataset.root)
-        check_dataset(self.dataset.root, spec, fingerprint)
+        lerobot = LeRobotFit(config)  # refuses what LeRobot would, before anything is written
+        spec, fingerprint, sources = self._read_sources(lerobot)
         with contextlib.ExitStack() as held:
             if _is_first_process():
                 held.enter_context(exclusive(self.output_dir))
@@ -92,7 +98,7 @@ class TrainOptions:
                 if self.resume:
                     check_same_options(self.output_dir, self, _FREE)
             fit = self._fit_mlp if config.is_mlp else self._fit_policy
-            path = fit(config, spec, fingerprint)
+            path = fit(config, spec, fingerprint, sources)
         if _is_first_process():
             say(f"checkpoint: {path}")
             say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
@@ -105,6 +111,21 @@ class TrainOptions:
         policy, seed = start_policy(self.policy), stream_base("training", self.seed)
         return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
 
+    def _read_sources(self, lerobot: LeRobotFit) -> tuple[RobotTaskSpec, Mapping[str, Any], Sources]:
+        """Return spec and fingerprint of the first dataset, and all of them, which must agree with it."""
+        from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_spec
+        from manip_il.learn.pretrained import PLAIN
+        from manip_il.learn.sources import Sources, check_same_sources
+
+        roots = tuple(self.dataset.root)
+        specs, fingerprints = [read_spec(root) for root in roots], [read_fingerprint(root) for root in roots]
+        pictures, language = lerobot.observation != "state", lerobot.policy.type not in PLAIN
+        check_same_sources(roots, specs, pictures=pictures, language=language)
+        for root, spec, fingerprint in zip(roots, specs, fingerprints, strict=True):
+            check_dataset(root, spec, fingerprint)
+        frames = tuple(dataset_info(root).frames for root in roots)
+        return specs[0], fingerprints[0], Sources(roots, frames, tuple(self.dataset.weights))
+
     def _begin(self, config: FitConfig) -> Stages:
         """Write the options, now that what can be wrong has been found, and return the display."""
         if _is_first_process():
@@ -112,13 +133,13 @@ class TrainOptions:
         steps = config.steps_per_checkpoint
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
-    def _fit_mlp(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.data.lerobot_read import read_table
+    def _fit_mlp(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any], sources: Sources) -> Path:
+        from manip_il.data.lerobot_read import read_tables
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
         with self._begin(config) as stages:
-            table = read_table(self.dataset.root, (*LEARNING_COLUMNS, "frame_index"))
+            table = read_tables(sources.roots, (*LEARNING_COLUMNS, "frame_index"))
             stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
             return fit(
                 table,
@@ -128,24 +149,23 @@ class TrainOptions:
                 fingerprint=fingerprint,
                 on_log=stages.log,
                 resume=self.resume,
-                repo_id=f"local/{self.dataset.root.name}",
+                sources=sources,
+                repo_id=f"local/{'_'.join(root.name for root in sources.roots)}",
             )
 
-    def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any]) -> Path:
-        from manip_il.data.lerobot_read import read_provenance
-        from manip_il.learn.checkpoint import recorded_look
+    def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any], sources: Sources) -> Path:
         from manip_il.learn.fit_policy import PolicyTrainer
 
-        root = self.dataset.root
         with self._decoding() as on_frames:
             trainer = PolicyTrainer(
-                root,
+                sources.roots,
                 config,
                 self.output_dir,
                 spec=spec,
                 fingerprint=fingerprint,
-                look=recorded_look(read_provenance(root), fingerprint),
+                look=_look(sources.roots),
                 resume=self.resume,
+                sources=sources,
                 on_frames=on_frames,
             )
         with self._begin(config) as stages:
@@ -164,7 +184,8 @@ class TrainOptions:
             def decoded(frames: int) -> None:
                 nonlocal bar
                 if bar is None:
-                    total = dataset_info(self.dataset.root).frames * len(camera_keys(self.dataset.root))
+                    roots = self.dataset.root
+                    total = sum(dataset_info(root).frames * len(camera_keys(root)) for root in roots)
                     bar = stack.enter_context(progress(total, "decode pictures, once"))
                 bar.advance(frames)
 
@@ -174,6 +195,18 @@ class TrainOptions:
     def more_help(cls, words: Sequence[str]) -> str:
         """Return the options of the policy that `--policy.type` names."""
         return common.policy_help(words)
+
+
+def _look(roots: Sequence[Path]) -> dict[str, Any] | None:
+    """The light of the first dataset's pictures, in which the policy is evaluated; warn where others have another."""
+    from manip_il.data.lerobot_read import read_fingerprint, read_provenance
+    from manip_il.learn.checkpoint import recorded_look
+
+    first, *others = [recorded_look(read_provenance(root), read_fingerprint(root)) for root in roots]
+    for root, look in zip(roots[1:], others, strict=True):
+        if look != first:
+            warn([f"light of the pictures differs: {roots[0]} has {first}, {root} has {look}; evaluated in the first"])
+    return first
 
 
 def _is_first_process() -> bool:

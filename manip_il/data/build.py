@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import itertools
 import json
 import logging
@@ -180,6 +181,15 @@ def merge_datasets(
         return _join_by_lerobot(roots, root, repo_id, own_file(repo_id, spec, fingerprint, origin))
     episodes = itertools.chain.from_iterable(read_episodes(source) for source in roots)
     return write_dataset(episodes, root, spec, repo_id=repo_id, fingerprint=fingerprint, provenance=origin)
+
+
+def dataset_sha256(root: Path) -> str:
+    """Return the hash of what a dataset says in numbers: its description, statistics and columns, not its videos."""
+    digest = hashlib.sha256()
+    for path in (root / layout.INFO, root / layout.STATS, *sorted(root.glob(layout.DATA_FILES))):
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Mapping[str, Any]) -> DatasetInfo:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import shutil
 from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, override
 
@@ -16,11 +17,15 @@ from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
+from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
 from manip_il.data.lerobot_read import check_dataset
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError
 
+I64 = NDArray[np.int64]
+LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that datasets taken as one must share
 Frame = dict[str, Any]  # column -> array of the feature's dtype and shape, or text; and `task`
 
 
@@ -80,36 +85,107 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
 
 
 class Metadata(LeRobotDatasetMetadata):
-    """LeRobot's metadata of one dataset, or of several as one; `roots` are their folders."""
+    """LeRobot's metadata of one dataset, or of several as one.
+
+    roots, frames, episodes: folder and counts of each. task_numbers: of each, the joint number of its every task.
+    """
 
     roots: tuple[Path, ...] = ()
+    frames: tuple[int, ...] = ()
+    episodes_of: tuple[int, ...] = ()
+    task_numbers: tuple[I64, ...] = ()
+
+    def joint_tasks(self, own: I64) -> I64:
+        """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""
+        if len(self.roots) == 1:
+            return own
+        pieces = np.split(own, np.cumsum(self.frames)[:-1])
+        return np.concatenate([numbers[piece] for numbers, piece in zip(self.task_numbers, pieces, strict=True)])
+
+    def numbered(self, datasets: Sequence[LeRobotDataset]) -> Sequence[Any]:
+        """Return the datasets, one for each root, with frames, episodes and tasks numbered as in `read_tables`."""
+        if len(datasets) == 1:
+            return datasets
+        starts = np.cumsum([(0, 0), *zip(self.frames, self.episodes_of, strict=True)], axis=0).tolist()
+        parts = zip(datasets, starts, self.task_numbers, strict=False)
+        return [_Numbered(one, frames, episodes, tasks) for one, (frames, episodes), tasks in parts]
+
+
+@dataclass(frozen=True)
+class _Numbered:
+    """A dataset in a row of several. frames, episodes: of those before it. tasks: joint number of its every task."""
+
+    dataset: Any  # LeRobot's
+    frames: int
+    episodes: int
+    tasks: I64
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, row: int) -> Frame:
+        frame: Frame = self.dataset[row]
+        task = int(frame["task_index"])
+        more = {"index": self.frames, "episode_index": self.episodes, "task_index": int(self.tasks[task]) - task}
+        return frame | {key: frame[key] + number for key, number in more.items()}
 
 
 def read_metadata(*roots: Path) -> Metadata:
     """Return LeRobot's own description of a dataset, or of several as one, from which its factories build policies.
 
     The cameras' statistics are ImageNet's, as `lerobot-train` takes them by default. Raises `ManipError` for a folder
-    that is no dataset, `MismatchError` for several of different features or tasks.
+    that is no dataset, `MismatchError` for several of different rates or columns to learn from. Columns that not all
+    have in one shape, cameras too, are left out; statistics are those of all frames, each counted once.
     """
     metas = [_metadata(root) for root in roots]
     first = metas[0]
+    for meta in metas[1:]:
+        _check_same_nature(first, meta)
     first.roots = roots
-    for root, meta in zip(roots[1:], metas[1:], strict=True):
-        for what, ours, theirs in zip(("features", "rate", "tasks"), _nature(first), _nature(meta), strict=True):
-            if ours != theirs:
-                raise MismatchError(what, str(roots[0]), ours, str(root), theirs)
-    stats = [meta.stats for meta in metas if meta.stats is not None]
-    joined = stats[0] if len(metas) == 1 else aggregate_stats(stats)
+    first.frames = tuple(meta.total_frames for meta in metas)
+    first.episodes_of = tuple(meta.total_episodes for meta in metas)
+    if len(metas) > 1:
+        _join_tasks(first, metas)
+        alike = {key for key in first.features if all(_shape(meta, key) == _shape(first, key) for meta in metas)}
+        first.info.features = {key: value for key, value in first.features.items() if key in alike}
+    stats = [meta.stats or {} for meta in metas]
+    shared = [{key: one for key, one in own.items() if key in first.features} for own in stats]
+    joined = stats[0] if len(metas) == 1 else aggregate_stats(shared)
     for key in first.camera_keys:
         joined[key] |= {name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()}
     first.stats = joined
-    first.info.total_episodes = sum(meta.total_episodes for meta in metas)
-    first.info.total_frames = sum(meta.total_frames for meta in metas)
+    first.info.total_episodes = sum(first.episodes_of)
+    first.info.total_frames = sum(first.frames)
     return first
 
 
-def _nature(meta: LeRobotDatasetMetadata) -> tuple[list[str], int, list[str]]:
-    return list(meta.features), meta.fps, [] if meta.tasks is None else list(map(str, meta.tasks.index))
+def _check_same_nature(left: Metadata, right: Metadata) -> None:
+    """Raise `MismatchError` unless rate and the columns that are learnt from agree."""
+    sides = str(left.root), str(right.root)
+    if left.fps != right.fps:
+        raise MismatchError("rate", sides[0], left.fps, sides[1], right.fps)
+    for key in LEARNT:
+        ours, theirs = _shape(left, key), _shape(right, key)
+        if ours != theirs:
+            raise MismatchError(f"column {key}", sides[0], ours or "none", sides[1], theirs or "none")
+
+
+def _shape(meta: Metadata, key: str) -> tuple[int, ...]:
+    """A column's shape; () where there is none."""
+    return tuple(meta.features.get(key, {}).get("shape", ()))
+
+
+def _join_tasks(first: Metadata, metas: Sequence[Metadata]) -> None:
+    """Give `first` the instructions of all, each once, and the numbers that each dataset's have there."""
+    own = [_instructions(meta) for meta in metas]
+    joint = {text: number for number, text in enumerate(dict.fromkeys(text for texts in own for text in texts))}
+    first.task_numbers = tuple(np.array([joint[text] for text in texts], np.int64) for texts in own)
+    if first.tasks is not None:
+        first.tasks = first.tasks.reindex(list(joint)).assign(task_index=list(joint.values()))
+
+
+def _instructions(meta: Metadata) -> list[str]:
+    return [] if meta.tasks is None else list(map(str, meta.tasks.sort_values("task_index").index))
 
 
 def _metadata(root: Path) -> Metadata:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -56,6 +56,7 @@ class CheckpointMeta:
 
     observation: one of `learn.pretrained.OBSERVATIONS`. cameras, image_size: of the pictures that it was
     trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
+    datasets: folder, frames and weight of each, as `Sources.to_json` has them.
     """
 
     robot: str
@@ -70,6 +71,7 @@ class CheckpointMeta:
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels]
     look: dict[str, Any] | None = None
+    datasets: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for name in ("robot", "task"):
@@ -84,6 +86,8 @@ class CheckpointMeta:
             raise ManipError(f"image_size is {size}; expected height and width")
         for side in size:
             checks.whole("a side of image_size", side, 0, _LONGEST_SIDE)
+        for one in checks.array("datasets", self.datasets, _MOST_NAMES):
+            checks.mapping("one of datasets", one)
         for name in ("fingerprint", "options") if self.look is None else ("fingerprint", "options", "look"):
             if len(checks.mapping(name, getattr(self, name))) > _MOST_NAMES:
                 raise ManipError(f"{name} has {len(getattr(self, name))} entries; expected at most {_MOST_NAMES}")
@@ -96,16 +100,18 @@ class CheckpointMeta:
         options: Mapping[str, Any] | None = None,
         observation: str = "state",
         look: Mapping[str, Any] | None = None,
+        datasets: Sequence[Mapping[str, Any]] = (),
     ) -> CheckpointMeta:
         """Return the meta of a policy trained on data of `spec`.
 
-        look: `recorded_look` of the dataset.
+        look: `recorded_look` of the dataset. datasets: `Sources.to_json`.
         """
         meta = cls(
             **{name: getattr(spec, name) for name in ("task", *_MUST_AGREE)},
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
+            datasets=[dict(one) for one in datasets],
         )
         if observation == "state":
             return meta

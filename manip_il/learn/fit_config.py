@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -131,6 +131,22 @@ class FitConfig:
     def peak_lr(self) -> float | None:
         """Peak learning rate; None for that of the optimiser's preset."""
         return MLP_LR if self.lr is None and self.is_mlp else self.lr
+
+
+def check_weights(roots: Sequence[Path], weights: Sequence[float]) -> None:
+    """Raise `UsageError` for no dataset, for one that is given twice, and for weights that do not fit them."""
+    if not roots:
+        raise UsageError("--dataset.root names no dataset; expected at least one folder")
+    seen: dict[Path, Path] = {}
+    for root in roots:
+        if (real := root.resolve()) in seen:
+            raise UsageError(f"--dataset.root names {seen[real]} and {root}, one dataset; use --dataset.weights")
+        seen[real] = root
+    if weights and len(weights) != len(roots):
+        raise UsageError(f"--dataset.weights has {len(weights)} numbers, --dataset.root {len(roots)} datasets")
+    for root, weight in zip(roots, weights, strict=False):
+        if not 0 < weight < math.inf:
+            raise UsageError(f"--dataset.weights is {weight:g} for {root}; expected more than 0")
 
 
 @cache

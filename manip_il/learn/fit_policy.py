@@ -45,6 +45,7 @@ from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.limits import threads
 from manip_il.learn.metrics import Writer, metric_writers
 from manip_il.learn.samples import Batch, load_samples
+from manip_il.learn.sources import Sources
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 _HALF_PRECISION = {"bfloat16": "bf16", "float16": "fp16"}
@@ -54,9 +55,9 @@ class PolicyTrainer:
     """Policy, processors, optimiser and data of one run that clones the labels of the dataset in `root`, or of several.
 
     spec, fingerprint, look: see `CheckpointMeta.of`. weights: how often each frame is drawn, relative to the others,
-    (N,); by default each once an epoch. on_frames: sees how many frames more have been decoded into the cache. On one
-    CPU the same data, config and threads give the same bits, resumed or not. Started by `accelerate launch` or
-    `torchrun`, every process takes `batch_size` samples a step.
+    (N,); by default each once an epoch, or as `sources`, the datasets of `root`, have it. on_frames: sees how many
+    frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
+    resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
     on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
@@ -74,10 +75,12 @@ class PolicyTrainer:
         resume: bool = False,
         on_frames: Callable[[int], None] | None = None,
         weights: F64 | None = None,
+        sources: Sources | None = None,
     ):
         self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config)
         options, observation = self.lerobot.resume_options(), self.lerobot.observation
-        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look)
+        datasets = sources.to_json() if sources is not None else ()
+        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look, datasets)
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir, resume=resume)
@@ -87,6 +90,9 @@ class PolicyTrainer:
         self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
             self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
+        drawn = weights[self.samples.train] if weights is not None else None
+        if sources is not None and weights is None:
+            drawn = weights = sources.row_weights(self.samples.train)
         self.digest = self.samples.digest
         if weights is not None:
             self.digest = hashlib.sha256(self.digest.encode() + weights.tobytes()).hexdigest()
@@ -98,7 +104,6 @@ class PolicyTrainer:
         with threads(config.threads):
             self._build(checkpoint)
         world = self.accelerator.num_processes
-        drawn = weights[self.samples.train] if weights is not None else None
         self._order = order_of(len(self.samples.train), drawn, self.batch_size * world, config.seed)
 
     def _build(self, checkpoint: Path | None) -> None:

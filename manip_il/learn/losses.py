@@ -29,6 +29,7 @@ DISTRIBUTIONS = ("gaussian", "mixture", "categorical")  # whose spread is learnt
 # A deterministic expert lets the likelihood grow without bound as the deviation goes to zero. The
 # floor, 2 % of a target's own standard deviation, keeps the gradients finite.
 MIN_LOG_STD = -4.0
+_REACH = 3.0  # deviations that a smeared target reaches
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
@@ -163,33 +164,53 @@ class MixtureHead(Distribution):
 class CategoricalHead(Distribution):
     """Each dimension in `bins` equal bins over [-1, 1], the range of the data; cross-entropy.
 
-    A target between two bin centres is shared out between them in proportion (two-hot, as in
-    Schrittwieser et al., MuZero, 2020, appendix F), so that the centres' expectation is the target
-    itself and not its bin's centre. Acts with the expectation over the likeliest bin and its two
-    neighbours: exact within a bin, unlike the argmax, and never between two modes, unlike the
+    A target is smeared over the bins by a Gaussian of `sigma` bins around it (HL-Gauss: Farebrother et al., Stop
+    regressing, ICML 2024, section 3.1), which says that neighbouring bins are near. `pad` bins of the same width beside
+    either end hold what is smeared over the edge: else a target there, as a capped joint step is, would be pulled
+    inwards. With `sigma` 0 there are none, and a target is shared out between the two nearest bin centres (two-hot, as
+    in Schrittwieser et al., MuZero, 2020, appendix F). Either way the centres' expectation is the target itself.
+
+    Acts with the expectation over the likeliest bin and those that its target was smeared over (at least its two
+    neighbours): exact within a bin, unlike the argmax, and never between two modes that are apart, unlike the
     expectation over all bins. A sample is a bin's centre.
     """
 
-    def __init__(self, n: int, bins: int) -> None:
-        self.n, self.bins, self.size = n, bins, n * bins
+    def __init__(self, n: int, bins: int, sigma: float = 0.0) -> None:
+        self.n, self.bins, self.sigma = n, bins, sigma
+        self.pad = math.ceil(_REACH * sigma)
+        self.total = bins + 2 * self.pad
+        self.size = n * self.total
 
     @override
     def nll(self, params: Tensor, target: Tensor) -> Tensor:
-        log_prob = self._logits(params).log_softmax(-1)
-        place = (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1))
-        lower = place.floor().clamp(max=self.bins - 2)
+        if not self.sigma:
+            return -self.log_prob(params, target)
+        return -(self.smeared(target) * self._logits(params).log_softmax(-1)).sum((-2, -1))
+
+    @override
+    def log_prob(self, params: Tensor, target: Tensor) -> Tensor:
+        """Return log-probability of each row's target (B, n), between two bins' centres in proportion, (B,) [nats]."""
+        log_prob, place = self._logits(params).log_softmax(-1), self._place(target)
+        lower = place.floor().clamp(max=self.total - 2)
         upper_share = place - lower
         index = lower.long().unsqueeze(-1)
         at_lower = log_prob.gather(-1, index).squeeze(-1)
         at_upper = log_prob.gather(-1, index + 1).squeeze(-1)
-        return -((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
+        return ((1.0 - upper_share) * at_lower + upper_share * at_upper).sum(-1)
+
+    def smeared(self, target: Tensor) -> Tensor:
+        """Return the share of each bin in targets (B, n), (B, n, bins and padding): `sigma`'s Gaussian over the bin."""
+        edges = torch.arange(self.total + 1, dtype=target.dtype, device=target.device) - 0.5
+        below = torch.special.ndtr((edges - self._place(target).unsqueeze(-1)) / self.sigma)
+        # The ends are 3 sigma or more away from any target, so the whole is never 0.
+        return below.diff(dim=-1) / (below[..., -1:] - below[..., :1])
 
     @override
     def action(self, params: Tensor) -> Tensor:
-        logits = self._logits(params)
-        near = logits.argmax(-1, keepdim=True) + torch.arange(-1, 2, device=params.device)
-        inside = (near >= 0) & (near < self.bins)
-        near = near.clamp(0, self.bins - 1)
+        logits, reach = self._logits(params), max(1, self.pad)
+        near = logits.argmax(-1, keepdim=True) + torch.arange(-reach, reach + 1, device=params.device)
+        inside = (near >= 0) & (near < self.total)
+        near = near.clamp(0, self.total - 1)
         weights = logits.gather(-1, near).masked_fill(~inside, -torch.inf).softmax(-1)
         return (weights * self._centres(near, params)).sum(-1)
 
@@ -202,21 +223,25 @@ class CategoricalHead(Distribution):
         drawn = _inverse_cdf(self._logits(params).log_softmax(-1), draws.unsqueeze(-1))
         return self._centres(drawn, params).squeeze(-1)
 
+    def _place(self, target: Tensor) -> Tensor:
+        """Targets, taken as the edge where they lie outside, in bins from the first centre."""
+        return (target.clamp(-1.0, 1.0) + 1.0) * (0.5 * (self.bins - 1)) + self.pad
+
     def _centres(self, bins: Tensor, params: Tensor) -> Tensor:
-        return bins.to(params.dtype) * (2.0 / (self.bins - 1)) - 1.0
+        return (bins.to(params.dtype) - self.pad) * (2.0 / (self.bins - 1)) - 1.0
 
     def _logits(self, params: Tensor) -> Tensor:
-        return params.reshape(*params.shape[:-1], self.n, self.bins)
+        return params.reshape(*params.shape[:-1], self.n, self.total)
 
 
-def make_head(loss: str, n: int, *, components: int, bins: int) -> Head:
-    """Return the head for a name in `LOSSES`; raises `UnknownName` for another."""
+def make_head(loss: str, n: int, *, components: int, bins: int, sigma: float = 0.0) -> Head:
+    """Return the head for a name in `LOSSES`; raises `UnknownName` for another. sigma: of `categorical` [bins]."""
     heads: dict[str, Head] = {
         "mse": MSEHead(n),
         "l1": L1Head(n),
         "gaussian": GaussianHead(n),
         "mixture": MixtureHead(n, components),
-        "categorical": CategoricalHead(n, bins),
+        "categorical": CategoricalHead(n, bins, sigma),
     }
     if loss not in heads:
         raise UnknownName("loss", loss, heads)

@@ -29,6 +29,7 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "gelu": nn.GELU, "s
 ACTIVATIONS = tuple(_ACTIVATIONS)
 BOUNDS = {"width": (1, 16_384), "depth": (1, 100), "components": (1, 1_000), "bins": (2, 10_000)}
 LARGEST_CLAMP = 1e6  # [standard deviations]
+LARGEST_SIGMA = 100.0  # [bins]
 # [rad] or [m]. An input that moves less than this in all of the data is noise that division by its
 # deviation would blow up: it is multiplied by zero instead, so the network never sees it.
 CONSTANT_INPUT = 1e-4
@@ -49,6 +50,7 @@ class Shape:
     components: int
     bins: int
     clamp: float
+    sigma: float = 0.0  # checkpoints from before there was one have none
 
     def __post_init__(self) -> None:
         for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS)):
@@ -59,6 +61,7 @@ class Shape:
             checks.whole(name, getattr(self, name), least, most)
         if not checks.number("clamp", self.clamp, 0.0, LARGEST_CLAMP) > 0:
             raise ManipError(f"clamp is {self.clamp}; expected more than 0")
+        checks.number("sigma", self.sigma, 0.0, LARGEST_SIGMA)
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ class MLPNetwork(nn.Module):
     def __init__(self, inputs: int, n: int, shape: Shape) -> None:
         super().__init__()
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
-        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins)
+        self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma)
         layers: list[nn.Module] = []
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
             layers += [nn.Linear(width, shape.width), _ACTIVATIONS[shape.activation]()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -220,7 +220,8 @@ class _Perceptron:
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:
     """The network's shape in an mlp's `config.json`."""
     try:
-        return Shape(**{field.name: config[field.name] for field in fields(Shape)})
+        known = [field for field in fields(Shape) if field.name in config or field.default is MISSING]
+        return Shape(**{field.name: config[field.name] for field in known})
     except KeyError as error:
         raise ManipError(f"{path} has no {error.args[0]}; it is not an mlp's") from error
     except ManipError as error:

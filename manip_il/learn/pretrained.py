@@ -51,6 +51,9 @@ _NAMES: dict[str, tuple[str, ...]] = {  # other policies of LeRobot 0.6.1 -> the
 }
 
 
+_MLP_SHAPE = ("width", "depth", "activation", "loss", "components", "bins", "clamp")
+
+
 @dataclass(frozen=True)
 class Interface:
     """Inputs and outputs of a policy.
@@ -107,6 +110,18 @@ def read_config(path: Path) -> dict[str, Any]:
 def read_interface(path: Path) -> Interface:
     """Return inputs and outputs of the policy in a folder. Raises what `read_config` raises."""
     return interface_of(read_config(path), path)
+
+
+def mlp_options(path: Path) -> dict[str, Any] | None:
+    """Return the options of another mlp of the architecture in a folder; None where it holds another kind of policy.
+
+    Raises what `read_config` raises.
+    """
+    config = read_config(path)
+    if config["type"] != "mlp":
+        return None
+    kept = {name: config[name] for name in _MLP_SHAPE if name in config}
+    return {"type": "mlp", **kept, "sigma": config.get("sigma", 0.0)}
 
 
 def interface_of(config: dict[str, Any], path: Path) -> Interface:

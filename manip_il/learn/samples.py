@@ -191,6 +191,7 @@ def load_samples(
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
     table = read_tables(roots, [*numbers, *_ALWAYS, *label])
+    table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     require_finite(table, numbers)
     episodes = table[EPISODE_INDEX].astype(np.int64).reshape(-1)
     windows = windows_of(policy, features, episodes)
@@ -205,7 +206,7 @@ def load_samples(
         )
         ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
         read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
-        source = LibrarySource(torch.utils.data.ConcatDataset(read), config.num_workers)
+        source = LibrarySource(torch.utils.data.ConcatDataset(meta.numbered(read)), config.num_workers)
     else:
         columns = {key: torch.from_numpy(np.array(table[key])) for key in (*numbers, *_ALWAYS)}
         source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
@@ -219,11 +220,12 @@ def _frames(
 ) -> dict[str, JoinedFrames] | None:
     """The pictures of every camera in all datasets; None where they would take more than `limit` bytes."""
     found: list[Mapping[str, Any]] = []
+    total = 0
     for root in roots if cameras else []:
         frames = open_frame_cache(root, list(cameras), max_bytes=limit, on_frames=on_frames)
-        if frames is None:
+        total += sum(one.nbytes for one in frames.values()) if frames is not None else 0
+        if frames is None or total > limit:
             return None
-        limit -= sum(one.nbytes for one in frames.values())
         found.append(frames)
     return {camera: JoinedFrames([frames[camera] for frames in found]) for camera in cameras}
 

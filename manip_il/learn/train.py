@@ -48,6 +48,7 @@ from manip_il.learn.metrics import metric_writers
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.network import fit_statistics, warm_start
+from manip_il.learn.sources import Sources
 
 WARMUP_STEPS, WEIGHT_DECAY, GRAD_CLIP_NORM = 100, 1e-4, 10.0
 # Do not change the weights that come out at the end (threads: only in the last bits).
@@ -64,14 +65,16 @@ def fit(
     on_log: Callable[[dict[str, Any]], None] | None = None,
     resume: bool = False,
     weights: NDArray[np.float64] | None = None,
+    sources: Sources | None = None,
     repo_id: str = "local/table",
 ) -> Path:
     """Clone the labels of `table` and return `output_dir/checkpoints/last/pretrained_model`.
 
     table: the schema's `observation.state`, `observation.environment_state`, `action` and, where
     there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
-    to the others, (N,); by default each once an epoch. repo_id: what Weights & Biases calls the data. The
-    same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
+    to the others, (N,); by default each once an epoch, or as `sources`, the datasets of the table, have it.
+    Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the
+    data. The same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
     `metrics.jsonl`, and where the config says.
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for
@@ -82,10 +85,10 @@ def fit(
     checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
     rows = learning_rows(table)
-    drawn = weights[valid_frames(table)] if weights is not None else None
+    drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
     lerobot = LeRobotFit(config)
     options = _options(lerobot)
-    meta = CheckpointMeta.of(spec, fingerprint, options)
+    meta = CheckpointMeta.of(spec, fingerprint, options, datasets=sources.to_json() if sources else ())
     digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):
@@ -219,6 +222,16 @@ def lr_at(step: int, steps: int, peak: float) -> float:
     if step < warmup:
         return peak * (step + 1) / (warmup + 1)
     return peak * 0.5 * (1.0 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
+
+
+def _drawn(table: Table, rows: Rows, config: FitConfig, sources: Sources | None) -> NDArray[np.float64] | None:
+    """How often each row of R is drawn, (R,), where the datasets have weights; 0 for those that are held out."""
+    if sources is None or not sources.weights:
+        return None
+    train, _ = split_by_episode(rows.episodes, config.eval_split, config.seed)
+    drawn = np.zeros(len(rows.episodes))
+    drawn[train] = sources.row_weights(np.flatnonzero(valid_frames(table))[train])
+    return drawn
 
 
 def _new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:

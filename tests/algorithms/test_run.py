@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from manip_il.algorithms import fitting
 from manip_il.algorithms import run as run_module
 from manip_il.algorithms.config import BetaSchedule, RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
@@ -17,6 +19,7 @@ from manip_il.algorithms.table import run_algorithm
 from manip_il.data.lerobot_read import dataset_info, read_table, read_tables
 from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
+from manip_il.errors import MismatchError
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
@@ -165,6 +168,52 @@ def test_a_warm_refit_begins_where_the_last_round_ended(run, tmp_path, monkeypat
     results = list(run_algorithm(replace(CONFIG, refit="warm"), tmp_path, Engine()))
     assert begun == [None, results[0].policy]
     assert files(results[1].policy) != files(run[1][1].policy)
+
+
+def test_a_run_begins_with_recorded_demonstrations_in_place_of_its_own(run, tmp_path):
+    given = tuple(datasets(run[0], 1))
+    config = replace(CONFIG, datasets=given, beta=ALONE)
+    results = list(run_algorithm(config, tmp_path / "run", Engine()))
+    assert results[0].episodes == sum(dataset_info(root).episodes for root in given)
+    assert results[0].labels == read_tables(given, ("label_valid",))["label_valid"].sum()
+    assert not (round_folder(tmp_path / "run", 0) / "journals").exists()
+    assert results[1].labels > results[0].labels
+    aggregated = read_table(tmp_path / "run" / "dataset", ("action",))["action"]
+    np.testing.assert_array_equal(aggregated[: results[0].labels], read_tables(given, ("action",))["action"])
+    again = list(run_algorithm(config, tmp_path / "run", Engine()))
+    assert [result.validation for result in again] == [result.validation for result in results]
+
+
+def test_a_run_goes_on_with_the_same_datasets_only(run, tmp_path):
+    given = tmp_path / "given"
+    shutil.copytree(datasets(run[0], 0)[0], given)
+    config = replace(CONFIG, datasets=(given,), rounds=0)
+    list(run_algorithm(config, tmp_path / "run", Engine()))
+    stats = given / "meta" / "stats.json"
+    stats.write_text(stats.read_text() + " ")
+    with pytest.raises(MismatchError, match=f"content of a dataset differs: {given} has .*, the run in {tmp_path}"):
+        list(run_algorithm(config, tmp_path / "run", Engine()))
+
+
+@pytest.mark.parametrize("with_data", [False, True])
+def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, monkeypatch, with_data: bool):
+    folder, before, _ = run
+    begun: list[Path | None] = []
+    plain = fitting.fit_table
+
+    def watch(config, table, into, fit, *rest):
+        begun.append(fit.init_from)
+        return plain(config, table, into, fit, *rest)
+
+    monkeypatch.setattr(fitting, "fit_table", watch)
+    start = before[1].policy
+    config = replace(CONFIG, start=start, datasets=tuple(datasets(folder, 0)) if with_data else (), beta=ALONE)
+    results = list(run_algorithm(config, tmp_path, Engine()))
+    assert files(results[0].policy) == files(start)
+    assert (results[0].labels > 0) == with_data
+    assert begun == [start]  # round 0 fits nothing
+    assert results[1].labels > results[0].labels
+    assert list(run_algorithm(config, tmp_path, Engine()))[1].labels == results[1].labels
 
 
 def labels(folder: Path, rounds: int) -> int:

@@ -169,7 +169,7 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             "dagger --sampling.corrections=-1": "sampling.corrections is -1.0; expected 0 or more",
             "dagger --policy.type=cnn": "give --cameras=front,wrist",
             "dagger --policy.lr=1": "unknown option of --policy.type=mlp: 'lr'",
-            "dagger --dataset.root=x": "unknown option '--dataset.root'; manip-il dagger --help lists all",
+            "dagger --dataset.root=x": "x does not exist; expected the folder of a LeRobot dataset",
             f"{expert} --suite=hard": "unknown suite 'hard'",
             f"{expert} --suite=nominall": "did you mean 'nominal'?",
             f"{expert} --env.tolerance=2": "tolerance is 2.0",

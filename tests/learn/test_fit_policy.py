@@ -9,6 +9,7 @@ from typing import Any
 from urllib.error import URLError
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from accelerate.state import AcceleratorState
@@ -159,6 +160,20 @@ def loaded(root: Path, config: FitConfig, observation: str) -> Samples:
     return load_samples([root], policy, config, meta)
 
 
+def loaded_all(roots: list[Path], config: FitConfig) -> Samples:
+    """Several datasets for a policy on pictures."""
+    meta, policy = read_metadata(*roots), policy_config(config.policy)
+    set_features(policy, meta, "images")
+    return load_samples(roots, policy, config, meta)
+
+
+def edit_tasks(root: Path, text: str) -> None:
+    """Give a dataset of one instruction another."""
+    path = root / "meta" / "tasks.parquet"
+    tasks = pd.read_parquet(path)
+    tasks.rename(index=lambda _: text).to_parquet(path)
+
+
 def test_held_out_episodes_are_never_learnt_from(demos) -> None:
     samples = loaded(demos, config(eval_split=0.4), "state")
     episodes = read_table(demos, ["episode_index"])["episode_index"]
@@ -208,6 +223,27 @@ def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(pictures
     fit(pictures, tmp_path / "loaded", VISION, **one, image_cache_gb=0.0, num_workers=0)
     ours, theirs = ([record["loss"] for record in records(tmp_path / name)] for name in ("cached", "loaded"))
     assert ours == pytest.approx(theirs, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_several_datasets_with_pictures_are_one_in_the_cache_and_in_lerobots_loader(pictures, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    other = tmp_path / "other"
+    words = ["--cameras=front,wrist", "--image.height=64", "--image.width=64", "--task.type=reach", "--seed=1"]
+    assert main(["record", f"--dataset.root={other}", "--dataset.num_episodes=1", "--workers=1", *words]) == 0
+    edit_tasks(other, "Touch the ball.")
+    roots, settings = [pictures, other], {"type": "cnn", "width": 16, "device": "cpu"}
+    both = [loaded_all(roots, config(settings, image_cache_gb=limit, num_workers=0)) for limit in (1.0, 0.0)]
+    assert [type(one.source) for one in both] == [MemorySource, LibrarySource]
+    frames = [read_metadata(root).total_frames for root in roots]
+    rows = np.array([0, frames[0] - 1, frames[0], sum(frames) - 1])
+    ours, theirs = (next(one.source.batches([rows])) for one in both)
+    assert ours["task"] == theirs["task"]
+    assert ours["task"][2:] == ["Touch the ball."] * 2
+    for key in ("index", "episode_index", "task_index", "action", "observation.images.front"):
+        assert torch.equal(ours[key].reshape(-1), theirs[key].reshape(-1)), key
+    assert ours["index"].tolist() == rows.tolist()
 
 
 @pytest.mark.slow

@@ -46,6 +46,8 @@ def mlp(table, spec, tmp_path) -> Path:
         ({"activation": ["silu"]}, "activation is"),
         ({"activation": "sqrt"}, "unknown activation 'sqrt'"),
         ({"clamp": "10"}, "clamp is '10'"),
+        ({"sigma": "3"}, "sigma is '3'"),
+        ({"sigma": -1}, "sigma is -1; expected a finite number from 0 to 100"),
         ({"clamp": 0}, "clamp is 0; expected more than 0"),
         ({"input_features": {"observation.state": {"type": "STATE", "shape": [10**9]}}}, "a side of observation.state"),
         ({"input_features": {"observation.state": {"type": "STATE", "shape": ["4"]}}}, "a side of observation.state"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 
+import draccus
 import numpy as np
 import pytest
 import torch
@@ -13,13 +14,15 @@ from safetensors.torch import load_file, save_file
 
 from manip_il.errors import MismatchError, NotFiniteError, UsageError
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import policy_config
 from manip_il.learn.limits import threads
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.pretrained import Interface
+from manip_il.learn.pretrained import CONFIG, Interface
 from manip_il.learn.train import fit
 
+from ..damage import edit_json
 from .tiny_policies import observations
 
 
@@ -59,6 +62,20 @@ def test_acting_is_the_same_through_lerobots_processors(checkpoint):
         fast = LearnedPolicy.load(checkpoint).act(states[row : row + 1], environments[row : row + 1])
         assert fast.dtype == np.float64
         assert np.array_equal(action.numpy().astype(np.float64), fast)
+
+
+def test_a_categorical_checkpoint_from_before_targets_were_smeared_acts_as_it_did(table, spec, tmp_path):
+    config = FitConfig({"loss": "categorical", "sigma": 0.0}, steps=3, batch_size=32)
+    path = fit(table, config, tmp_path / "run", spec=spec)
+    states, environments = observations(9)
+    before = LearnedPolicy.load(path).act(states, environments)
+    edit_json(path / CONFIG, lambda settings: settings.pop("sigma"))
+    assert np.array_equal(LearnedPolicy.load(path).act(states, environments), before)
+    policy = MLPPolicy.from_pretrained(path)  # as LeRobot's tools load it
+    actions = policy.model.act(torch.from_numpy(np.concatenate([states, environments], axis=1)))
+    assert np.array_equal(actions.numpy().astype(np.float64), before)
+    assert draccus.encode(policy_config({"path": str(path)}))["sigma"] == 0  # learning goes on as it began
+    assert draccus.encode(policy_config({"loss": "categorical"}))["sigma"] == 3
 
 
 def test_loading_needs_no_network(checkpoint, monkeypatch):

@@ -130,5 +130,5 @@ def test_frames_of_no_weight_are_never_drawn(two, tmp_path):
 def test_datasets_of_different_robots_are_not_one(two, tmp_path):
     words = [f"--dataset.root={tmp_path / 'c'}", "--dataset.num_episodes=1", "--task.type=lift", "--workers=1"]
     assert main(["record", *words]) == 0
-    with pytest.raises(MismatchError, match="tasks differs"):
+    with pytest.raises(MismatchError, match="environment_state differs: "):
         read_metadata(two[0], tmp_path / "c")

@@ -13,6 +13,8 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import MLPOptions
 from manip_il.learn.network import Shape
 
+SIGMA = 3.0  # [bins]
+
 
 @PreTrainedConfig.register_subclass("mlp")
 @dataclass
@@ -20,7 +22,9 @@ class MLPConfig(PreTrainedConfig):
     """A multi-layer perceptron from joint and environment state to one action.
 
     loss: one of `manip_il.learn.losses.LOSSES`. components: of `mixture`. bins: a dimension, of
-    `categorical`. clamp: bound of the normalised inputs, in standard deviations, so that a state
+    `categorical`, over the range of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two
+    nearest. None is the default, but for a configuration with features, as a checkpoint's is: it was saved before there
+    was a sigma, so it is 0. clamp: bound of the normalised inputs, in standard deviations, so that a state
     far off the data cannot blow the outputs up.
 
     The network needs raw inputs (its targets are relative to the measured joints), so LeRobot's
@@ -35,6 +39,7 @@ class MLPConfig(PreTrainedConfig):
     loss: str = MLPOptions.loss
     components: int = 5
     bins: int = 21
+    sigma: float | None = None
     clamp: float = 10.0
 
     device: str | None = "cpu"
@@ -52,6 +57,8 @@ class MLPConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.sigma is None:
+            self.sigma = 0.0 if self.input_features else SIGMA
         try:
             self.network_shape()
         except UsageError:
