@@ -68,6 +68,7 @@ class DaggerOptions(common.EnvOptions):
     ensemble: int = option_of(RunConfig, "ensemble")
     sampling: Sampling = field(default_factory=Sampling)
     policy: Open = option_of(FitConfig, "policy")
+    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
@@ -121,7 +122,7 @@ class DaggerOptions(common.EnvOptions):
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
         from manip_il.engine.drivers import QueryRule  # which imports numpy
 
-        same = ("observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        same = ("action_space", "observation", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         made = {
             "env": self.env_config(),
             "fit": FitConfig(policy=start_policy(self.policy), **{name: getattr(self, name) for name in same}),

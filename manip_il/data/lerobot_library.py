@@ -16,6 +16,7 @@ from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
+from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
 from manip_il.data.lerobot_read import check_dataset
@@ -80,9 +81,13 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
 
 
 class Metadata(LeRobotDatasetMetadata):
-    """LeRobot's metadata of one dataset, or of several as one; `roots` are their folders."""
+    """LeRobot's metadata of one dataset, or of several as one; `roots` are their folders.
+
+    learnt_actions: what is learnt in place of the column `action`, (N, n), where that is converted first.
+    """
 
     roots: tuple[Path, ...] = ()
+    learnt_actions: NDArray[np.float32] | None = None
 
 
 def read_metadata(*roots: Path) -> Metadata:

@@ -56,6 +56,7 @@ class CheckpointMeta:
 
     observation: one of `learn.pretrained.OBSERVATIONS`. cameras, image_size: of the pictures that it was
     trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
+    action_space: in which it learnt, None in a checkpoint from before there was a choice.
     """
 
     robot: str
@@ -70,6 +71,7 @@ class CheckpointMeta:
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels]
     look: dict[str, Any] | None = None
+    action_space: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("robot", "task"):
@@ -77,6 +79,8 @@ class CheckpointMeta:
         checks.whole("fps", self.fps, 1, _FASTEST)
         checks.text("action_meaning", self.action_meaning, _LONGEST_WORDS)
         checks.text("observation", self.observation, checks.LONGEST_NAME)
+        if self.action_space is not None:
+            checks.text("action_space", self.action_space, checks.LONGEST_NAME)
         for name in ("joint_names", "environment_state_names", "cameras"):
             for word in checks.array(name, getattr(self, name), _MOST_NAMES):
                 checks.text(f"one of {name}", word, _LONGEST_WORDS)
@@ -96,6 +100,7 @@ class CheckpointMeta:
         options: Mapping[str, Any] | None = None,
         observation: str = "state",
         look: Mapping[str, Any] | None = None,
+        action_space: str | None = None,
     ) -> CheckpointMeta:
         """Return the meta of a policy trained on data of `spec`.
 
@@ -106,6 +111,7 @@ class CheckpointMeta:
             fingerprint=dict(fingerprint or {}),
             options=dict(options or {}),
             observation=observation,
+            action_space=action_space,
         )
         if observation == "state":
             return meta
