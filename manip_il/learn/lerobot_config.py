@@ -283,7 +283,8 @@ class LeRobotFit:
 def _action_space(policy: PreTrainedConfig, config: FitConfig) -> str:
     """The action space of a fit, also put into the configuration of a policy that has it there."""
     wanted, start = config.action_space, config.init_from or config.policy.get("path")
-    before = read_interface(Path(start)).space if start is not None else None
+    known = start is not None and (Path(start) / CONFIG).is_file()  # else the weights are missing, too, which is said
+    before = read_interface(Path(start)).space if start is not None and known else None
     if policy.type in OWN_SPACE:
         own = typing.cast(MLPConfig, policy)
         if wanted not in (None, own.action_space) and "action_space" in config.policy:
