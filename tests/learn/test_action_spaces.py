@@ -202,7 +202,9 @@ def test_an_action_without_its_steps_joints_is_refused(panda, root, tmp_path):
 
 def test_a_checkpoint_goes_on_in_its_own_space_alone(panda, table, root, tmp_path):
     path = fit(table, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee", spec=panda)
-    assert fit_plan(root, tmp_path / "more", panda, {"path": str(path)}, None).lerobot.action_space == EE_DELTA
+    more = LearnedPolicy.load(fit_plan(root, tmp_path / "more", panda, {"path": str(path)}, None).fit())
+    assert (more.interface.space, more.interface.robot) == (EE_DELTA, "panda")
+    assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
     with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
         fit_plan(root, tmp_path / "other", panda, {"path": str(path)}, JOINT_DELTA)
     with pytest.raises(ManipError, match="holds no inverse kinematics; use joint_delta"):
