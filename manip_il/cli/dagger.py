@@ -78,6 +78,7 @@ class DaggerOptions(common.EnvOptions):
     ensemble: int = option_of(RunConfig, "ensemble")
     sampling: Sampling = field(default_factory=Sampling)
     policy: Open = option_of(FitConfig, "policy")
+    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
@@ -139,7 +140,7 @@ class DaggerOptions(common.EnvOptions):
 
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
-        same = ("steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        same = ("action_space", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
         made = {
             "env": self.env_config(),
             "fit": FitConfig(policy=policy, observation=observation, **{name: getattr(self, name) for name in same}),

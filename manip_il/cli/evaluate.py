@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 EPISODES, MOST_EPISODES = 100, 10_000
 FILMS = "films"
-FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust")
+FREE = ("workers", "engine", "output_dir", "eval.films", "eval.batch_size", "trust", "action_space")
 
 
 @dataclass
@@ -56,6 +56,9 @@ class EvalOptions:
 
     example: ClassVar[str] = "manip-il eval --policy.type=expert --eval.n_episodes=200 --output_dir=runs/expert"
     policy: MeasuredPolicyGroup = field(default_factory=MeasuredPolicyGroup)
+    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option(
+        None, "refuse a policy that learnt in another; by default what its checkpoint says"
+    )
     robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
     task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
     env: common.EnvGroup = field(default_factory=common.EnvGroup)
@@ -74,6 +77,8 @@ class EvalOptions:
         """Refuse what paths and values show to be wrong."""
         if (self.policy.path is None) == (self.policy.type is None):
             raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random")
+        if self.policy.type is not None and self.action_space not in (None, "joint_target"):
+            raise UsageError(f"--action_space={self.action_space} is for a checkpoint, not for {self.policy.type}")
         for name, lowest in (("n_episodes", 1), ("films", 0), ("first", 0), ("hold", 0), ("batch_size", 1)):
             value = getattr(self.eval, name)
             if value is not None and value < lowest:
@@ -83,7 +88,7 @@ class EvalOptions:
         self._seeds()
         common.require_workers(self.workers)
         if self.policy.path is not None:
-            find_policy(self.policy.path)
+            self._check_space(find_policy(self.policy.path))
         require_suite(self.suite)
         require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
         self.env.config(self.robot.type, self.task.type)
@@ -142,6 +147,16 @@ class EvalOptions:
         conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
         job = RolloutJob(env, self.policy.type or "policy", policy=path, label="last", conditions=conditions)
         return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
+
+    def _check_space(self, path: Path) -> None:
+        """Raise `MismatchError` for a checkpoint of another action space than the one asked for."""
+        if self.action_space is None:
+            return
+        from manip_il.errors import MismatchError
+        from manip_il.learn.pretrained import read_interface
+
+        if (space := read_interface(path).space) != self.action_space:
+            raise MismatchError("action space", str(path), space, "--action_space", self.action_space)
 
     def _check_memory(self, policy: Path | None, episodes: int) -> None:
         """Raise where memory is too small, before anything large is loaded; a Ray cluster checks for itself."""

@@ -53,6 +53,7 @@ class TrainOptions:
     )
     dataset: SourceGroup
     policy: Open = option_of(FitConfig, "policy")
+    action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     steps: int | None = option_of(FitConfig, "steps")
     batch_size: int | None = option_of(FitConfig, "batch_size")

@@ -88,12 +88,14 @@ class Metadata(LeRobotDatasetMetadata):
     """LeRobot's metadata of one dataset, or of several as one.
 
     roots, frames, episodes: folder and counts of each. task_numbers: of each, the joint number of its every task.
+    learnt_actions: what is learnt in place of the column `action`, (N, n), where that is converted first.
     """
 
     roots: tuple[Path, ...] = ()
     frames: tuple[int, ...] = ()
     episodes_of: tuple[int, ...] = ()
     task_numbers: tuple[I64, ...] = ()
+    learnt_actions: NDArray[np.float32] | None = None
 
     def joint_tasks(self, own: I64) -> I64:
         """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""

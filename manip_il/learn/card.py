@@ -40,6 +40,7 @@ def write_card(
         ("policy", f"`{policy.type}`, sees `{observation_of(inputs)}`: {names}"),
         ("robot, task", f"`{meta.robot}`, `{meta.task}`, {meta.fps} actions/s"),
         ("action", f"{meta.action_meaning}: {', '.join(meta.joint_names)}"),
+        ("learnt as", f"`{meta.action_space}`"),
         ("learnt from", f"{dataset.total_episodes:,} episodes, {dataset.total_frames:,} frames of `{dataset.repo_id}`"),
         ("fit", f"{pipeline.steps:,} steps of {pipeline.batch_size} samples, seed {pipeline.seed}"),
         ("optimiser", f"{optimizer.type if optimizer else 'none'}, lr {optimizer.lr if optimizer else 0:g}"),

@@ -57,6 +57,7 @@ class CheckpointMeta:
     observation: one of `learn.pretrained.OBSERVATIONS`. cameras, image_size: of the pictures that it was
     trained on, where it sees any; look: their light, as arguments of `sim.look.Look`, None where that is not known.
     datasets: folder, frames and weight of each, as `Sources.to_json` has them.
+    action_space: in which it learnt, None in a checkpoint from before there was a choice.
     """
 
     robot: str
@@ -72,6 +73,7 @@ class CheckpointMeta:
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels]
     look: dict[str, Any] | None = None
     datasets: list[dict[str, Any]] = field(default_factory=list)
+    action_space: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("robot", "task"):
@@ -79,6 +81,8 @@ class CheckpointMeta:
         checks.whole("fps", self.fps, 1, _FASTEST)
         checks.text("action_meaning", self.action_meaning, _LONGEST_WORDS)
         checks.text("observation", self.observation, checks.LONGEST_NAME)
+        if self.action_space is not None:
+            checks.text("action_space", self.action_space, checks.LONGEST_NAME)
         for name in ("joint_names", "environment_state_names", "cameras"):
             for word in checks.array(name, getattr(self, name), _MOST_NAMES):
                 checks.text(f"one of {name}", word, _LONGEST_WORDS)
@@ -101,6 +105,7 @@ class CheckpointMeta:
         observation: str = "state",
         look: Mapping[str, Any] | None = None,
         datasets: Sequence[Mapping[str, Any]] = (),
+        action_space: str | None = None,
     ) -> CheckpointMeta:
         """Return the meta of a policy trained on data of `spec`.
 
@@ -112,6 +117,7 @@ class CheckpointMeta:
             options=dict(options or {}),
             observation=observation,
             datasets=[dict(one) for one in datasets],
+            action_space=action_space,
         )
         if observation == "state":
             return meta

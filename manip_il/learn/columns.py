@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.learn.action_spaces import JOINT_DELTAS, Conversion
 
 EPISODE_INDEX, FRAME_INDEX, INDEX = "episode_index", "frame_index", "index"  # LeRobot's own columns
 LEARNING_COLUMNS = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, EPISODE_INDEX)
-ARM, GRIPPER = slice(None, -1), -1  # of joint state and action, as every robot's `ActionSpace` orders them
 
 I64 = NDArray[np.int64]
 Table = Mapping[str, NDArray[Any]]
@@ -57,11 +57,11 @@ def require_finite(table: Table, keys: Sequence[str]) -> None:
         raise NotFiniteError(f"column {key}, {', '.join(place)}: {np.asarray(table[key])[row]} is not finite")
 
 
-def learning_rows(table: Table) -> Rows:
+def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS) -> Rows:
     """Return the rows whose `label_valid` is not 0 (all of them where there is no such column).
 
-    Targets are relative to the measured joints, the gripper's command is absolute. Without
-    `episode_index` all rows count as one episode. Raises `ManipError` where no row is left.
+    Targets are the actions in the space of `conversion`. Without `episode_index` all rows count as one episode. Raises
+    `ManipError` where no row is left.
     """
     state, action = np.asarray(table[STATE], np.float32), np.asarray(table[ACTION], np.float32)
     environment = np.asarray(table.get(ENVIRONMENT_STATE, np.empty((len(state), 0))), np.float32)
@@ -69,10 +69,9 @@ def learning_rows(table: Table) -> Rows:
     valid = valid_frames(table)
     if not valid.any():
         raise ManipError(f"none of {len(valid)} frames has a valid label: there is nothing to learn from")
-    targets = action.copy()
-    targets[:, ARM] -= state[:, ARM]
+    targets = conversion.encode(action[valid], state[valid])
     inputs = np.concatenate([state, environment], axis=1)
-    return Rows(inputs[valid], targets[valid], episodes[valid])
+    return Rows(inputs[valid], targets, episodes[valid])
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:

@@ -26,6 +26,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
 from manip_il.learn.checkpoint import META_FILE
+from manip_il.learn.fit_config import EE_DELTA, JOINT_DELTA
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.pretrained import CONFIG, read_config
@@ -195,6 +196,8 @@ def _load(path: Path, policy_sha256: str) -> tuple[LearnedPolicy, PolicyFunction
     if any(mode != "IDENTITY" for mode in mapping(f"{path / CONFIG}: normalization_mapping", modes).values()):
         raise ManipError(f"{path / CONFIG}: normalization_mapping is {shorten(modes)}; expected IDENTITY for all")
     policy = LearnedPolicy.load(path)
+    if policy.interface.space == EE_DELTA:
+        raise ManipError(f"{path} has learnt {EE_DELTA}, and a file holds no inverse kinematics; use {JOINT_DELTA}")
     function = PolicyFunction(policy)
     return policy, function, file_metadata(policy, config, function.inputs, policy_sha256)
 

@@ -20,6 +20,9 @@ from manip_il.checks import read_json
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 
+JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_delta", "ee_delta")
+OWN_SPACE = ("mlp", "cnn")  # policies that know their action space: joint_delta unless told otherwise
+CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
 MLP = "mlp"  # the one policy with a loop of its own
 MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
 STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
@@ -45,8 +48,9 @@ class MLPOptions:
 class FitConfig:
     """Options of a fit; None is the default of the policy's kind.
 
-    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). observation: `state`,
-    `images` or `both`. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times slower
+    policy: `type` or `path`, and what that policy knows (`loss`, `width`, `chunk_size`, ...). action_space: see
+    `manip_il.learn.action_spaces`; by default that of a checkpoint to start from, too. observation: `state`, `images`
+    or `both`. threads: a second one is up to 1.8 times as fast where a core is free, and tens of times slower
     where none is. trust: whether models that the policy or its checkpoint names may be loaded. seed: of weights and
     batches. init_from: a `pretrained_model` folder whose weights to start from.
 
@@ -55,6 +59,9 @@ class FitConfig:
     """
 
     policy: Mapping[str, Any] = option(dict, "type (mlp), or path of a policy to start from; ...")
+    action_space: str | None = option(
+        None, "what is learnt, out of the same dataset; by default joint_delta by mlp and cnn, else joint_target"
+    )
     observation: str | None = option(
         None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
@@ -90,6 +97,10 @@ class FitConfig:
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
         check_names(self.policy)
+        if self.action_space is not None and self.action_space not in ACTION_SPACES:
+            raise UnknownName("action space", self.action_space, ACTION_SPACES)
+        if "path" not in self.policy:
+            check_convertible(str(self.policy.get("type", MLP)), self.action_space or JOINT_TARGET)
         if self.is_mlp and self.observation not in (None, "state"):
             raise UsageError(
                 f"--policy.type=mlp does not take images, so not --observation={self.observation}; use cnn"
@@ -171,6 +182,15 @@ def policy_options(kind: str) -> tuple[str, ...]:
         bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name)]
         name = bases[0] if len(bases) == 1 else ""
     return ()
+
+
+def check_convertible(kind: str, space: str) -> None:
+    """Raise `UsageError` for a policy type whose processors cannot carry an action space."""
+    if space != JOINT_TARGET and kind not in CONVERTED:
+        raise UsageError(
+            f"action_space is {space!r}, which LeRobot's processors of {kind!r} cannot carry; expected {JOINT_TARGET}, "
+            f"or --policy.type={', '.join(CONVERTED[:-1])} or {CONVERTED[-1]}"
+        )
 
 
 def check_names(settings: Mapping[str, Any]) -> None:

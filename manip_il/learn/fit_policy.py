@@ -21,12 +21,16 @@ from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
 from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.lerobot_library import Metadata, read_metadata
+from manip_il.data.lerobot_read import read_tables
+from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError, UsageError
+from manip_il.learn.action_spaces import Conversion, conversion_for, same_width
+from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
 from manip_il.learn.card import write_card
 from manip_il.learn.checkpoint import (
@@ -80,13 +84,17 @@ class PolicyTrainer:
         self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config)
         options, observation = self.lerobot.resume_options(), self.lerobot.observation
         datasets = sources.to_json() if sources is not None else ()
-        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look, datasets)
+        conversion = conversion_for(self.lerobot.action_space, spec)
+        self.meta = CheckpointMeta.of(spec, fingerprint, options, observation, look, datasets, conversion.space)
+        self.conversion = conversion if is_in_processors(self.lerobot.policy.type, conversion) else None
         self.accelerator = _accelerator(self.lerobot.policy)
         self.accelerator.wait_for_everyone()  # the first process may have had a folder to empty
         checkpoint = last_checkpoint(output_dir, resume=resume)
         roots = [root] if isinstance(root, Path) else list(root)
         self.dataset = read_metadata(*roots)
         set_features(self.lerobot.policy, self.dataset, observation)
+        if self.conversion is not None:
+            _convert(self.dataset, self.conversion)
         self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
             self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
@@ -113,7 +121,10 @@ class PolicyTrainer:
         if before is not None:
             config.pretrained_path = before
         policy = build_policy(config, self.dataset)
-        self.preprocessor, self.postprocessor = build_processors(config, self.dataset, before, trust=self.config.trust)
+        trust, conversion = self.config.trust, self.conversion
+        self.preprocessor, self.postprocessor = build_processors(
+            config, self.dataset, before, trust=trust, conversion=conversion
+        )
         optimizer = self.lerobot.optimizer().build(policy.get_optim_params())
         if not isinstance(optimizer, torch.optim.Optimizer):
             raise UsageError(f"--policy.type={config.type} needs several optimisers; train it with lerobot-train")
@@ -249,6 +260,15 @@ class PolicyTrainer:
 
     def _lr(self) -> float:
         return float(self.optimizer.param_groups[0]["lr"])
+
+
+def _convert(dataset: Metadata, conversion: Conversion) -> None:
+    """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
+    table = read_tables(dataset.roots, [STATE, ACTION])
+    same_width(table[ACTION], table[STATE], conversion.space)
+    actions = conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE])
+    dataset.learnt_actions = actions
+    dataset.stats = {**(dataset.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:

@@ -23,11 +23,12 @@ from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.batches import Augment
-from manip_il.learn.fit_config import MLP, NOT_OURS, FitConfig
+from manip_il.learn.fit_config import JOINT_TARGET, MLP, NOT_OURS, OWN_SPACE, FitConfig, check_convertible
 from manip_il.learn.limits import check_numbers
-from manip_il.learn.pretrained import CONFIG, OBSERVATIONS, PLAIN, read_config, require_trust
+from manip_il.learn.mlp.configuration_mlp import MLPConfig
+from manip_il.learn.pretrained import CONFIG, OBSERVATIONS, PLAIN, read_config, read_interface, require_trust
 
 PLUGINS = ("manip_il.learn.mlp", "manip_il.learn.cnn")
 _OF_THE_MACHINE = ("device", "pretrained_path")  # where a policy runs and where its weights came from
@@ -214,8 +215,9 @@ def policy_features(
 class LeRobotFit:
     """The options of a fit as LeRobot's configurations: policy, optimiser, schedule, logger.
 
-    observation: what the policy sees. augment: of pictures, None for none. Raises what `policy_config` raises, and
-    `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot does not know.
+    observation: what the policy sees. action_space: in which it learns. augment: of pictures, None for none. Raises
+    what `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot
+    does not know, `MismatchError` for a checkpoint to start from that has learnt in another action space.
     """
 
     def __init__(self, config: FitConfig):
@@ -224,6 +226,7 @@ class LeRobotFit:
         if config.init_from is not None and not config.is_mlp:
             self.policy.pretrained_path = config.init_from
         self.observation = config.observation or ("images" if self.policy.type == "cnn" else "state")
+        self.action_space = _action_space(self.policy, config)
         self.augment = Augment() if config.image_augment else None
         self.wandb: WandBConfig = _decode(WandBConfig, config.wandb, "--wandb")
         self._optimizer = choice(OptimizerConfig, config.optimizer, "optimizer") if config.optimizer else None
@@ -271,6 +274,25 @@ class LeRobotFit:
             "batch_size": self.config.samples_per_step,
             "seed": self.config.seed,
             "observation": self.observation,
+            "action_space": self.action_space,
             "eval_split": self.config.eval_split,
             "lr": self.config.lr,
         }
+
+
+def _action_space(policy: PreTrainedConfig, config: FitConfig) -> str:
+    """The action space of a fit, also put into the configuration of a policy that has it there."""
+    wanted, start = config.action_space, config.init_from or config.policy.get("path")
+    known = start is not None and (Path(start) / CONFIG).is_file()  # else the weights are missing, too, which is said
+    before = read_interface(Path(start)).space if start is not None and known else None
+    if policy.type in OWN_SPACE:
+        own = typing.cast(MLPConfig, policy)
+        if wanted not in (None, own.action_space) and "action_space" in config.policy:
+            raise UsageError(f"give one of --action_space={wanted} and --policy.action_space={own.action_space}")
+        own.action_space = space = wanted or own.action_space
+    else:
+        space = wanted or before or JOINT_TARGET
+    if before not in (None, space):
+        raise MismatchError("action space", f"the checkpoint {start}", before, "this fit", space)
+    check_convertible(policy.type, space)
+    return space

@@ -25,6 +25,8 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError, UnknownName
+from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.action_steps import add_steps, expect_converted  # known here, they are known to what is loaded
 from manip_il.learn.checkpoint import readable_state
 from manip_il.learn.lerobot_config import policy_class, policy_types
 from manip_il.learn.limits import Budget, check_numbers
@@ -203,19 +205,31 @@ def _loaded(config: PreTrainedConfig, meta: Any) -> PreTrainedPolicy:
 
 
 def build_processors(
-    config: PreTrainedConfig, meta: Any, checkpoint: Path | None, *, trust: bool = False
+    config: PreTrainedConfig,
+    meta: Any,
+    checkpoint: Path | None,
+    *,
+    trust: bool = False,
+    conversion: Conversion | None = None,
 ) -> tuple[Any, Any]:
     """Return LeRobot's pre- and postprocessor, with the dataset's statistics, on going on with the checkpoint's.
 
-    Raises what `require_trust` raises for the checkpoint's, and `ManipError` where they cannot be read.
+    conversion: of the actions, which the dataset's metadata then has, where the processors are to carry one. Raises
+    what `require_trust` raises for the checkpoint's, and `ManipError` where they cannot be read.
     """
     if checkpoint is None:
-        return make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+        before, after = make_pre_post_processors(config, dataset_stats=usable_statistics(meta.stats), dataset_meta=meta)
+        if conversion is not None:
+            add_steps(before, after, conversion)
+            expect_converted(before)
+        return before, after
     check_processors(checkpoint)
     require_trust(read_config(checkpoint), str(checkpoint), trust, checkpoint)
     device = {"device_processor": {"device": config.device}}
     with readable_state(checkpoint):
-        return make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
+        before, after = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=device)
+    expect_converted(before)
+    return before, after
 
 
 def usable_statistics(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
-from manip_il.learn.columns import ARM, GRIPPER
+from manip_il.learn.action_spaces import ARM, GRIPPER
+from manip_il.learn.fit_config import ACTION_SPACES, JOINT_DELTA
 from manip_il.learn.losses import DISTRIBUTIONS, LOSSES, Distribution, make_head
 
 # The order of the sums in a matrix product changes with the number of rows. Acting always
@@ -51,9 +52,10 @@ class Shape:
     bins: int
     clamp: float
     sigma: float = 0.0  # checkpoints from before there was one have none
+    action_space: str = JOINT_DELTA
 
     def __post_init__(self) -> None:
-        for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS)):
+        for name, known in (("loss", LOSSES), ("activation", ACTIVATIONS), ("action_space", ACTION_SPACES)):
             value = checks.text(name, getattr(self, name), checks.LONGEST_NAME)
             if value not in known:
                 raise UnknownName(name, value, known)
@@ -107,8 +109,9 @@ def fit_statistics(inputs: NDArray[np.float32], targets: NDArray[np.float32], lo
 class MLPNetwork(nn.Module):
     """Perceptron, head and units. Inputs (B, n + k) are raw, the first n the measured joints.
 
-    Its targets are relative to the measured joints, but for the gripper's, the last, which is
-    absolute. A row's action does not depend on the rows beside it, bit for bit.
+    In the space `joint_delta` its targets are relative to the measured joints, but for the gripper's, the last, which
+    is absolute: it adds the joints itself. In any other its actions are its targets, for `action_spaces` to convert. A
+    row's action does not depend on the rows beside it, bit for bit.
     """
 
     input_mean: Tensor
@@ -121,6 +124,7 @@ class MLPNetwork(nn.Module):
     def __init__(self, inputs: int, n: int, shape: Shape) -> None:
         super().__init__()
         self.n, self.clamp, self.loss = n, shape.clamp, shape.loss
+        self.adds_joints = shape.action_space == JOINT_DELTA
         self.head = make_head(shape.loss, n, components=shape.components, bins=shape.bins, sigma=shape.sigma)
         layers: list[nn.Module] = []
         for width in (inputs, *[shape.width] * (shape.depth - 1)):
@@ -148,12 +152,14 @@ class MLPNetwork(nn.Module):
         return self.head.nll(self.layers(x), y)
 
     def relative(self, actions: Tensor, inputs: Tensor) -> Tensor:
-        """Return targets (B, n) of absolute actions (B, n): the arm's from the measured joints, the gripper's alone."""
+        """Return targets (B, n) of actions (B, n): the arm's from the measured joints where the network adds these."""
+        if not self.adds_joints:
+            return actions
         return torch.cat([actions[:, ARM] - inputs[:, : self.n - 1], actions[:, GRIPPER:]], dim=1)
 
     @torch.no_grad()
     def act(self, inputs: Tensor) -> Tensor:
-        """Return absolute actions, (B, n), each the same bits whatever the other rows are."""
+        """Return actions, (B, n), each the same bits whatever the other rows are."""
         return _in_blocks(self.actions, inputs)
 
     def distribution(self) -> Distribution:  # no property: TorchScript would compile it
@@ -164,7 +170,7 @@ class MLPNetwork(nn.Module):
 
     @torch.no_grad()
     def sample(self, inputs: Tensor, draws: Tensor) -> Tensor:
-        """Return absolute actions, (B, n), from what the distribution's `draw` gave for each row (B, m).
+        """Return actions, (B, n), from what the distribution's `draw` gave for each row (B, m).
 
         Bits as in `act`.
         """
@@ -177,7 +183,7 @@ class MLPNetwork(nn.Module):
 
     @torch.no_grad()
     def log_prob(self, inputs: Tensor, actions: Tensor) -> Tensor:
-        """Return the log-density of absolute actions (B, n) in normalised units [nats], (B,); bits as in `act`."""
+        """Return the log-density of actions (B, n) in normalised units [nats], (B,); bits as in `act`."""
 
         def log_probs(inputs: Tensor, actions: Tensor) -> Tensor:
             targets = self.encode_targets(self.relative(actions, inputs))
@@ -186,13 +192,15 @@ class MLPNetwork(nn.Module):
         return _in_blocks(log_probs, inputs, actions)
 
     def actions(self, inputs: Tensor) -> Tensor:
-        """Return absolute actions, (B, n), of all rows in one product, whose last bits depend on their number."""
+        """Return actions, (B, n), of all rows in one product, whose last bits depend on their number."""
         y = self.head.action(self.layers(self.encode(inputs)))
         # The expert's targets never left this range, so neither shall the learner's, wherever it is.
         target = torch.clamp(y * self.target_scale + self.target_mean, self.target_low, self.target_high)
         return self._absolute(inputs, target)
 
     def _absolute(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        if not self.adds_joints:
+            return targets
         return torch.cat([inputs[:, : self.n - 1] + targets[:, ARM], targets[:, GRIPPER:]], dim=1)
 
 

@@ -15,7 +15,9 @@ from safetensors.torch import load_file
 
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
-from manip_il.learn.checkpoint import CheckpointMeta, read_meta
+from manip_il.learn.action_spaces import conversion
+from manip_il.learn.checkpoint import META_FILE, CheckpointMeta, read_meta
+from manip_il.learn.fit_config import EE_DELTA, JOINT_TARGET
 from manip_il.learn.limits import Budget, threads
 from manip_il.learn.losses import DISTRIBUTIONS
 from manip_il.learn.network import MLPNetwork, Shape
@@ -57,6 +59,8 @@ class LearnedPolicy:
             raise UsageError(f"device is {device!r}, but torch sees no graphics card here; expected 'cpu'")
         config = read_config(path)
         interface, meta = interface_of(config, path), read_meta(path)
+        if meta is not None and meta.action_space not in (None, interface.space):
+            raise MismatchError("action space", str(path / META_FILE), meta.action_space, CONFIG, interface.space)
         if config["type"] == "mlp":
             return cls(_Perceptron(path, config, interface, device), interface, meta)
         from manip_il.learn.lerobot_policy import load_policy
@@ -192,26 +196,34 @@ class _Perceptron:
         except ManipError as error:
             raise ManipError(f"{path}: {error}") from error
         self.module.to(device).eval()
+        # every other space is the network's own
+        self._conversion = conversion(interface.space if interface.space == EE_DELTA else JOINT_TARGET, interface.robot)
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row (B, n).
 
-        The mlp's processors are the identity (see MLPConfig), so there is nothing else to do.
+        The mlp's processors are the identity (see MLPConfig), but for the conversion of an action space.
         """
-        return self.module.act(self._inputs(batch))
+        return self._decoded(self.module.act(self._inputs(batch)), batch)
 
     def sample(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> torch.Tensor:
         """Return absolute actions (B, n), each row's from its own generator."""
         head = self.module.distribution()
         draws = torch.from_numpy(np.stack([head.draw(rng) for rng in rngs]))
-        return self.module.sample(self._inputs(batch), draws.to(self._device)).cpu()
+        return self._decoded(self.module.sample(self._inputs(batch), draws.to(self._device)), batch).cpu()
 
     def log_prob(self, batch: Batch, actions: torch.Tensor) -> torch.Tensor:
         """Return the log-density of absolute actions (B, n) [nats], (B,)."""
-        return self.module.log_prob(self._inputs(batch), actions.to(self._device, torch.float32)).cpu()
+        targets = self._conversion.encode(actions.to(torch.float32).numpy(), batch[STATE].numpy())
+        return self.module.log_prob(self._inputs(batch), torch.from_numpy(targets).to(self._device)).cpu()
 
     def forget(self, episodes: Iterable[int]) -> None:
         """Forget nothing: the mlp has no memory."""
+
+    def _decoded(self, targets: torch.Tensor, batch: Batch) -> torch.Tensor:
+        if self._conversion.space == JOINT_TARGET:
+            return targets
+        return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)
@@ -220,8 +232,8 @@ class _Perceptron:
 def _shape(config: Mapping[str, Any], path: Path) -> Shape:
     """The network's shape in an mlp's `config.json`."""
     try:
-        known = [field for field in fields(Shape) if field.name in config or field.default is MISSING]
-        return Shape(**{field.name: config[field.name] for field in known})
+        needed = [one.name for one in fields(Shape) if one.default is MISSING or one.name in config]
+        return Shape(**{name: config[name] for name in needed})
     except KeyError as error:
         raise ManipError(f"{path} has no {error.args[0]}; it is not an mlp's") from error
     except ManipError as error:

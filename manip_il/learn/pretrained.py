@@ -16,7 +16,8 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, UnknownName
+from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, OWN_SPACE
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 OBSERVATIONS = ("state", "images", "both")  # besides the joints: the true poses, pictures, or both
@@ -26,12 +27,15 @@ _LARGEST_JSON = 16 * 1024 * 1024  # [bytes]
 _MOST_FEATURES, _MOST_STEPS, _LONGEST_SIDE = 100, 100, 100_000
 _PLACEHOLDER = "empty_camera_"  # of LeRobot's language policies: they fill such a picture in themselves
 _NORMALISER = frozenset({"eps", "features", "norm_map", "normalize_observation_keys"})
-_STEPS: dict[str, frozenset[str]] = {  # LeRobot's default processors: step -> the options that it may have
+MEASURED, DECODER = "manip_il_measured_joints", "manip_il_joint_targets"  # steps that carry an action space
+_STEPS: dict[str, frozenset[str]] = {  # LeRobot's default processors, and ours: step -> the options that it may have
     "rename_observations_processor": frozenset({"rename_map"}),
     "to_batch_processor": frozenset(),
     "device_processor": frozenset({"device", "float_dtype"}),
     "normalizer_processor": _NORMALISER,
     "unnormalizer_processor": _NORMALISER,
+    MEASURED: frozenset(),
+    DECODER: frozenset({"action_space", "robot"}),
 }
 PLAIN = ("act", "cnn", "diffusion", "gaussian_actor", "mlp", "tdmpc", "vqbet")  # policies that load nothing by name
 _NAMES: dict[str, tuple[str, ...]] = {  # other policies of LeRobot 0.6.1 -> the options that name what they load
@@ -59,13 +63,15 @@ class Interface:
     """Inputs and outputs of a policy.
 
     type: LeRobot's name for the policy. numbers: column -> how many; pictures: camera -> (height, width) [pixels];
-    action: how many numbers.
+    action: how many numbers. space: the action space it has learnt in; robot: whose hand moves, for `ee_delta` alone.
     """
 
     type: str
     numbers: dict[str, int]
     pictures: dict[str, tuple[int, int]]
     action: int
+    space: str = JOINT_TARGET
+    robot: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -130,6 +136,7 @@ def interface_of(config: dict[str, Any], path: Path) -> Interface:
         inputs, outputs = _features(config["input_features"]), _features(config["output_features"])
         if ACTION not in outputs:
             raise ManipError(f"no {ACTION} among the outputs ({', '.join(outputs)})")
+        space, robot = _space(config, path)
         pictures = {key.removeprefix(IMAGES): shape for key, (kind, shape) in inputs.items() if kind == "VISUAL"}
         if any(len(shape) != 3 for shape in pictures.values()):
             raise ManipError(f"pictures of shapes {checks.shorten(list(pictures.values()))}; expected (3, H, W)")
@@ -138,9 +145,31 @@ def interface_of(config: dict[str, Any], path: Path) -> Interface:
             numbers={key: math.prod(shape) for key, (kind, shape) in inputs.items() if kind in ("STATE", "ENV")},
             pictures={name: shape[1:] for name, shape in pictures.items() if not name.startswith(_PLACEHOLDER)},  # pyright: ignore[reportArgumentType]
             action=math.prod(outputs[ACTION][1]),
+            space=space,
+            robot=robot,
         )
     except ManipError as error:
         raise ManipError(f"{path / CONFIG} has features that cannot be read: {error}") from error
+
+
+def _space(config: Mapping[str, Any], path: Path) -> tuple[str, str]:
+    """Action space and robot: the mlp's and cnn's by their configuration, all others' by the postprocessor's step."""
+    file = path / PROCESSORS[1]
+    steps = processor_steps(file) if file.is_file() else []
+    options: dict[str, Any] = next((one["config"] for one in steps if one["registry_name"] == DECODER), {})
+    converted, robot = options.get("action_space", JOINT_TARGET), checks.text("robot", options.get("robot", ""))
+    if config["type"] not in OWN_SPACE:
+        return _known_space(converted), robot
+    space = _known_space(config.get("action_space", JOINT_DELTA))
+    if converted != (in_step := EE_DELTA if space == EE_DELTA else JOINT_TARGET):
+        raise MismatchError(f"action space, for {space},", file.name, converted, CONFIG, in_step)
+    return space, robot
+
+
+def _known_space(space: Any) -> str:
+    if checks.text("action_space", space, checks.LONGEST_NAME) not in ACTION_SPACES:
+        raise UnknownName("action space", space, ACTION_SPACES)
+    return space
 
 
 def _features(features: Mapping[str, Any]) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -167,6 +196,8 @@ def check_interface(interface: Interface, spec: RobotTaskSpec) -> None:
     for key, width in interface.numbers.items():
         if width != have[key]:
             raise MismatchError(f"width of {key}", "the policy", width, environment, have[key])
+    if interface.robot not in ("", spec.robot):
+        raise MismatchError("robot, whose hand moves,", "the policy", interface.robot, environment, spec.robot)
     if interface.action != have[STATE]:
         raise MismatchError("width of the action", "the policy", interface.action, environment, have[STATE])
     for camera, size in interface.pictures.items():

@@ -164,6 +164,20 @@ class LibrarySource:
 
 
 @dataclass(frozen=True)
+class WithActions(torch.utils.data.Dataset[Batch]):
+    """Another dataset's samples with other actions, of every frame (N, n)."""
+
+    dataset: torch.utils.data.Dataset[Batch]
+    windows: Windows
+    actions: NDArray[np.float32]
+
+    def __getitem__(self, index: int) -> Batch:
+        planned = ACTION in self.windows.deltas
+        rows = self.windows.rows(np.array([index]), ACTION)[0][0] if planned else index
+        return self.dataset[index] | {ACTION: torch.from_numpy(self.actions[rows])}
+
+
+@dataclass(frozen=True)
 class Samples:
     """The data of one fit. train, held_out: sample numbers; digest: of everything that is learnt from."""
 
@@ -183,8 +197,9 @@ def load_samples(
 ) -> Samples:
     """Return the samples of datasets, taken as one, for a policy that has its features; in memory where they fit.
 
-    meta: LeRobot's metadata of the datasets. on_frames: sees how many frames more have been decoded. Raises
-    `NotFiniteError`, and what `windows_of` and `Windows.usable` raise.
+    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'. on_frames:
+    sees how many frames more have been decoded. Raises `NotFiniteError`, and what `windows_of` and `Windows.usable`
+    raise.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = tuple(key for key in features if key in meta.camera_keys)
@@ -192,6 +207,8 @@ def load_samples(
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
     table = read_tables(roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
+    if meta.learnt_actions is not None:
+        table[ACTION] = meta.learnt_actions
     require_finite(table, numbers)
     episodes = table[EPISODE_INDEX].astype(np.int64).reshape(-1)
     windows = windows_of(policy, features, episodes)
@@ -206,7 +223,10 @@ def load_samples(
         )
         ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
         read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
-        source = LibrarySource(torch.utils.data.ConcatDataset(meta.numbered(read)), config.num_workers)
+        dataset: torch.utils.data.Dataset[Batch] = torch.utils.data.ConcatDataset(meta.numbered(read))
+        if meta.learnt_actions is not None:
+            dataset = WithActions(dataset, windows, meta.learnt_actions)
+        source = LibrarySource(dataset, config.num_workers)
     else:
         columns = {key: torch.from_numpy(np.array(table[key])) for key in (*numbers, *_ALWAYS)}
         source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))

@@ -28,6 +28,8 @@ from safetensors.torch import load_file
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError
+from manip_il.learn.action_spaces import ARM, GRIPPER, JOINT_DELTAS, Conversion, conversion_for
+from manip_il.learn.action_steps import add_steps, is_in_processors
 from manip_il.learn.batches import order_of
 from manip_il.learn.checkpoint import (
     PRETRAINED_MODEL,
@@ -40,7 +42,7 @@ from manip_il.learn.checkpoint import (
     unpublished,
     write_own_files,
 )
-from manip_il.learn.columns import ARM, GRIPPER, Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
+from manip_il.learn.columns import Rows, Table, check_table, learning_rows, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.learn.limits import threads
@@ -79,22 +81,25 @@ def fit(
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for
     data or a loss that is not finite, `MismatchError` for a table that does not fit `spec` or a
-    run that is resumed on other data or options.
+    run that is resumed on other data or options, and what `conversion_for` raises.
     """
     output_dir = Path(output_dir)
     checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
-    rows = learning_rows(table)
-    drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
     lerobot = LeRobotFit(config)
+    conversion = conversion_for(lerobot.action_space, spec)
+    rows = learning_rows(table, conversion)
+    drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
     options = _options(lerobot)
-    meta = CheckpointMeta.of(spec, fingerprint, options, datasets=sources.to_json() if sources else ())
+    meta = CheckpointMeta.of(
+        spec, fingerprint, options, datasets=sources.to_json() if sources else (), action_space=conversion.space
+    )
     digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):
         if checkpoint is not None:
             check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
-        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn)
+        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn, conversion)
         pipeline = lerobot.pipeline(repo_id, None, output_dir)
         with metric_writers(output_dir, trainer.step, config.tensorboard, pipeline) as writers:
             for record in trainer.run():
@@ -117,8 +122,9 @@ class Trainer:
         spec: RobotTaskSpec,
         checkpoint: Path | None = None,
         weights: NDArray[np.float64] | None = None,
+        conversion: Conversion = JOINT_DELTAS,
     ) -> None:
-        config = lerobot.config
+        config, self.conversion = lerobot.config, conversion
         self.steps, self.batch_size, self.log_freq = config.total_steps, config.samples_per_step, config.log_freq
         self.peak_lr = lerobot.optimizer().lr
         self.step = 0
@@ -193,7 +199,10 @@ class Trainer:
             folder, state = new / PRETRAINED_MODEL, new / TRAINING_STATE
             folder.mkdir()
             self.policy.save_pretrained(folder)
-            for processor in make_pre_post_processors(self.policy.config):
+            processors = make_pre_post_processors(self.policy.config)
+            if is_in_processors(self.policy.config.type, self.conversion):
+                add_steps(*processors, self.conversion)
+            for processor in processors:
                 processor.save_pretrained(folder)
             state.mkdir()
             save_optimizer_state(self.optimizer, state)

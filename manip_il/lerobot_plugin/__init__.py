@@ -4,8 +4,9 @@ Importing it registers the environment type `manip_il` and the policies: LeRobot
 takes packages alone; its parser fails on a module without `__path__`.
 """
 
+from manip_il.learn.action_steps import JointTargetsStep, MeasuredJointsStep
 from manip_il.learn.cnn import CNNConfig
 from manip_il.learn.mlp import MLPConfig
 from manip_il.lerobot_plugin.environment import ManipILEnv
 
-__all__ = ["CNNConfig", "MLPConfig", "ManipILEnv"]
+__all__ = ["CNNConfig", "JointTargetsStep", "MLPConfig", "ManipILEnv", "MeasuredJointsStep"]

@@ -23,6 +23,10 @@ _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
 _CONVERGED = 1e-4  # weighted pose error that is none [m]
+_CORRECTIONS = 3  # Gauss-Newton steps of `solve`; the error is squared by each
+_EXACT = 1e-9  # pose error that is none to `solve` [m] or [rad]
+_LEVENBERG = 1e-8  # added to J J^T, so that a singular posture gives a short step
+_LARGEST = 0.5  # of a joint in one step of `solve` [rad]
 
 
 class ArmIK:
@@ -43,6 +47,8 @@ class ArmIK:
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         self._limits = [mink.ConfigurationLimit(model)]
         self._qpos = np.zeros(model.nq)
+        self._dofs = np.array([joint.dofadr[0] for joint in joints])
+        self._jacobian = np.zeros((6, model.nv))
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
@@ -74,6 +80,35 @@ class ArmIK:
         mujoco.mj_kinematics(self._configuration.model, data)
         return dq, self._pose_error(position, rotation) / before
 
+    def solve(self, q: F64, position: F64, rotation: F64) -> F64:
+        """Return joints (arm,) [rad], within their limits and near `q`, with which `ee` has a pose.
+
+        The first step is `step`, which resolves what the pose leaves open (the elbow of an arm of seven joints) as for
+        the expert; the corrections after it are the shortest that the linearised kinematics has (damped least squares).
+        A pose that is out of reach is approached.
+        """
+        self.ee_pose(q)
+        first = self.step(position, rotation, _LARGEST)
+        q = self._within(q if first is None else q + first[0])
+        for _ in range(_CORRECTIONS):
+            at, turned = self.ee_pose(q)
+            error = np.concatenate([position - at, rotation_vector(rotation @ turned.T)])
+            if np.abs(error).max() < _EXACT:
+                break
+            jacobian = self._site_jacobian()
+            dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _LEVENBERG * np.eye(6), error)
+            q = self._within(q + dq * min(1.0, _LARGEST / max(float(np.abs(dq).max()), _LARGEST)))
+        return q
+
+    def _within(self, q: F64) -> F64:
+        return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])
+
+    def _site_jacobian(self) -> F64:
+        """Position over rotation of `ee` by the arm's joints at the posture last given to `ee_pose`, (6, arm)."""
+        configuration, jacobian = self._configuration, self._jacobian
+        mujoco.mj_jacSite(configuration.model, configuration.data, jacobian[:3], jacobian[3:], self._site)
+        return jacobian[:, self._dofs]
+
     def _pose_error(self, position: F64, rotation: F64) -> float:
         """Distance to a pose, position and angle weighted as the frame task weights them."""
         data = self._configuration.data
@@ -94,6 +129,22 @@ def _solve(problem: qpsolvers.Problem) -> F64 | None:
     lower, sense = np.full(len(upper), -_UNBOUNDED), np.zeros(len(upper), dtype=np.intc)
     x, _, exit_flag, _ = daqp.solve(problem.P, problem.q, matrix, upper, lower, sense)
     return x if exit_flag > 0 else None
+
+
+def rotation_vector(rotation: F64) -> F64:
+    """Return axis times angle [rad], at most pi long, of a rotation matrix (3, 3)."""
+    quaternion, vector = np.empty(4), np.empty(3)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return vector
+
+
+def rotation_matrix(vector: F64) -> F64:
+    """Return the rotation (3, 3) about an axis by an angle, given as their product (3,) [rad]."""
+    quaternion, matrix = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(9)
+    mujoco.mju_quatIntegrate(quaternion, vector, 1.0)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
 
 
 def _se3(position: F64, rotation: F64) -> mink.SE3:

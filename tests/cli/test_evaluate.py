@@ -50,6 +50,12 @@ def test_an_act_checkpoint_is_measured_on_its_own_robot_and_task(act, tmp_path, 
     assert (result.robot, result.task, [episode.steps for episode in result.episodes]) == ("panda", "reach", [8, 8])
 
 
+def test_a_policy_of_another_action_space_than_asked_for_is_refused(act, tmp_path, capsys):
+    assert evaluate(act, tmp_path / "e", "--action_space=ee_delta") == 1
+    assert "has joint_target, --action_space has ee_delta" in capsys.readouterr().err
+    assert evaluate(act, tmp_path / "e", "--action_space=joint_target") == 0
+
+
 @pytest.mark.gl
 def test_a_policy_of_pictures_says_what_it_looks_at(seeing, tmp_path, capsys):
     assert evaluate(seeing, tmp_path / "e") == 0

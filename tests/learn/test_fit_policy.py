@@ -311,7 +311,7 @@ def test_a_checkpoint_has_lerobots_layout_and_a_card(demos, tmp_path) -> None:
     meta = LearnedPolicy.load(path).meta
     assert meta is not None
     assert meta.options["steps"] == 4
-    assert replace(meta, options={}) == CheckpointMeta.of(read_spec(demos))
+    assert replace(meta, options={}) == CheckpointMeta.of(read_spec(demos), action_space="joint_target")
 
 
 def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, curves) -> None:

@@ -12,6 +12,10 @@ from manip_il.sim.env import EnvConfig
 
 pytestmark = pytest.mark.slow
 UNFILMED = "--env.render_mode=none"  # these tests need no OpenGL
+SMALL_ACT = {"type": "act", "device": "cpu", "dim_model": 32, "n_heads": 2, "dim_feedforward": 64} | {
+    "n_encoder_layers": 1, "use_vae": "false", "chunk_size": 5, "n_action_steps": 5, "optimizer_lr": 1e-3,
+    "pretrained_backbone_weights": "null",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +51,30 @@ def test_lerobot_eval_finds_our_mlps_success_for_every_seed(
     theirs = lerobots(tmp_path)
     assert theirs["successes"] == [episode.success for episode in ours]
     assert theirs["sum_rewards"] == [episode.ret for episode in ours]
+
+
+@pytest.mark.parametrize(
+    ("space", "policy"),
+    [
+        ("joint_target", {"type": "mlp", "width": 32}),
+        ("ee_delta", {"type": "mlp", "width": 32}),
+        ("joint_delta", SMALL_ACT),
+        ("ee_delta", SMALL_ACT),
+    ],
+    ids=["mlp-joint_target", "mlp-ee_delta", "act-joint_delta", "act-ee_delta"],
+)
+def test_lerobot_eval_needs_no_word_of_the_action_space(command, lerobots, trial, demos, tmp_path, space, policy):
+    words = [f"--policy.{name}={value}" for name, value in policy.items()]
+    words += [f"--action_space={space}", "--batch_size=64", "--steps=80", f"--output_dir={tmp_path / 'run'}"]
+    assert main(["train", f"--dataset.root={demos}", *words]) == 0
+    path = tmp_path / "run/checkpoints/last/pretrained_model"
+    evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 6)
+    few = evaluation.words(3, asynchronous=False)
+    command("lerobot-eval", f"--policy.path={path}", *few, UNFILMED, f"--output_dir={tmp_path / 'eval'}")
+    theirs, ours = lerobots(tmp_path / "eval"), evaluation.ours(path)
+    assert theirs["successes"] == [episode.success for episode in ours]
+    assert theirs["sum_rewards"] == [episode.ret for episode in ours]
+    assert any(theirs["successes"])
 
 
 def test_lerobot_trains_act_with_evaluation_and_each_seed_ends_the_same_everywhere(

@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from manip_il.errors import ManipError, MismatchError, UsageError
-from manip_il.learn.fit_config import MLPOptions
+from manip_il.learn.fit_config import JOINT_DELTA, MLPOptions
 from manip_il.learn.network import Shape
 
 SIGMA = 3.0  # [bins]
@@ -25,9 +25,9 @@ class MLPConfig(PreTrainedConfig):
     `categorical`, over the range of the data. sigma: how far `categorical` smears a target, in bins; 0: over the two
     nearest. None is the default, but for a configuration with features, as a checkpoint's is: it was saved before there
     was a sigma, so it is 0. clamp: bound of the normalised inputs, in standard deviations, so that a state
-    far off the data cannot blow the outputs up.
+    far off the data cannot blow the outputs up. action_space: of `manip_il.learn.action_spaces`, in which it learns.
 
-    The network needs raw inputs (its targets are relative to the measured joints), so LeRobot's
+    The network needs raw inputs (its targets may be relative to the measured joints), so LeRobot's
     normaliser steps are the identity and the statistics are buffers of the model.
 
     Raises `UnknownName` for a loss or activation that is not known, `UsageError` for a size out of bounds.
@@ -41,6 +41,7 @@ class MLPConfig(PreTrainedConfig):
     bins: int = 21
     sigma: float | None = None
     clamp: float = 10.0
+    action_space: str = JOINT_DELTA
 
     device: str | None = "cpu"
     push_to_hub: bool = False  # type: ignore[assignment]

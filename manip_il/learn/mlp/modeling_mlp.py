@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, override
+from typing import Any, cast, override
 
+import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
+from manip_il.errors import ManipError
+from manip_il.learn.action_spaces import JointTarget, conversion
 from manip_il.learn.columns import INDEX, Table, learning_rows, valid_frames
+from manip_il.learn.fit_config import EE_DELTA
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.network import MLPNetwork, fit_statistics
 
@@ -38,7 +43,10 @@ class MLPPolicy(PreTrainedPolicy):
             roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
             wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
             names = [key for key in wanted if key in dataset_meta.features]
-            self._learn_columns(read_tables(roots, [*names, INDEX]), config.loss)
+            table = read_tables(roots, [*names, INDEX])
+            if config.action_space == EE_DELTA:
+                table[ACTION] = _converted(dataset_meta)
+            self._learn_columns(table, config.loss)
 
     @override
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
@@ -54,7 +62,7 @@ class MLPPolicy(PreTrainedPolicy):
 
     @override
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
-        """Return one absolute action a row, (B, n)."""
+        """Return one action a row, (B, n): absolute, but of `ee_delta` the motion of the hand."""
         return self.model.act(self._inputs(batch))
 
     @override
@@ -95,8 +103,19 @@ class MLPPolicy(PreTrainedPolicy):
 
     def _learn_columns(self, columns: Table, loss: str) -> None:
         """Take statistics and valid labels from a dataset's columns."""
-        rows = learning_rows({key: columns[key] for key in (*self.inputs, ACTION, LABEL_VALID) if key in columns})
+        space = cast(MLPConfig, self.config).action_space
+        rows = learning_rows(
+            {key: columns[key] for key in (*self.inputs, ACTION, LABEL_VALID) if key in columns},
+            JointTarget() if space == EE_DELTA else conversion(space, ""),  # hand motions are converted already
+        )
         self.model.set_statistics(fit_statistics(rows.inputs, rows.targets, loss))
         valid = torch.zeros(int(columns[INDEX].max()) + 1, dtype=torch.bool)
         valid[torch.from_numpy(columns[INDEX])] = torch.from_numpy(valid_frames(columns))
         self._valid_by_index = valid
+
+
+def _converted(dataset_meta: Any) -> NDArray[np.float32]:
+    """The dataset's actions as motions of the hand, (N, n), which `PolicyTrainer` leaves with the metadata."""
+    if (actions := getattr(dataset_meta, "learnt_actions", None)) is None:
+        raise ManipError(f"{EE_DELTA} needs the robot's kinematics, which LeRobot has not: train with manip-il train")
+    return actions

@@ -1,0 +1,185 @@
+"""The spaces in which a policy may learn a robot's action, and the way there and back.
+
+With s = (q, w) the measured joints [rad] and gripper opening [m] of a frame, a = (q*, w*) its action (joint targets and
+the opening's command, what a dataset holds and an environment takes), and (p, R) = FK(q) position and rotation of `ee`:
+
+    joint_target   y = (q*, w*)
+    joint_delta    y = (q* - q, w*)
+    ee_delta       y = (p* - p, log(R* R^T), 0 ..., w*)      with (p*, R*) = FK(q*)
+
+`joint_target` and `joint_delta` lose nothing. The opening is absolute in all: it is a command to close, not a motion.
+
+`ee_delta` is a position [m] and a rotation vector [rad] in the world's axes, not the hand's: objects and goals are
+observed there, so that "towards it" is the same numbers however the hand is turned, and stock environments
+(robosuite's OSC_POSE, gymnasium-robotics) mean the same by it. It has as many numbers as the robot's action, so that a
+network has the environment's shape; those between the six and the opening are 0 and are not read. Six numbers need an
+arm of six joints or more. The way back finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.solve`). The pose is
+reached again to rounding, the joints are not: an arm of seven joints has a motion of the elbow that leaves the hand
+where it is, which six numbers do not hold. It is chosen as the expert chooses it, by the pull to the home posture. A
+pose out of reach is approached.
+
+The measured state is the frame's own. An action of a plan is thus converted in the step in which it is executed, with
+the joints measured there, so that plans of many actions (ACT's chunks, diffusion's horizons) are converted exactly,
+too; what learns them sees target minus state of each frame of the window.
+
+`mlp` and `cnn` learn `joint_delta` by default, inside of their network (`MLPNetwork`), which holds the measured joints
+anyway and so goes into an exported file whole; `joint_target` is the same network without the sum. What a network
+cannot hold is in the checkpoint's processors (`action_steps`): both deltas of LeRobot's policies, every `ee_delta`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import MismatchError, UnknownName, UsageError
+from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
+from manip_il.robots import ROBOTS
+
+if TYPE_CHECKING:  # inverse kinematics takes a second to import
+    from manip_il.robots.ik import ArmIK
+
+ARM, GRIPPER = slice(None, -1), -1  # of joint state and action, as every robot's `ActionSpace` orders them
+_POSITION, _ROTATION, _POSE = slice(0, 3), slice(3, 6), 6
+Numbers = TypeVar("Numbers", bound=np.floating[Any])
+
+
+class Conversion(Protocol):
+    """The way from actions to targets of a space and back, row by row; all (N, n) and of the dtype of the first."""
+
+    @property
+    def space(self) -> str:
+        """The name of the space."""
+        ...
+
+    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return the targets of joint targets and openings (N, n), measured from joint states (N, n)."""
+        ...
+
+    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return joint targets [rad] and openings [m] (N, n) of targets (N, n)."""
+        ...
+
+
+@dataclass(frozen=True)
+class JointTarget:
+    """Targets that are the actions."""
+
+    space: str = JOINT_TARGET
+
+    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return the actions (N, n) as they are."""
+        return actions
+
+    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return the targets (N, n) as they are."""
+        return targets
+
+
+@dataclass(frozen=True)
+class JointDelta:
+    """Joint targets minus measured joints [rad], and the opening [m]."""
+
+    space: str = JOINT_DELTA
+
+    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return the arm's part of actions (N, n) less the measured joints."""
+        targets = actions.copy()
+        targets[:, ARM] -= states[:, ARM]
+        return targets
+
+    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return the arm's part of targets (N, n) plus the measured joints."""
+        actions = targets.copy()
+        actions[:, ARM] += states[:, ARM]
+        return actions
+
+
+@dataclass(frozen=True)
+class HandDelta:
+    """Motion of `ee` [m, rad] that a joint target means, and the opening [m]; robot: a name in `ROBOTS`."""
+
+    robot: str
+    space: str = EE_DELTA
+
+    def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return motions of the hand (N, n) of actions (N, n), by forward kinematics."""
+        from manip_il.robots.ik import rotation_vector
+
+        ik, targets = _arm_ik(self.robot), np.zeros_like(actions)
+        for target, action, state in zip(targets, actions, states, strict=True):
+            position, rotation = ik.ee_pose(state[ARM])
+            wanted, turned = ik.ee_pose(action[ARM])
+            target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
+            target[GRIPPER] = action[GRIPPER]
+        return targets
+
+    def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
+        """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
+        from manip_il.robots.ik import rotation_matrix
+
+        ik, actions = _arm_ik(self.robot), np.empty_like(targets)
+        for action, target, state in zip(actions, targets, states, strict=True):
+            q, motion = np.asarray(state[ARM], np.float64), np.asarray(target, np.float64)
+            position, rotation = ik.ee_pose(q)
+            turned = rotation_matrix(motion[_ROTATION]) @ rotation
+            action[ARM], action[GRIPPER] = ik.solve(q, position + motion[_POSITION], turned), target[GRIPPER]
+        return actions
+
+
+JOINT_DELTAS = JointDelta()
+
+
+def conversion(space: str, robot: str) -> Conversion:
+    """Return the conversion of a space for a robot, which `ee_delta` alone needs.
+
+    Raises `UnknownName` for a space or robot, `UsageError` for an arm that has fewer joints than a pose has numbers.
+    """
+    if space not in ACTION_SPACES:
+        raise UnknownName("action space", space, ACTION_SPACES)
+    if space != EE_DELTA:
+        return JointTarget() if space == JOINT_TARGET else JOINT_DELTAS
+    if robot not in ROBOTS:  # no path either: the name may be a downloaded checkpoint's
+        raise UnknownName("robot", robot, ROBOTS, f"{EE_DELTA} needs its kinematics; known: {', '.join(ROBOTS)}")
+    from manip_il.robots.robot import get_robot
+
+    if (joints := len(get_robot(robot).joints)) < _POSE:
+        raise UsageError(f"{EE_DELTA} has {_POSE} numbers, and the arm of {robot} {joints} joints; use {JOINT_DELTA}")
+    return HandDelta(robot)
+
+
+def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
+    """Return the conversion of a space for data of `spec`.
+
+    Raises `MismatchError` naming both sides where the data's actions are not joint targets of a robot that is known
+    here with these joints, where that matters, and what `conversion` raises.
+    """
+    found = conversion(space, spec.robot)
+    if space != JOINT_TARGET and spec.action_meaning != RobotTaskSpec.action_meaning:
+        needed = RobotTaskSpec.action_meaning
+        raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
+    if isinstance(found, HandDelta):
+        from manip_il.robots.robot import get_robot
+
+        if (names := get_robot(spec.robot).joint_names) != spec.joint_names:
+            raise MismatchError("joint names", "the dataset", spec.joint_names, f"robot {spec.robot}", names)
+    return found
+
+
+def same_width(actions: NDArray[Any], states: NDArray[Any], space: str) -> None:
+    """Raise `MismatchError` unless actions (N, n) have a measured joint for each number, which a delta needs."""
+    if space != JOINT_TARGET and actions.shape[1:] != states.shape[1:]:
+        raise MismatchError(f"width, for {space},", "action", actions.shape[1:], "observation.state", states.shape[1:])
+
+
+@cache
+def _arm_ik(robot: str) -> ArmIK:
+    from manip_il.robots.ik import ArmIK
+    from manip_il.robots.robot import get_robot
+
+    return ArmIK(get_robot(robot))

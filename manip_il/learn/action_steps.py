@@ -1,0 +1,103 @@
+"""The steps of LeRobot's processors that carry an action space: see `action_spaces`.
+
+`MeasuredJointsStep`, in the preprocessor, keeps the measured joints of an observation; `JointTargetsStep`, at the end
+of the postprocessor, makes joint targets of the policy's output with them. A checkpoint that has them works wherever
+LeRobot calls both once a step, as lerobot-eval does. LeRobot connects the two when it loads them, as it does its own
+steps of this kind, which are their base classes; those measure a whole plan from the joints at its beginning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+from lerobot.lerobot_types import EnvTransition, TransitionKey
+from lerobot.processor import (
+    AbsoluteActionsProcessorStep,
+    PolicyProcessorPipeline,
+    ProcessorStepRegistry,
+    RelativeActionsProcessorStep,
+)
+
+from manip_il.data.schema import STATE
+from manip_il.errors import ManipError
+from manip_il.learn.action_spaces import Conversion, HandDelta, conversion
+from manip_il.learn.fit_config import JOINT_TARGET, OWN_SPACE
+from manip_il.learn.pretrained import DECODER, MEASURED
+
+Pipeline = PolicyProcessorPipeline[Any, Any]
+_NORMALISER = "normalizer_processor"
+
+
+@ProcessorStepRegistry.register(MEASURED)
+@dataclass
+class MeasuredJointsStep(RelativeActionsProcessorStep):
+    """Keeps an observation's joint state (B, n), raw; changes nothing.
+
+    converted: the actions that come with observations are in the space already, as `fit_policy` makes them.
+    """
+
+    converted: bool = False
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Return the same transition. Raises `ManipError` for one with an action of a dataset's."""
+        if transition.get(TransitionKey.ACTION) is not None and not self.converted:
+            raise ManipError(
+                "this policy learns actions in a space of manip_il's, which are not in the dataset; go on with "
+                "manip-il train --resume=true"
+            )
+        self._last_state = (transition.get(TransitionKey.OBSERVATION) or {}).get(STATE)
+        return transition
+
+    def get_config(self) -> dict[str, Any]:
+        """Return nothing: whose joints are measured is the postprocessor's to know."""
+        return {}
+
+
+@ProcessorStepRegistry.register(DECODER)
+@dataclass
+class JointTargetsStep(AbsoluteActionsProcessorStep):
+    """Makes joint targets and opening (B, n) of a policy's output (B, n), against the joints measured in this step."""
+
+    action_space: str = JOINT_TARGET
+    robot: str = ""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """Return the transition with joint targets. Raises `ManipError` for another output than one step's."""
+        targets = transition.get(TransitionKey.ACTION)
+        states = self.relative_step.get_cached_state() if self.relative_step is not None else None
+        if not isinstance(targets, torch.Tensor) or states is None or targets.shape != states.shape:
+            given = f"{tuple(getattr(targets, 'shape', ()))} of {None if states is None else tuple(states.shape)}"
+            raise ManipError(
+                f"{self.action_space}: an action is made with the joints measured in its own step; expected the "
+                f"output of one step and its observation, (B, n) both, not {given}"
+            )
+        rows = targets.detach().to("cpu", torch.float32).numpy()
+        actions = conversion(self.action_space, self.robot).decode(rows, states.to("cpu", torch.float32).numpy())
+        return cast(EnvTransition, {**transition, TransitionKey.ACTION: torch.from_numpy(actions).to(targets)})
+
+    def get_config(self) -> dict[str, Any]:
+        """Return the options that a checkpoint keeps."""
+        return {"action_space": self.action_space, "robot": self.robot}
+
+
+def is_in_processors(kind: str, found: Conversion) -> bool:
+    """Return whether the processors of a policy type carry a conversion, rather than nothing or its network."""
+    return found.space != JOINT_TARGET and (kind not in OWN_SPACE or isinstance(found, HandDelta))
+
+
+def add_steps(before: Pipeline, after: Pipeline, found: Conversion) -> None:
+    """Add the steps of a conversion to a policy's pre- and postprocessor."""
+    measured = MeasuredJointsStep()
+    names = [getattr(step, "_registry_name", "") for step in before.steps]
+    place = names.index(_NORMALISER) if _NORMALISER in names else len(names)
+    before.steps = [*before.steps[:place], measured, *before.steps[place:]]
+    robot = found.robot if isinstance(found, HandDelta) else ""
+    after.steps = [*after.steps, JointTargetsStep(relative_step=measured, action_space=found.space, robot=robot)]
+
+
+def expect_converted(before: Pipeline) -> None:
+    """Let a preprocessor take batches whose actions are in the policy's space already."""
+    for step in [step for step in before.steps if isinstance(step, MeasuredJointsStep)]:
+        cast(MeasuredJointsStep, step).converted = True

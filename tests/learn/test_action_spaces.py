@@ -1,0 +1,253 @@
+"""One dataset is learnt in any action space, and what comes out is joint targets again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
+
+from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.schema import ACTION, STATE, RobotTaskSpec, features
+from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
+from manip_il.learn.action_spaces import JointTarget, conversion, conversion_for, same_width
+from manip_il.learn.checkpoint import META_FILE
+from manip_il.learn.columns import LEARNING_COLUMNS
+from manip_il.learn.export import export_torchscript
+from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, FitConfig
+from manip_il.learn.fit_policy import PolicyTrainer
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.samples import WithActions
+from manip_il.learn.train import fit
+from manip_il.robots.ik import ArmIK
+from manip_il.robots.robot import get_robot
+
+from ..tables import every_robot
+from .tiny_policies import ACT, DIFFUSION, edit_config
+
+every_space = pytest.mark.parametrize("space", ACTION_SPACES)
+SMALL = {"steps": 3, "batch_size": 8, "save_freq": 3, "log_freq": 3}
+EPISODES, LENGTH = 3, 12
+
+
+def moves(robot: str, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Actions and states (rows, n) around the home posture, no step longer than the robot's longest."""
+    the_robot, rng = get_robot(robot), np.random.default_rng(seed)
+    limits, longest, home = ArmIK(the_robot).limits, the_robot.max_joint_step, np.array(the_robot.home)
+    joints = np.clip(home + rng.uniform(-0.4, 0.4, (rows, len(home))), limits[:, 0], limits[:, 1])
+    targets = np.clip(joints + rng.uniform(-longest, longest, joints.shape), limits[:, 0], limits[:, 1])
+    openings = rng.uniform(0, 0.08, (2, rows, 1))
+    return np.hstack([targets, openings[0]]), np.hstack([joints, openings[1]])
+
+
+def poses(robot: str, joints: np.ndarray) -> np.ndarray:
+    """Position and rotation matrix of `ee`, (rows, 12), of joint values (rows, n)."""
+    ik = ArmIK(get_robot(robot))
+    return np.array([np.concatenate([part.ravel() for part in ik.ee_pose(row[:-1])]) for row in joints])
+
+
+@pytest.fixture(scope="module")
+def panda() -> RobotTaskSpec:
+    return RobotTaskSpec("panda", "reach", 20, get_robot("panda").joint_names, ("e0", "e1"), 5, "reach")
+
+
+@pytest.fixture(scope="module")
+def table() -> dict[str, np.ndarray]:
+    rows = EPISODES * LENGTH
+    actions, states = moves("panda", rows)
+    return {
+        STATE: states.astype(np.float32),
+        "observation.environment_state": (10 * (actions - states)[:, :2]).astype(np.float32),
+        ACTION: actions.astype(np.float32),
+        "label_valid": np.ones((rows, 1), np.int64),
+        "episode_index": np.repeat(np.arange(EPISODES), LENGTH),
+        "frame_index": np.tile(np.arange(LENGTH), EPISODES),
+    }
+
+
+@pytest.fixture(scope="module")
+def root(panda, table, tmp_path_factory) -> Path:
+    from lerobot.datasets import LeRobotDataset
+
+    folder = tmp_path_factory.mktemp("spaces") / "dataset"
+    columns = {key: value for key, value in features(panda).items() if key in LEARNING_COLUMNS}
+    made = LeRobotDataset.create("local/dataset", panda.fps, columns, root=folder, use_videos=False)
+    for row in range(EPISODES * LENGTH):
+        made.add_frame({key: table[key][row] for key in columns} | {"task": panda.instruction})
+        if row % LENGTH == LENGTH - 1:
+            made.save_episode()
+    made.finalize()
+    return folder
+
+
+def fit_plan(root: Path, folder: Path, spec: RobotTaskSpec, settings: Any, space: str | None, **more: Any):
+    config = FitConfig(settings, action_space=space, eval_split=0.0, **SMALL, **more)
+    return PolicyTrainer(root, config, folder, spec=spec, resume=folder.is_dir())
+
+
+@every_robot
+@pytest.mark.parametrize("space", [JOINT_TARGET, JOINT_DELTA])
+def test_joint_spaces_lose_nothing(robot, space):
+    actions, states = moves(robot, 20)
+    there = conversion(space, robot).encode(actions, states)
+    np.testing.assert_allclose(conversion(space, robot).decode(there, states), actions, rtol=0, atol=1e-15)
+    measured = states[:, :-1] if space == JOINT_DELTA else 0.0
+    np.testing.assert_array_equal(there[:, :-1], actions[:, :-1] - measured)
+    np.testing.assert_array_equal(there[:, -1], actions[:, -1])
+
+
+@every_robot
+def test_a_hand_motion_reaches_the_hands_pose_again_but_not_the_joints(robot):
+    actions, states = moves(robot, 20)
+    hand = conversion(EE_DELTA, robot)
+    there = hand.encode(actions, states)
+    back = hand.decode(there, states)
+    np.testing.assert_allclose(poses(robot, back), poses(robot, actions), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(hand.encode(back, states), there, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(back[:, -1], actions[:, -1])
+    off = np.abs(back - actions)[:, :-1].max()
+    assert 1e-3 < off < 4 * get_robot(robot).max_joint_step  # the elbow's part
+
+
+@every_robot
+def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
+    _, states = moves(robot, 1)
+    hand, targets = conversion(EE_DELTA, robot), np.zeros((1, states.shape[1]))
+    targets[0, 1] = 0.01
+    moved = poses(robot, hand.decode(targets, states)) - poses(robot, states)
+    np.testing.assert_allclose(moved[0], [0, 0.01, *[0] * 10], atol=1e-8)
+    targets[0, 1] = 10.0
+    limits, q = ArmIK(get_robot(robot)).limits, hand.decode(targets, states)[0, :-1]
+    assert (np.isfinite(q) & (q >= limits[:, 0]) & (q <= limits[:, 1])).all()
+
+
+@every_space
+def test_the_mlp_learns_each_space_from_the_same_table_and_gives_joint_targets(panda, table, tmp_path, space):
+    config = FitConfig({"width": 64, "depth": 2}, action_space=space, steps=600, batch_size=36, eval_split=0.0)
+    path = fit(table, config, tmp_path, spec=panda)
+    policy = LearnedPolicy.load(path)
+    assert (policy.interface.space, policy.meta and policy.meta.action_space) == (space, space)
+    actions = policy.act(table[STATE], table["observation.environment_state"])
+    wanted, states = table[ACTION].astype(np.float64), table[STATE].astype(np.float64)
+    reached, needed = poses("panda", actions) - poses("panda", wanted), poses("panda", wanted) - poses("panda", states)
+    assert np.abs(reached).mean() < 0.2 * np.abs(needed).mean()
+
+
+@every_space
+@pytest.mark.parametrize("settings", [ACT, DIFFUSION], ids=["act", "diffusion"])
+def test_lerobots_own_code_carries_each_space(panda, table, root, tmp_path, space, settings):
+    path = fit_plan(root, tmp_path / "run", panda, settings, space).fit()
+    policy = LearnedPolicy.load(path)
+    assert (policy.interface.space, policy.meta and policy.meta.action_space) == (space, space)
+    config = PreTrainedConfig.from_pretrained(path)
+    before, after = make_pre_post_processors(config, str(path))  # as lerobot-eval loads them
+    states = torch.from_numpy(table[STATE][:5])
+    before(
+        {STATE: states, "observation.environment_state": torch.from_numpy(table["observation.environment_state"][:5])}
+    )
+    found = conversion(space, "panda")
+    learnt = found.encode(table[ACTION], table[STATE])
+    middle = after(torch.zeros(5, 8)).numpy()  # of the normalised targets, of whatever kind
+    centre = learnt.mean(0) if settings is ACT else (learnt.max(0) + learnt.min(0)) / 2
+    np.testing.assert_allclose(middle, found.decode(np.tile(centre, (5, 1)), table[STATE][:5]), atol=5e-3)
+    acted = policy.act(table[STATE][:2], table["observation.environment_state"][:2])
+    assert acted.shape == (2, 8)
+
+
+@pytest.mark.parametrize("space", [JOINT_DELTA, EE_DELTA])
+def test_every_action_of_a_plan_is_measured_from_its_own_frame(panda, table, root, tmp_path, space):
+    trainer = fit_plan(root, tmp_path / "run", panda, ACT, space)
+    targets = conversion(space, "panda").encode(table[ACTION], table[STATE])
+    [batch] = trainer.samples.source.batches([np.array([3, 10])])
+    np.testing.assert_array_equal(batch[ACTION][0], targets[3:7])
+    np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
+    memory: Any = trainer.samples.source
+    ahead = {ACTION: [delta / panda.fps for delta in memory.windows.deltas[ACTION].tolist()]}
+    read = WithActions(lerobot_windows(root, "local/dataset", ahead), memory.windows, targets)
+    for place, row in enumerate((3, 10)):
+        torch.testing.assert_close(read[row][ACTION], batch[ACTION][place])
+
+
+def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(panda, root, tmp_path, weights):
+    more = {"observation": "state"}
+    whole = fit_plan(root, tmp_path / "whole", panda, ACT, JOINT_DELTA, **more).fit()
+
+    def stop(_record: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_plan(root, tmp_path / "halves", panda, ACT, JOINT_DELTA, **more).fit(stop)
+    halves = fit_plan(root, tmp_path / "halves", panda, ACT, JOINT_DELTA, **more).fit()
+    assert all(torch.equal(value, weights(halves)[name]) for name, value in weights(whole).items())
+    before, _ = make_pre_post_processors(PreTrainedConfig.from_pretrained(whole), str(whole))
+    with pytest.raises(ManipError, match="go on with manip-il train --resume=true"):
+        before({STATE: torch.zeros(2, 8), ACTION: torch.zeros(2, 4, 8)})
+
+
+def test_an_action_without_its_steps_joints_is_refused(panda, root, tmp_path):
+    path = fit_plan(root, tmp_path / "run", panda, ACT, JOINT_DELTA).fit()
+    before, after = make_pre_post_processors(PreTrainedConfig.from_pretrained(path), str(path))
+    with pytest.raises(ManipError, match=r"joint_delta: .* not \(2, 8\) of None"):
+        after(torch.zeros(2, 8))
+    before({STATE: torch.zeros(2, 8), "observation.environment_state": torch.zeros(2, 2)})
+    with pytest.raises(ManipError, match=r"not \(2, 4, 8\) of \(2, 8\)"):
+        after(torch.zeros(2, 4, 8))  # a whole plan
+
+
+def test_a_checkpoint_goes_on_in_its_own_space_alone(panda, table, root, tmp_path):
+    path = fit(table, FitConfig({"width": 8}, action_space=EE_DELTA, **SMALL), tmp_path / "ee", spec=panda)
+    more = LearnedPolicy.load(fit_plan(root, tmp_path / "more", panda, {"path": str(path)}, None).fit())
+    assert (more.interface.space, more.interface.robot) == (EE_DELTA, "panda")
+    assert np.isfinite(more.act(table[STATE], table["observation.environment_state"])).all()
+    with pytest.raises(MismatchError, match=r"checkpoint .* has ee_delta, this fit has joint_delta"):
+        fit_plan(root, tmp_path / "other", panda, {"path": str(path)}, JOINT_DELTA)
+    with pytest.raises(ManipError, match="holds no inverse kinematics; use joint_delta"):
+        export_torchscript(path, "")
+    meta = path / META_FILE
+    meta.write_text(json.dumps(json.loads(meta.read_text()) | {"action_space": JOINT_TARGET}))
+    with pytest.raises(MismatchError, match=r"manip_il\.json has joint_target, config\.json has ee_delta"):
+        LearnedPolicy.load(path)
+    edit_config(path, action_space=JOINT_DELTA)
+    with pytest.raises(ManipError, match="ee_delta"):
+        LearnedPolicy.load(path)
+
+
+def test_a_checkpoint_from_before_there_was_a_choice_acts_as_it_did(panda, table, tmp_path):
+    path = fit(table, FitConfig({"width": 8}, **SMALL), tmp_path, spec=panda)
+    observed = table[STATE], table["observation.environment_state"]
+    acted = LearnedPolicy.load(path).act(*observed)
+    for name in ("config.json", META_FILE):
+        old = json.loads((path / name).read_text())
+        assert old.pop("action_space") == JOINT_DELTA
+        (path / name).write_text(json.dumps(old))
+    np.testing.assert_array_equal(LearnedPolicy.load(path).act(*observed), acted)
+
+
+def test_what_cannot_be_is_refused_in_one_line(panda):
+    with pytest.raises(UnknownName, match=r"action space 'ee_delt' \(did you mean 'ee_delta'\?\)"):
+        FitConfig(action_space="ee_delt")
+    with pytest.raises(UsageError, match=r"LeRobot's processors of 'smolvla' cannot carry; expected joint_target"):
+        FitConfig({"type": "smolvla"}, action_space=JOINT_DELTA)
+    with pytest.raises(UnknownName, match=r"robot 'pandas' \(did you mean 'panda'\?\); ee_delta needs its kinematics"):
+        conversion_for(EE_DELTA, replace(panda, robot="pandas"))
+    with pytest.raises(MismatchError, match=r"joint names differs: the dataset has .*'a'.*robot panda has"):
+        conversion_for(EE_DELTA, replace(panda, joint_names=("a", "gripper")))
+    with pytest.raises(MismatchError, match="meaning of the action differs: the dataset has torques, joint_delta has"):
+        conversion_for(JOINT_DELTA, replace(panda, action_meaning="torques"))
+    assert conversion_for(JOINT_TARGET, replace(panda, action_meaning="torques")) == JointTarget()
+    with pytest.raises(MismatchError, match=r"action has \(8,\), observation.state has \(7,\)"):
+        same_width(np.zeros((2, 8)), np.zeros((2, 7)), JOINT_DELTA)
+
+
+def test_lerobots_own_training_has_no_kinematics(table, root):
+    meta: Any = read_metadata(root)
+    with pytest.raises(ManipError, match="train with manip-il train"):
+        make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
+    policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)
+    np.testing.assert_array_equal(policy.model.target_high, table[ACTION].max(0))
