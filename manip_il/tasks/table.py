@@ -10,6 +10,7 @@ from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 from manip_il.tasks.task import Task
 
@@ -22,6 +23,7 @@ TASKS: dict[str, Task] = {
     "stack": Stack(),
     "drawer": Drawer(),
     "clear_table": ClearTable(),
+    "sort": Sort(),
 }
 
 
