@@ -31,13 +31,13 @@ SENTENCES = (
     "Move only the {colour} cube to where it belongs.",
     "The {colour} cube goes into the {colour} bin.",
 )
-INSIDE = (0.046, 0.075)  # half a bin's inner length and width [m]
+INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
 PITCH = 0.105  # of the bins, which stand in a row away from the robot [m]
-SIDE = 0.21  # of the row from the workspace's middle, left or right [m]
+SIDE = 0.19  # of the row from the workspace's middle, left or right [m]
 SHIFT = 0.08  # of everything from the workspace's middle, at most, to where the arm reaches farthest around [m]
 HALF = 0.018  # of a cube's edge [m]
 APART = 0.085  # of the cubes at the start [m]
-FROM_BINS = 0.15  # of a cube from the row's middle at the start, sideways [m]
+FROM_BINS = 0.14  # of a cube from the row's middle at the start, sideways [m]
 BEYOND = 0.15  # of a cube at most from the workspace's middle on the side without bins [m]
 LOWER = 0.04  # of a carried cube than over a deeper box: what falls from there does not fly far [m]
 STEP = 0.1  # how far ahead of the hand its target runs while it carries: soon there, it loses less on the way [m]
@@ -157,7 +157,7 @@ _RUNGS = (
     _GRASP,
     *(replace(rung, target=_approach) for rung in _APPROACH),
 )
-_LIMITS = Limits(tolerance=0.005, horizon=200)
+_LIMITS = Limits(tolerance=0.005, horizon=250)
 
 
 @dataclass(frozen=True)
