@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.bins import OVER, WALL, add_bin, drop_place, drop_progress, drop_rungs, is_in
+from manip_il.tasks.bins import LIFT, LIFT_SLOPE, OVER, WALL, add_bin, drop_place, drop_rungs, is_in
 from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
-from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held
+from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
@@ -69,13 +69,25 @@ def _wrong(world: World) -> int:
     return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
 
 
+def _place(world: World) -> F64:
+    """Where the named cube is let go, over its bin, (3,) [m]."""
+    return drop_place(world, asked(world), BINS[asked(world)]) - [0.0, 0.0, LOWER]
+
+
 def _to(world: World) -> F64:
     """Where the named cube is let go, or beside it, off the bins, while it would be over another's."""
     name = asked(world)
-    place = drop_place(world, name, BINS[name]) - [0.0, 0.0, LOWER]
+    place = _place(world)
     along = abs(place[0] - world.pose(name).position[0])
     inwards = math.copysign(1.0, world.scene.robot.workspace.centre[1] - place[1])
     return place + [0.0, inwards * min(FROM_BINS, SLOPE * max(0.0, along - INSIDE[0] / 2)), 0.0]
+
+
+def _carry_progress(world: World) -> float:
+    """Progress by the way that is left around the other bins, and by the height that is missing on it, 0 to 1."""
+    along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
+    lift = min(LIFT, LIFT_SLOPE * max(0.0, math.hypot(along, across) - INSIDE[0]))
+    return nearness(abs(along) + abs(across) + max(0.0, up + lift))
 
 
 def _other_held(world: World) -> str:
@@ -231,5 +243,5 @@ class Sort:
         if _is_sorted(world, name):
             return 1.0 if not _wrong(world) else 0.95
         if held(world, name):
-            return 0.5 + 0.4 * drop_progress(world, name, _to(world))
+            return 0.5 + 0.4 * _carry_progress(world)
         return 0.45 * grasp_progress(world, name)
