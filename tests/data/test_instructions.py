@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -91,4 +92,5 @@ def test_lerobot_loads_every_frame_with_its_text(root):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset("local/data", root=root)
-    assert [dataset[row]["task"] for row in (0, 7, 8, 19)] == [RED, BLUE, RED, RED]
+    rows: list[Any] = [dataset[row] for row in (0, 7, 8, 19)]
+    assert [row["task"] for row in rows] == [RED, BLUE, RED, RED]
