@@ -58,8 +58,8 @@ class Limits:
 class Task(Protocol):
     """A task, for every arm that can do it.
 
-    objects: what the arm moves and must reach, the first being what events move. grasped: those of them that the gripper
-    must go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that
+    objects: what the arm moves and must reach, the first being what events move. grasped: those that the gripper must
+    go around. rungs: latest first, the last one holding everywhere; each is a function of the world alone, so that
     the expert can label any state.
     """
 
