@@ -12,7 +12,7 @@ from manip_il.robots.ik import ArmIK
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import angle_between
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Target
+from manip_il.tasks.task import Target, objects_in
 
 F64 = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ class Expert:
     def __init__(self, scene: Scene):
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
-        self._objects, rungs = get_task(scene.task).objects, get_task(scene.task).rungs
+        self._task, rungs = get_task(scene.task), get_task(scene.task).rungs
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
     def label(self, state: State) -> Label:
@@ -52,7 +52,7 @@ class Expert:
 
     def _unsound(self) -> str:
         world = self._world
-        for name in self._objects:
+        for name in objects_in(self._task, world):
             position = world.pose(name).position.tolist()
             if position[2] < FALLEN:
                 return f"{name} off the table"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,11 +69,15 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """An observation for a learner. state: (n,); environment_state: (k,), privileged, for state-based policies."""
+    """An observation for a learner. state: (n,); environment_state: (k,), privileged, for state-based policies.
+
+    instruction: what the episode is about, for policies that read language.
+    """
 
     state: F32
     environment_state: F32
     images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)  # camera -> (H, W, 3)
+    instruction: str = ""
 
     def __post_init__(self) -> None:
         require_finite("observation.state", self.state)
@@ -129,7 +133,7 @@ class Episode:
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
     at some time. success_at_end: within the tolerance for the required steps at the last frame. final: the
     observation after every frame that is `next.done`, in order, so that algorithms can bootstrap; empty where none was
-    made.
+    made. instruction: its text for policies that read language; empty where it is that of the task.
     """
 
     seed: int
@@ -137,6 +141,7 @@ class Episode:
     success: bool
     success_at_end: bool
     final: tuple[Observation, ...] = ()
+    instruction: str = ""
 
     def __post_init__(self) -> None:
         lengths = {key: len(column) for key, column in self.columns.items()}
@@ -170,6 +175,15 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
 
 
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)
+
+
+@runtime_checkable
+class ReadsInstructions(Protocol):
+    """A policy that is told what each episode is about."""
+
+    def instruct(self, instructions: Mapping[int, str]) -> None:
+        """Take the texts of episodes that begin, by their numbers."""
+        ...
 
 
 class Policy(Protocol):

@@ -35,11 +35,13 @@ class Header:
     frames: int
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
+    instruction: str = ""  # of the episode, where it is not that of the spec
 
     @classmethod
     def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
         """Return the header of an episode."""
-        return cls(episode.seed, episode.success, episode.success_at_end, len(episode), spec, fingerprint)
+        ends = episode.success, episode.success_at_end
+        return cls(episode.seed, *ends, len(episode), spec, fingerprint, episode.instruction)
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
@@ -90,6 +92,7 @@ def to_episode(
         success=any(frame.success for frame in decides),
         success_at_end=decides[-1].success,
         final=tuple(frame.final for frame in frames if frame.done and frame.final is not None),
+        instruction=frames[0].observation.instruction,
     )
 
 
@@ -218,7 +221,7 @@ class Selection:
 def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Episode:
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
-    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final)
+    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final, episode.instruction)
 
 
 def _column(values: list[Any], dtype: type) -> NDArray[Any]:

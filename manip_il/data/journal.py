@@ -48,6 +48,7 @@ from manip_il.mdp import Episode
 _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _HEADER_KEYS = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")
+_INSTRUCTION = "instruction"  # of the header; journals of older versions lack it
 _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
@@ -114,7 +115,8 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
             pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
             columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
         final = take_final(columns)
-        episode = Episode(header.seed, columns, header.success, header.success_at_end, final)
+        ends = header.success, header.success_at_end
+        episode = Episode(header.seed, columns, *ends, final, header.instruction)
         if len(episode) != header.frames:
             raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
         return header, episode
@@ -189,6 +191,7 @@ def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str,
             "frames": str(len(episode)),
             "spec": json.dumps(spec.to_json()),
             "fingerprint": json.dumps(fingerprint),
+            _INSTRUCTION: json.dumps(episode.instruction),
         },
     )
     channels, times = foxglove.episode_channels(episode, spec), foxglove.frame_times(episode, spec)
@@ -280,6 +283,7 @@ def _header(stream: BinaryIO) -> Header:
         checks.whole("its number of frames", values["frames"], 1, MOST_FRAMES),
         RobotTaskSpec.from_json(values["spec"]),
         checks.mapping("its fingerprint", values["fingerprint"]),
+        checks.text("its instruction", checks.parse_json("its instruction", data.get(_INSTRUCTION, '""'))),
     )
 
 

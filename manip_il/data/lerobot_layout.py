@@ -6,6 +6,7 @@ Restated here, and held against the library by the tests, because importing `ler
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,17 @@ def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
 
 
 def info_json(
-    spec: RobotTaskSpec, episodes: int, frames: int, file_sizes: tuple[float, float], videos: dict[str, dict[str, Any]]
+    spec: RobotTaskSpec,
+    episodes: int,
+    frames: int,
+    file_sizes: tuple[float, float],
+    videos: dict[str, dict[str, Any]],
+    tasks: int = 1,
 ) -> dict[str, Any]:
     """Return content of `meta/info.json`, keys in LeRobot's order.
 
-    file_sizes: of data and video files [MB]. videos: camera column -> the `info` of its video files.
+    file_sizes: of data and video files [MB]. videos: camera column -> the `info` of its video files. tasks: how many
+    texts its episodes have.
     """
     table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in all_features(spec).items()}
     for key, info in videos.items():
@@ -66,7 +73,7 @@ def info_json(
         "features": table,
         "total_episodes": episodes,
         "total_frames": frames,
-        "total_tasks": 1,
+        "total_tasks": tasks,
         "chunks_size": CHUNKS_SIZE,
         "data_files_size_in_mb": file_sizes[0],
         "video_files_size_in_mb": file_sizes[1],
@@ -111,14 +118,15 @@ def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
     return pa.schema(columns | dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()))
 
 
-def tasks_table(instruction: str) -> pa.Table:
-    """Return the one task, as pandas would write it with `task` for its index: LeRobot looks tasks up by that index."""
+def tasks_table(instructions: Sequence[str]) -> pa.Table:
+    """Return the tasks, as pandas would write them with `task` for its index: LeRobot looks tasks up by that index."""
     columns = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
         for name, kind, numpy_type in ((TASK_INDEX, "int64", "int64"), ("task", "unicode", "object"))
     ]
     pandas = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.3.3"}
-    table = pa.table({TASK_INDEX: pa.array([0], pa.int64()), "task": pa.array([instruction])})
+    numbers = pa.array(range(len(instructions)), pa.int64())
+    table = pa.table({TASK_INDEX: numbers, "task": pa.array(instructions, pa.string())})
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 

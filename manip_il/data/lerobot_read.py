@@ -17,7 +17,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.info import LARGEST_META, PICTURES, info_problems
-from manip_il.data.parquet_files import check_files, read_column, read_file
+from manip_il.data.parquet_files import UNREADABLE, check_files, read_column, read_file, read_tasks
 from manip_il.data.pictures import VideoReader
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
@@ -86,7 +86,7 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     An episode's success is what `next.success` has. One data file is held at a time. Raises what `read_table` and
     `read_frames` raise.
     """
-    spec = read_spec(root)
+    spec, tasks = read_spec(root), read_instructions(root)
     cameras = list(spec.image_keys) if pictures else []
     wanted = {key: one for key, one in s.features(spec).items() if pictures or key not in spec.image_keys}
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
@@ -97,14 +97,15 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     with ExitStack() as stack:
         readers = {key: stack.enter_context(closing(VideoReader())) for key in cameras}
         for path in _data_files(root):
-            table = read_file(path, [*stored, layout.EPISODE_INDEX])
+            table = read_file(path, [*stored, layout.EPISODE_INDEX, layout.TASK_INDEX])
             columns = {key: read_column(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
             index = read_column(root, layout.EPISODE_INDEX, table, _INDEX)
+            task = read_column(root, layout.TASK_INDEX, table, _INDEX)
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
                 own |= {key: _decode(root, info, readers[key], clips[key], key, int(index[start])) for key in cameras}
-                yield _episode({key: own[key] for key in shapes})
+                yield _episode({key: own[key] for key in shapes}, _text(root, tasks, int(task[start])))
 
 
 def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
@@ -178,6 +179,16 @@ def dataset_info(root: Path) -> DatasetInfo:
     )
 
 
+def read_instructions(root: Path) -> dict[int, str]:
+    """Return the text of every `task_index`. Raises `ManipError` where it cannot be read."""
+    try:
+        return dict(zip(*read_tasks(root), strict=True))
+    except UNREADABLE as error:
+        raise ManipError(
+            f"cannot read {root / layout.TASKS}: {error}; run `manip-il doctor` to see what is left"
+        ) from error
+
+
 def camera_keys(root: Path) -> list[str]:
     """Return names of the columns that are pictures."""
     return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in PICTURES]
@@ -209,9 +220,9 @@ def _decode(
     return reader.read(root / part.path, part.first, part.count, int(info["fps"]))
 
 
-def _episode(columns: dict[str, NDArray[Any]]) -> Episode:
-    success = columns[s.SUCCESS]
-    return Episode(int(columns[s.SEED].flat[0]), columns, bool(success.any()), bool(success[-1]))
+def _episode(columns: dict[str, NDArray[Any]], instruction: str) -> Episode:
+    seed, success = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
+    return Episode(seed, columns, bool(success.any()), bool(success[-1]), instruction=instruction)
 
 
 def _cameras(info: dict[str, Any]) -> dict[str, Any]:
@@ -275,6 +286,12 @@ def _keep(root: Path, table: pa.Table, episodes: Sequence[int], count: int) -> p
         if not 0 <= episode < count:
             raise UsageError(f"{root} has no episode {episode}; it has 0 to {count - 1}")
     return table.filter(np.isin(table.column(layout.EPISODE_INDEX).to_numpy(), list(episodes)))
+
+
+def _text(root: Path, tasks: dict[int, str], number: int) -> str:
+    if not isinstance(text := tasks.get(number), str):
+        raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
+    return text
 
 
 def _instruction(root: Path) -> str:

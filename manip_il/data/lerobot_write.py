@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, writing
 from manip_il.data.lerobot_read import DatasetInfo
@@ -119,6 +120,7 @@ class DatasetWriter:
         self._counts: dict[str, I64] = {}  # camera column -> pixels of all episodes
         self._encoding: deque[tuple[dict[str, Any], dict[str, Future[Clip]]]] = deque()
         self._rows: list[dict[str, Any]] = []
+        self._tasks: dict[str, int] = {}  # text -> its number, in the order of the first episodes
         self._episodes = self._frames = self._success = self._success_at_end = 0
         self.finished = False
 
@@ -132,9 +134,10 @@ class DatasetWriter:
             raise ManipError(f"{self._root} is finished: no episodes can be added")
         columns = fitted_columns(episode, self._spec)
         pictures = {key: columns.pop(key) for key in self._spec.image_keys}
-        columns |= self._index_columns(len(episode))
+        task = checks.text("instruction", episode.instruction or self._spec.instruction)
+        columns |= self._index_columns(len(episode), self._tasks.setdefault(task, len(self._tasks)))
         with _explained(self._root):
-            row = self._write_data(columns, len(episode)) | _flat(self._stats.add(columns))
+            row = self._write_data(columns, len(episode), task) | _flat(self._stats.add(columns))
             self._encoding.append((row, self._cameras.write(pictures)))
             self._settle()
         self._episodes += 1
@@ -183,17 +186,17 @@ class DatasetWriter:
             with contextlib.suppress(OSError):  # a full disk was reported by `add` or `finish`
                 files.close()
 
-    def _index_columns(self, length: int) -> dict[str, NDArray[Any]]:
+    def _index_columns(self, length: int, task: int) -> dict[str, NDArray[Any]]:
         frame = np.arange(length, dtype=np.int64)
         return {
             layout.TIMESTAMP: (frame / self._spec.fps).astype(np.float32),
             layout.FRAME_INDEX: frame,
             layout.EPISODE_INDEX: np.full(length, self._episodes, dtype=np.int64),
             layout.INDEX: frame + self._frames,
-            layout.TASK_INDEX: np.zeros(length, dtype=np.int64),
+            layout.TASK_INDEX: np.full(length, task, dtype=np.int64),
         }
 
-    def _write_data(self, columns: Mapping[str, NDArray[Any]], length: int) -> dict[str, Any]:
+    def _write_data(self, columns: Mapping[str, NDArray[Any]], length: int, task: str) -> dict[str, Any]:
         """The episode's rows; returns the episode's row of meta/episodes without statistics."""
         # LeRobot's rule: a new file where this episode, at the file's size a frame so far, would fill it
         size, frames = self._data.size, self._data.rows
@@ -202,7 +205,7 @@ class DatasetWriter:
         chunk, file = self._data.write(to_table(columns, self._data.schema))
         return {
             layout.EPISODE_INDEX: self._episodes,
-            "tasks": [self._spec.instruction],
+            "tasks": [task],
             "length": length,
             "data/chunk_index": chunk,
             "data/file_index": file,
@@ -242,10 +245,10 @@ class DatasetWriter:
         self._rows.clear()
 
     def _write_meta(self, videos: dict[str, dict[str, Any]], provenance: Mapping[str, Any]) -> None:
-        info = layout.info_json(self._spec, self._episodes, self._frames, self._file_sizes, videos)
+        info = layout.info_json(self._spec, self._episodes, self._frames, self._file_sizes, videos, len(self._tasks))
         layout.write_json(self._folder / layout.INFO, info)
         layout.write_json(self._folder / layout.OURS, {**self._ours, "provenance": dict(provenance)})
-        table = layout.tasks_table(self._spec.instruction)
+        table = layout.tasks_table(list(self._tasks))
         pq.write_table(table, self._folder / layout.TASKS, write_page_checksum=True)
         stats = self._stats.result() | {
             key: picture_stats(counts, self._frames) for key, counts in self._counts.items()

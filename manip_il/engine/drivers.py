@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.mdp import Actor, Policy
+from manip_il.mdp import Actor, Policy, ReadsInstructions
 from manip_il.robots.action_space import ActionSpace
 from manip_il.rollout import Driver, Turn
 from manip_il.seeding import rng_for
@@ -251,6 +251,8 @@ def _policy_actions(policy: Policy, turns: Sequence[Turn]) -> F64:
     """A policy's action in every turn, (B, n); one with a memory begins anew where an episode does."""
     if started := [turn.seed for turn in turns if turn.step == 0]:
         policy.reset(started)
+        if isinstance(policy, ReadsInstructions):
+            policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
     return policy.act(*_observations(turns, policy.cameras), [turn.seed for turn in turns])
 
 

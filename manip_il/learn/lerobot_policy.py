@@ -50,7 +50,8 @@ _SMALLEST = {"std": 1e-3, "range": 1e-2}  # [rad] or [m]: less than this in all 
 class EpisodePolicy:
     """A LeRobot policy with its processors and one memory an episode.
 
-    module: the policy without a memory of any episode. task: instruction for one that reads language.
+    module: the policy without a memory of any episode. task: instruction for one that reads language, in episodes that
+    `instruct` gives no other.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class EpisodePolicy:
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
+        self._instructions: dict[int, str] = {}
         self._memories: dict[int, tuple[PreTrainedPolicy, Iterator[int]]] = {}  # and the number of each step
 
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
@@ -82,13 +84,18 @@ class EpisodePolicy:
         """Drop the memory of these episodes."""
         for episode in episodes:
             self._memories.pop(episode, None)
+            self._instructions.pop(episode, None)
+
+    def instruct(self, instructions: Mapping[int, str]) -> None:
+        """Take the texts of episodes that begin, by their numbers."""
+        self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
         if episode not in self._memories:
             self._memories[episode] = copy.deepcopy(self.module, dict(self._shared)), itertools.count()
         policy, steps = self._memories[episode]
         with _drawing(episode, next(steps), self._device):
-            observation = self._before({**row, "task": [self._task]})
+            observation = self._before({**row, "task": [self._instructions.get(episode, self._task)]})
             # mixed precision where the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if policy.config.use_amp else contextlib.nullcontext():
                 action = policy.select_action(observation)

@@ -50,9 +50,10 @@ class LearnedPolicy:
         """Load any LeRobot `pretrained_model` folder, from JSON and safetensors alone unless `trust`.
 
         The mlp is read without LeRobot, whose import takes seconds; another policy by LeRobot's own factory. task:
-        instruction for a policy that reads language. trust: load models and code that the checkpoint names, too. Raises
-        `ManipError` for a folder that is not whole, that holds a pickle, whose files do not match, or that
-        names code to import or, without `trust`, models to load; `UnknownName` for a type of policy that is not known.
+        text for a policy that reads language, where `instruct` gives no other. trust: load models and code that the
+        checkpoint names, too. Raises `ManipError` for a folder that is not whole, that holds a pickle, whose files do
+        not match, or that names code to import or, without `trust`, models to load; `UnknownName` for a type of policy
+        that is not known.
         """
         path = Path(path)
         if device.startswith("cuda") and not torch.cuda.is_available():
@@ -105,6 +106,10 @@ class LearnedPolicy:
     def reset(self, episodes: Iterable[int]) -> None:
         """Forget the past of episodes that begin."""
         self._policy.forget(episodes)
+
+    def instruct(self, instructions: Mapping[int, str]) -> None:
+        """Take the texts of episodes that begin, by their numbers: for a policy that reads language."""
+        self._policy.instruct(instructions)
 
     @torch.inference_mode()
     def sample(self, states: F32, environment_states: F32, images: Images, rngs: Sequence[np.random.Generator]) -> F64:
@@ -224,6 +229,9 @@ class _Perceptron:
         if self._conversion.space == JOINT_TARGET:
             return targets
         return torch.from_numpy(self._conversion.decode(targets.cpu().numpy(), batch[STATE].numpy()))
+
+    def instruct(self, instructions: Mapping[int, str]) -> None:
+        """Read nothing: the mlp looks at numbers alone."""
 
     def _inputs(self, batch: Batch) -> torch.Tensor:
         return torch.cat([batch[key] for key in self._keys], dim=1).to(self._device)

@@ -21,8 +21,8 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
-from manip_il.data.lerobot_read import dataset_info, read_frames, read_table
-from manip_il.data.parquet_files import UNREADABLE, find_shards, read_tasks
+from manip_il.data.lerobot_read import dataset_info, read_frames, read_instructions, read_table
+from manip_il.data.parquet_files import UNREADABLE, find_shards
 from manip_il.errors import ManipError
 from manip_il.mcap import foxglove
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values
@@ -173,12 +173,7 @@ def _topic(key: str) -> str:
 
 
 def _read_tasks(root: Path, wanted: set[int]) -> dict[int, str]:
-    try:
-        tasks = dict(zip(*read_tasks(root), strict=True))
-    except UNREADABLE as error:
-        raise ManipError(
-            f"cannot read {root / layout.TASKS}: {error}; run `manip-il doctor` to see what is left"
-        ) from error
+    tasks = read_instructions(root)
     for number in sorted(wanted):
         if not isinstance(tasks.get(number), str):
             raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")

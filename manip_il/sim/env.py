@@ -22,6 +22,7 @@ from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
+from manip_il.tasks.task import instruction_in
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
@@ -64,7 +65,6 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
-        self.task_description = self._task.instruction
         self.task = self.config.task
         limits = np.vstack([self.scene.actions.low, self.scene.actions.high])
         limits = np.where(np.isfinite(limits), limits, np.sign(limits) * 2 * np.pi)  # a joint that turns freely
@@ -86,6 +86,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
         return self._observation(), self._info()
+
+    @property
+    def task_description(self) -> str:
+        """Text of the episode for policies that read language."""
+        return instruction_in(self._task, self.world)
 
     @property
     def scene(self) -> Scene:
@@ -181,7 +186,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         It has pictures only where the environment has cameras.
         """
         world, images = self._measured(), self._pictures(self._view) if self._view else {}
-        self._observed.append(Observation(joint_state(world), environment_state(world), images))
+        text = self.task_description
+        self._observed.append(Observation(joint_state(world), environment_state(world), images, text))
         return self._observed[0]
 
     def _measured(self) -> World:

@@ -21,6 +21,7 @@ from manip_il.data.lerobot_read import (
     dataset_info,
     read_fingerprint,
     read_frames,
+    read_instructions,
     read_provenance,
     read_spec,
     read_table,
@@ -73,6 +74,9 @@ def _rows(root: Path, info: DatasetInfo) -> Iterator[tuple[str, object]]:
     time = f"{seconds / unit:.3g} {name}"
     yield "robot", f"`{info.robot}`"
     yield "task", f"`{info.task}`: {info.instruction}"
+    texts = read_instructions(root)
+    if len(texts) > 1:
+        yield "texts", f"{len(texts)}, such as: {next(iter(texts.values()))}"
     cameras = [key.removeprefix(s.IMAGES) for key in camera_keys(root)]
     yield "cameras", ", ".join(f"`{name}`" for name in cameras) or "none: states only"
     yield "episodes", f"{info.episodes:,}"

@@ -11,6 +11,7 @@ from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
 from manip_il.tasks.task import Task
 
@@ -25,6 +26,7 @@ TASKS: dict[str, Task] = {
     "clear_table": ClearTable(),
     "insert": Insert(),
     "insert_tight": Insert("insert_tight", play=0.0005),
+    "sort": Sort(),
 }
 
 

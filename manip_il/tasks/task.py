@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
@@ -72,7 +72,7 @@ class Task(Protocol):
 
     @property
     def instruction(self) -> str:
-        """Text for policies that read language."""
+        """Text for policies that read language; a task with another one in each episode is `Instructing`, too."""
         ...
 
     @property
@@ -114,6 +114,29 @@ class Task(Protocol):
     def progress(self, world: World) -> float:
         """Return how much is done, 0 to 1; it never falls while the task is being done right."""
         ...
+
+
+@runtime_checkable
+class Instructing(Protocol):
+    """A task whose text differs from episode to episode; what is meant lives in the state, as a mocap body's pose."""
+
+    def objects_in(self, world: World) -> tuple[str, ...]:
+        """Return the objects that the text of a world's episode is about, which the arm must reach."""
+        ...
+
+    def instruction_in(self, world: World) -> str:
+        """Return the text of a world's episode."""
+        ...
+
+
+def instruction_in(task: Task, world: World) -> str:
+    """Return the text of a world's episode: the task's own sentence, unless it has another for each."""
+    return task.instruction_in(world) if isinstance(task, Instructing) else task.instruction
+
+
+def objects_in(task: Task, world: World) -> tuple[str, ...]:
+    """Return the objects that the arm must reach in a world's episode."""
+    return task.objects_in(world) if isinstance(task, Instructing) else task.objects
 
 
 def phases(task: Task) -> tuple[str, ...]:

@@ -67,6 +67,13 @@ class Diary(Wave):
         self.notes.append(("reset", list(episodes)))
 
 
+class Reader(Diary):
+    """Notes what it is told of episodes that begin, too."""
+
+    def instruct(self, instructions) -> None:
+        self.notes.append(("told", dict(instructions)))
+
+
 class Teacher:
     """An expert of one answer, which counts its queries."""
 
@@ -109,7 +116,7 @@ def run(driver, robot: str = "fetch") -> list[Episode]:
 
 def turn(seed: int = 0, step: int = 0, value: float = 0.0, teacher: Teacher | None = None) -> Turn:
     images = {name: np.full((2, 2, 3), seed + step, np.uint8) for name in ("front", "wrist")}
-    observation = Observation(np.full(3, value, np.float32), np.zeros(2, np.float32), images)
+    observation = Observation(np.full(3, value, np.float32), np.zeros(2, np.float32), images, f"do {seed}")
     return Turn(seed, step, observation, STATE, teacher)
 
 
@@ -162,6 +169,12 @@ def test_a_learner_is_told_whose_turn_it_is_and_sees_the_pictures_of_its_cameras
         ([10, 20], {"front": [11, 20]}),
         ([10], {"front": [12]}),
     ]
+
+
+def test_a_learner_that_reads_is_told_the_text_of_an_episode_as_it_begins():
+    reader = Reader()
+    LearnerDriver(reader).act([turn(10, 0), turn(20, 4)])
+    assert reader.notes[:2] == [("reset", [10]), ("told", {10: "do 10"})]
 
 
 @pytest.mark.parametrize("driver", [ExpertDriver(), MixtureDriver(Wave(), 1.0)])

@@ -113,8 +113,12 @@ def test_the_task_in_words_reaches_the_policy(act, monkeypatch):
         return torch.zeros(1, 4)
 
     monkeypatch.setattr("lerobot.policies.act.modeling_act.ACTPolicy.select_action", select_action)
-    LearnedPolicy.load(act, task="put it there").act(*observations(STEPS, 0))
+    policy = LearnedPolicy.load(act, task="put it there")
+    policy.act(*observations(STEPS, 0))
     assert tasks == [["put it there"]] * STEPS
+    policy.instruct({1: "no, here"})
+    policy.act(*observations(2, 0))
+    assert tasks[STEPS:] == [["put it there"], ["no, here"]]
 
 
 def test_a_policy_of_mixed_precision_acts_in_it(act):

@@ -1,0 +1,247 @@
+"""Sort: of three cubes, the one that the instruction names into the bin of its colour."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import World
+from manip_il.tasks.bins import LIFT, LIFT_SLOPE, OVER, WALL, add_bin, drop_place, drop_rungs, is_in
+from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
+from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
+from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
+from manip_il.tasks.pick_place import observe_object
+from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.starts import FROM_HAND, UPRIGHT, draw_until, draw_yaw, resting_height
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+COLOURS = {"red": RED, "blue": BLUE, "yellow": YELLOW}
+BINS = {name: f"{name}_bin" for name in COLOURS}
+ASKED = "asked"  # a mocap body that is nowhere seen: x is the number of the cube, z that of the sentence
+SENTENCES = (
+    "Put the {colour} cube into the {colour} bin.",
+    "Sort the {colour} cube into its bin.",
+    "Place the {colour} cube in the bin of the same colour.",
+    "Move only the {colour} cube to where it belongs.",
+    "The {colour} cube goes into the {colour} bin.",
+)
+INSIDE = (0.046, 0.068)  # half a bin's inner length and width [m]
+PITCH = 0.105  # of the bins, which stand in a row away from the robot [m]
+SIDE = 0.19  # of the row from the workspace's middle, left or right [m]
+SHIFT = 0.08  # of everything from the workspace's middle, at most, to where the arm reaches farthest around [m]
+HALF = 0.018  # of a cube's edge [m]
+APART = 0.085  # of the cubes at the start [m]
+FROM_BINS = 0.14  # of a cube from the row's middle at the start, sideways [m]
+BEYOND = 0.15  # of a cube at most from the workspace's middle on the side without bins [m]
+LOWER = 0.04  # of a carried cube than over a deeper box: what falls from there does not fly far [m]
+STEP = 0.1  # how far ahead of the hand its target runs while it carries: soon there, it loses less on the way [m]
+SLOPE = 5.0  # of the way around other bins: distance from the row per distance along it
+NEAR_WALL = 0.045  # of a cube from a wall that a finger has no room at [m]
+NARROW = 0.024  # opening beyond a cube's width where it lies in a bin [m]
+TURNED = 0.3  # of the hand from such a grasp: it stays over the cube until it has turned [rad]
+AWAY = 0.2  # of the hand over the bin once the cube is in it [m]
+_HIGH = 0.04  # of a cube over a bin's walls where it is carried across them [m]
+_WRONG = 0.1  # what another cube in a bin counts for as an error [m]
+
+
+def asked(world: World) -> str:
+    """Return the name of the cube that the instruction names."""
+    return world.remember(ASKED, lambda: _named(round(float(world.pose(ASKED).position[0]))))
+
+
+def _named(number: int) -> str:
+    return list(COLOURS)[min(max(number, 0), len(COLOURS) - 1)]
+
+
+def _is_sorted(world: World, name: str) -> bool:
+    return name == asked(world) and is_in(world, name, BINS[name], INSIDE)
+
+
+def _wrong(world: World) -> int:
+    """How many cubes that are to be left alone are in a bin."""
+    others = [name for name in COLOURS if name != asked(world)]
+    return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
+
+
+def _place(world: World) -> F64:
+    """Where the named cube is let go, over its bin, (3,) [m]."""
+    return drop_place(world, asked(world), BINS[asked(world)]) - [0.0, 0.0, LOWER]
+
+
+def _to(world: World) -> F64:
+    """Where the named cube is let go, or beside it, off the bins, while it would be over another's."""
+    name = asked(world)
+    place = _place(world)
+    along = abs(place[0] - world.pose(name).position[0])
+    inwards = math.copysign(1.0, world.scene.robot.workspace.centre[1] - place[1])
+    return place + [0.0, inwards * min(FROM_BINS, SLOPE * max(0.0, along - INSIDE[0] / 2)), 0.0]
+
+
+def _carry_progress(world: World) -> float:
+    """Progress by the way that is left around the other bins, and by the height that is missing on it, 0 to 1."""
+    along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
+    lift = min(LIFT, LIFT_SLOPE * max(0.0, math.hypot(along, across) - INSIDE[0]))
+    return nearness(abs(along) + abs(across) + max(0.0, up + lift))
+
+
+def _other_held(world: World) -> str:
+    """The cube in the hand that is to be left alone; empty for none."""
+    return next((name for name in COLOURS if name != asked(world) and held(world, name)), "")
+
+
+def _put_back(world: World) -> Target:
+    """Bring a wrong cube off the bins, lower it to the table and open the fingers."""
+    name = _other_held(world) or asked(world)
+    at, ee = world.pose(name).position, world.ee.position
+    low = at[2] - lie_of(world, name).tall / 2
+    centre, row = world.scene.robot.workspace.centre[1], world.pose(BINS[name]).position[1]
+    inwards = FROM_BINS - abs(at[1] - row)  # still to go until it is off the bins
+    if inwards <= 0:
+        return Target(ee - [0.0, 0.0, max(0.0, low)], hand_down(0.0), CLOSED if low > 0.008 else world.most_opening)
+    missing = WALL + _HIGH - low
+    sideways = min(1.0, max(0.0, 1.0 - missing / 0.03)) * math.copysign(inwards + 0.02, centre - row)
+    return Target(ee + [0.0, sideways, missing], hand_down(0.0), CLOSED)
+
+
+def _free_yaw(world: World) -> float | None:
+    """Yaw at which walls leave room for the fingers, modulo half a turn [rad]; None where there is room all around."""
+    name = asked(world)
+    x, y = world.pose(name).position[:2].tolist()
+    row = [world.pose(one).position for one in BINS.values()]
+    off = abs(y - row[0][1])
+    beyond = max(min(float(at[0]) for at in row) - x, x - max(float(at[0]) for at in row)) - PITCH / 2
+    if off > INSIDE[1] + NEAR_WALL or beyond > NEAR_WALL:
+        return None
+    return 0.0 if beyond > 0.0 or off < INSIDE[1] - NEAR_WALL else math.pi / 2
+
+
+def _approach(world: World) -> Target:
+    """As any cube is approached, but with the fingers where no wall is in their way."""
+    target, free = approach(world, asked(world), OVER), _free_yaw(world)
+    if free is None:
+        return target
+    ee, g = world.ee, grasp_of(world, asked(world))
+    hand = math.atan2(ee.rotation[1, 0], ee.rotation[0, 0])
+    yaw = min((one for one, _, _ in lie_of(world, asked(world)).grasps),
+              key=lambda one: (round(abs(math.sin(one - free)), 6), abs(one - hand)))  # fmt: skip
+    low = g.at[2] + g.half + CLEAR if angle_from_down(ee.rotation, yaw) > TURNED else 0.0
+    position = np.array([*target.position[:2], max(target.position[2], low)])
+    return Target(position, hand_down(yaw), g.width + NARROW)
+
+
+def _middle(world: World) -> tuple[float, float]:
+    """Where cubes and bins are around [m]: what falls from the hand shall fall where it can be picked up."""
+    x, y = world.scene.robot.workspace.centre
+    line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
+    shifts = [
+        shift
+        for shift in np.arange(-0.35, 0.35, 0.025).tolist()
+        if all(world.reach.has((x + shift, y + across, height)) for across, height in line)
+    ]
+    middle = (shifts[0] + shifts[-1]) / 2 if shifts else 0.0
+    return x + min(SHIFT, max(-SHIFT, middle)), y
+
+
+def _draw_place(rng: np.random.Generator, world: World, name: str, side: float) -> F64:
+    """Draw where a cube rests, (3,) [m], off the bins on a side (-1 or 1)."""
+    (x, y), wide = _middle(world), world.scene.robot.workspace.half_width
+    along, across = rng.uniform(-1, 1) * wide, side * rng.uniform(-BEYOND, SIDE - FROM_BINS)
+    return np.array([x + along, y + across, resting_height(world, name)])
+
+
+def _rise(world: World) -> Target:
+    return Target(world.pose(BINS[asked(world)]).position + [0.0, 0.0, AWAY], hand_down(0.0), world.most_opening)
+
+
+_LET_GO, _CARRY = drop_rungs(asked, _to, _is_sorted, tuple(COLOURS))
+_GRASP, *_APPROACH = grasp_rungs(asked, OVER)
+_RUNGS = (
+    _LET_GO,
+    Rung("done", "the cube is in its bin", lambda w: _is_sorted(w, asked(w)), _rise),
+    replace(_CARRY, target=lambda w: _CARRY.target(w)._replace(max_step=STEP)),
+    Rung("put_back", "another cube is in the hand", lambda w: bool(_other_held(w)), _put_back),
+    _GRASP,
+    *(replace(rung, target=_approach) for rung in _APPROACH),
+)
+_LIMITS = Limits(tolerance=0.005, horizon=250)
+
+
+@dataclass(frozen=True)
+class Sort:
+    """Put the cube that the instruction names into the bin of its colour, and leave the others on the table."""
+
+    name: str = "sort"
+    instruction: str = "Put the cube that is named into the bin of its colour."
+    limits: Limits = _LIMITS
+    objects: tuple[str, ...] = tuple(COLOURS)
+    grasped: tuple[str, ...] = tuple(COLOURS)
+    rungs: tuple[Rung, ...] = _RUNGS
+
+    def instruction_in(self, world: World) -> str:
+        """Return the sentence of a world's episode."""
+        number = round(float(world.pose(ASKED).position[2])) % len(SENTENCES)
+        return SENTENCES[number].format(colour=asked(world))
+
+    def objects_in(self, world: World) -> tuple[str, ...]:
+        """Return the cube that is named: the others may lie where the arm does not reach."""
+        return (asked(world),)
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the cubes, a bin for each, and what holds which one is named."""
+        for name, colour in COLOURS.items():
+            add_cube(spec, name, HALF, 0.05, colour)
+            add_bin(spec, BINS[name], INSIDE, colour)
+        add_furniture(spec, ASKED).pos = [0, 0, 0]
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw the sentence, on which side the bins stand and in which order, and the cubes, apart, at any yaw."""
+        number, sentence = float(rng.integers(len(COLOURS))), float(rng.integers(len(SENTENCES)))
+        poses: dict[str, tuple[F64, F64]] = {ASKED: (np.array([number, 0.0, sentence]), UPRIGHT)}
+        (x, y), hand = _middle(world), world.scene.robot.workspace.centre
+        side = rng.choice([-1.0, 1.0])
+        for place, name in enumerate(rng.permutation(list(BINS.values())).tolist()):
+            poses[name] = np.array([x + PITCH * (place - 1), y + side * SIDE, 0.0]), UPRIGHT
+        for name in COLOURS:
+            others = [poses[other][0] for other in COLOURS if other in poses]
+
+            def fits(at: F64, others: list[F64] = others) -> bool:
+                from_hand = math.dist(at[:2], hand) > FROM_HAND
+                return from_hand and world.reach.has(at) and all(math.dist(at, other) > APART for other in others)
+
+            at = draw_until(lambda name=name: _draw_place(rng, world, name, side), fits, world, name)
+            poses[name] = at, draw_yaw(rng)
+        return Start(poses)
+
+    def observe(self, world: World) -> Observed:
+        """Return which cube is named, that one and the way to its bin; hand, and where every cube and bin is."""
+        name = asked(world)
+        return {
+            **observe_hand(world),
+            **{f"{ASKED}.{other}": float(other == name) for other in COLOURS},
+            **{key.replace(name, "cube", 1): value for key, value in observe_object(world, name).items()},
+            "bin_from_cube": world.pose(BINS[name]).position - world.pose(name).position,
+            "place_from_cube": _to(world) - world.pose(name).position,
+            **{other: world.pose(other).position for other in COLOURS},
+            **{one: world.pose(one).position for one in BINS.values()},
+        }
+
+    def error(self, world: World) -> float:
+        """Return how far the named cube is from its bin's middle [m], 0 in it; more where another is in a bin."""
+        name = asked(world)
+        off = math.dist(world.pose(name).position, world.pose(BINS[name]).position)
+        return (0.0 if _is_sorted(world, name) else off) + _WRONG * _wrong(world)
+
+    def progress(self, world: World) -> float:
+        """Return progress of grasping the named cube and bringing it to its bin."""
+        name = asked(world)
+        if _is_sorted(world, name):
+            return 1.0 if not _wrong(world) else 0.95
+        if held(world, name):
+            return 0.5 + 0.4 * _carry_progress(world)
+        return 0.45 * grasp_progress(world, name)

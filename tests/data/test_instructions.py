@@ -1,0 +1,96 @@
+"""Episodes that each have a text of their own: what a dataset makes of them, and everything that reads it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.build import build, merge_datasets
+from manip_il.data.journal import read_episode, write_episode
+from manip_il.data.lerobot_read import dataset_info, read_episodes, read_table
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.doctor.examine import examine_folder, has_errors
+from manip_il.errors import ManipError
+from manip_il.mcap.export import export_dataset, open_source
+from manip_il.mdp import Episode
+from manip_il.store.card_dataset import dataset_fields
+
+from ..mcap.use import decoded
+
+RED, BLUE = "Put the red cube into its bin.", "Put the blue cube into its bin."
+TEXTS = [RED, BLUE, RED]
+
+
+@pytest.fixture
+def told(episodes: list[Episode]) -> list[Episode]:
+    return [replace(episode, instruction=text) for episode, text in zip(episodes, TEXTS, strict=True)]
+
+
+@pytest.fixture
+def root(tmp_path: Path, told: list[Episode], spec: s.RobotTaskSpec) -> Path:
+    write_dataset(told, tmp_path / "data", spec, repo_id="local/data", fingerprint={})
+    return tmp_path / "data"
+
+
+def texts(root: Path) -> list[str]:
+    return [episode.instruction for episode in read_episodes(root)]
+
+
+def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):
+    table = pq.read_table(root / layout.TASKS)
+    assert table.to_pydict() == {"task_index": [0, 1], "task": [RED, BLUE]}
+    assert json.loads((root / layout.INFO).read_text())["total_tasks"] == 2
+    assert read_table(root, ["task_index"])["task_index"].tolist() == [0] * 7 + [1] + [0] * 12
+    rows = pq.read_table(next(root.glob(layout.EPISODES_FILES)), columns=["tasks"]).column("tasks").to_pylist()
+    assert rows == [[text] for text in TEXTS]
+    assert texts(root) == TEXTS
+    assert dataset_info(root).instruction == spec.instruction
+
+
+def test_an_episode_without_a_text_has_the_specs(tmp_path, episodes, spec):
+    write_dataset(episodes, tmp_path / "data", spec, repo_id="local/data", fingerprint={})
+    assert texts(tmp_path / "data") == [spec.instruction] * 3
+
+
+def test_journals_keep_the_text_and_build_the_same_dataset(tmp_path, told, spec, root):
+    paths = [write_episode(tmp_path / "journals", episode, spec, {}) for episode in told]
+    assert [read_episode(path).instruction for path in paths] == TEXTS
+    build(tmp_path / "journals", tmp_path / "built")
+    assert texts(tmp_path / "built") == TEXTS
+    for name in (layout.TASKS, layout.INFO):
+        assert (tmp_path / "built" / name).read_bytes() == (root / name).read_bytes()
+
+
+def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
+    write_dataset(told[1:], tmp_path / "other", spec, repo_id="local/other", fingerprint={})
+    merge_datasets([tmp_path / "other", root], tmp_path / "merged", repo_id="local/merged")
+    assert texts(tmp_path / "merged") == [BLUE, RED, *TEXTS]
+    assert pq.read_table(tmp_path / "merged" / layout.TASKS)["task"].to_pylist() == [BLUE, RED]
+
+
+def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tmp_path, root):
+    assert not has_errors(examine_folder(root))
+    for path, text in zip(export_dataset(open_source(root), tmp_path), TEXTS, strict=True):
+        assert {message.message for topic, _, message in decoded(path.read_bytes()) if topic == "/task"} == {text}
+    assert dict(dataset_fields(root, "someone/data")[1]["rows"])["texts"] == f"2, such as: {RED}"
+
+
+def test_a_number_without_a_text_is_an_error(root):
+    pq.write_table(layout.tasks_table([RED]), root / layout.TASKS)
+    with pytest.raises(ManipError, match=r"rows have the task 1, which meta/tasks\.parquet does not hold"):
+        texts(root)
+
+
+def test_lerobot_loads_every_frame_with_its_text(root):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("local/data", root=root)
+    rows: list[Any] = [dataset[row] for row in (0, 7, 8, 19)]
+    assert [row["task"] for row in rows] == [RED, BLUE, RED, RED]

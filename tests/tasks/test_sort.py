@@ -1,0 +1,110 @@
+"""Sort: what is named is a function of the state, in words and in numbers, and the other cubes are left alone."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.expert import Expert
+from manip_il.mdp import State
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.world import World
+from manip_il.tasks.sort import BINS, COLOURS, SENTENCES, asked
+from manip_il.tasks.starts import UPRIGHT
+from manip_il.tasks.table import TASKS
+from manip_il.tasks.task import instruction_in, phases
+
+from ..scenes import SEED, drive_until, started
+from ..tables import every_robot
+
+STARTS = range(SEED, SEED + 100)
+
+
+@cache
+def starts() -> list[tuple[str, str, State]]:
+    env, found = ManipEnv("panda", "sort"), []
+    for seed in STARTS:
+        env.start(seed)
+        found.append((asked(env.world), env.task_description, env.get_state()))
+    return found
+
+
+def others(world: World) -> list[str]:
+    return [name for name in COLOURS if name != asked(world)]
+
+
+def test_every_cube_is_named_in_every_sentence():
+    assert {text for _, text, _ in starts()} == {text.format(colour=colour) for text in SENTENCES for colour in COLOURS}
+    assert all(name in text for name, text, _ in starts())
+
+
+def test_a_restored_state_says_the_same_in_words_and_numbers():
+    env, names = ManipEnv("panda", "sort"), environment_state_names(started(task="sort").scene)
+    for name, text, state in starts()[:20]:
+        env.set_state(State.from_vector(state.to_vector()))
+        seen = env.observe()
+        assert (asked(env.world), seen.instruction, env.task_description) == (name, text, text)
+        numbers = dict(zip(names, seen.environment_state.tolist(), strict=True))
+        assert [numbers[f"asked.{colour}"] for colour in COLOURS] == [colour == name for colour in COLOURS]
+        cube, bin_at = (env.world.pose(one).position for one in (name, BINS[name]))
+        np.testing.assert_allclose(
+            [numbers[f"cube_from_ee.{axis}"] for axis in "xyz"], cube - env.world.ee.position, atol=1e-6
+        )
+        np.testing.assert_allclose(numbers["bin_from_cube.x"], bin_at[0] - cube[0], atol=1e-6)
+
+
+@every_robot
+def test_an_episodes_text_is_that_of_its_state(robot: str):
+    world = started(robot, "sort").world
+    for episode in run_job(RolloutJob(EnvConfig(robot, "sort", horizon=6), "expert"), STARTS[:3]):
+        state = State.from_vector(episode.columns["sim_state"][-1])
+        world.restore(state.physics, state.variation)
+        assert episode.instruction == instruction_in(TASKS["sort"], world)
+
+
+@every_robot
+def test_the_cube_that_is_named_ends_in_its_bin_and_the_others_where_they_were(robot: str):
+    env = started(robot, "sort")
+    expert, before = Expert(env.scene), {name: env.world.pose(name).position.copy() for name in COLOURS}
+    while not env.solved:
+        assert env.get_state().step < env.config.horizon
+        env.advance(expert.label(env.get_state()).action)
+    for name in others(env.world):
+        np.testing.assert_allclose(env.world.pose(name).position, before[name], atol=1e-3)
+    wrong = others(env.world)[0]
+    env.world.place(wrong, env.world.pose(BINS[wrong]).position + [0.0, 0.0, 0.03], UPRIGHT)
+    env.world.update()
+    assert env.distance() > env.config.tolerance
+    assert env.progress < 1
+
+
+def test_a_cube_that_is_not_named_may_be_anywhere():
+    env = started(task="sort")
+    env.world.place(others(env.world)[0], np.array([-2.0, 0.0, -0.3]), UPRIGHT)
+    assert Expert(env.scene).label(env.get_state()).valid
+    env.world.place(asked(env.world), np.array([-2.0, 0.0, -0.3]), UPRIGHT)
+    assert Expert(env.scene).label(env.get_state()).reason == f"{asked(env.world)} off the table"
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_cube_that_is_not_named_is_put_back(number: int):
+    env = started(task="sort")
+    drive_until(env, "carry")
+    held, names = asked(env.world), phases(TASKS["sort"])
+    for _ in range(8):
+        env.advance(Expert(env.scene).label(env.get_state()).action)
+    now = (list(COLOURS).index(held) + number) % len(COLOURS)
+    env.world.place("asked", np.array([float(now), 0.0, 0.0]), UPRIGHT)
+    env.world.update()
+    expert = Expert(env.scene)
+    assert names[expert.label(env.get_state()).phase] == "put_back"
+    for _ in range(env.config.horizon):
+        env.advance(expert.label(env.get_state()).action)
+        if env.solved:
+            break
+    assert env.solved
+    assert env.world.pose(held).position[2] == pytest.approx(0.018, abs=0.002)
