@@ -54,7 +54,7 @@ class Source:
     @property
     def env(self) -> EnvConfig:
         """An environment that its states fit."""
-        return EnvConfig(self.spec.robot, self.spec.task)
+        return EnvConfig(self.spec.robot, self.spec.task, object=self.spec.object)
 
 
 def open_source(root: Path) -> Source:
@@ -72,7 +72,7 @@ def open_source(root: Path) -> Source:
                 f"{root} is for the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
                 "so its states cannot be rendered"
             )
-    env = EnvConfig(spec.robot, spec.task)
+    env = EnvConfig(spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
     if spec.sim_state_size != size:
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)

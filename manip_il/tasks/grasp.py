@@ -29,6 +29,7 @@ PREFER_ZERO = 0.3  # weight of a grasp's own yaw against its distance from the h
 WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a metre narrower [rad/m]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
+_BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
 class Lie(NamedTuple):
@@ -78,6 +79,11 @@ class Grasp(NamedTuple):
 def grasp_of(world: World, name: str) -> Grasp:
     """Return the pose of an object relative to the hand; computed once a state."""
     return world.remember(("grasp", name), partial(_grasp, world, name))
+
+
+def is_cube(world: World, name: str) -> bool:
+    """Return whether an object is a box with equal edges."""
+    return world.kind(name) == _BOX and len(set(world.extents(name))) == 1
 
 
 def lie_of(world: World, name: str) -> Lie:
@@ -130,10 +136,10 @@ def _nearest(grasps: Sequence[tuple[float, float, float]], hand: F64, widest: fl
 
 
 def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
-    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
+    if kind == _BOX:
         return _box_lie(rotation, extents)
     width, _, length = extents
-    if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
+    if kind == _SPHERE:
         return Lie(((0.0, width, width),), width, 0.0, 0)
     ahead, left, up = rotation[:, 2].tolist()
     if abs(up) > math.sqrt(0.5):
