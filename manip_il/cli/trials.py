@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import manip_il
 from manip_il.cli.progress import Stages, warn
@@ -143,6 +143,31 @@ def suite_conditions(suite: str, task: str, shape: str = "", *, sees: bool) -> t
         blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
     return tuple(left)
+
+
+def vary_option() -> Any:
+    """Return the field of `--vary`."""
+    words = (
+        "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
+    )
+    return option(list, words)
+
+
+def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
+    """Return what `--vary` names as one condition, from which every episode draws; none for no names.
+
+    Raises `UnknownName` for another name, `UsageError` for what is no YAML of ranges or changes nothing here.
+    """
+    from manip_il.sim.conditions import merged
+
+    if not names:
+        return ()
+    if odd := next((name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None):
+        raise UnknownName("--vary", odd, CONDITIONS[1:])
+    kept = for_task(merged([read_condition(name) for name in names]), env.task, env.object, sees=sees)
+    if kept is None:
+        raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+    return (kept,)
 
 
 def for_task(condition: Condition, task: str, shape: str = "", *, sees: bool) -> Condition | None:

@@ -128,6 +128,12 @@ class Drawn:
         return float(self.values.get(name, default))
 
 
+def merged(conditions: Sequence[Condition]) -> Condition:
+    """Return the condition that has the ranges of all, named after them; a later one's count where two have one."""
+    ranges = {name: range_ for condition in conditions for name, range_ in condition.ranges.items()}
+    return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
+
+
 def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
     """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal."""
     return (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)

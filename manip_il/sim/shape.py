@@ -9,6 +9,7 @@ from manip_il.errors import UnknownName, UsageError, shorten
 
 SHORTEST, LONGEST = 0.02, 0.12  # of an object's lengths [m]
 DEFAULT_WIDTH = 0.05  # where none is said [m]
+LIGHTEST = 0.05  # [kg]: a fingertip's contact with less is soft, and what is held creeps out of the hand
 DENSITY = 800.0  # [kg/m^3]: a cube of 5 cm has 0.1 kg
 _CAPSULE = 1.5  # length of a capsule whose length is not said, in diameters
 _SIZES = {
@@ -85,18 +86,19 @@ class Shape:
             "sphere": ball,
             "capsule": round_ * (length - width) + ball,
         }
-        return DENSITY * volumes[self.kind]
+        return max(LIGHTEST, DENSITY * volumes[self.kind])
 
     @property
     def word(self) -> str:
-        """What it is called in an instruction."""
+        """Name of it in an instruction."""
         return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
 
     @property
-    def sizes(self) -> tuple[float, float]:
-        """Greatest lengths between which it may be scaled and still be grasped, however it lies [m]."""
+    def sizes(self) -> tuple[float, float] | None:
+        """Greatest lengths between which it may be scaled and still be grasped, however it lies [m]; None for none."""
         least, between, most = sorted(self.lengths)
-        return most * _THINNEST / least, most * min(_WIDEST / between, LONGEST / most)
+        low, high = most * _THINNEST / least, most * min(_WIDEST / between, LONGEST / most)
+        return (low, high) if low < high else None
 
 
 def _lengths(kind: str, first: float, second: float | None = None, *rest: float) -> tuple[float, float, float]:
@@ -110,4 +112,4 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
 
 
 _THINNEST, _WIDEST = 0.02, 0.07  # of a scaled object: its least length, and the one between the fingers at most [m]
-CUBE = Shape("box", (DEFAULT_WIDTH,) * 3)
+CUBE = Shape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

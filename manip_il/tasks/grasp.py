@@ -33,7 +33,7 @@ _BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 class Lie(NamedTuple):
-    """How an object lies.
+    """Ways to grasp an object as it lies.
 
     grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
     for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how

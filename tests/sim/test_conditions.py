@@ -69,7 +69,10 @@ def test_only_mass_size_and_friction_change_the_model():
 def test_what_nobody_notices_is_left_out():
     assert VIEW.for_world(has_object=True, sees=False, sizes=(0.03, 0.07)) is None
     assert OBJECT.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) is None
-    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.03, 0.07)).ranges == {"mass": (0.05, 0.3), "size": (0.04, 0.06)}
+    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.03, 0.07)).ranges == {
+        "mass": (0.05, 0.3),
+        "size": (0.04, 0.06),
+    }
     assert KNOCKED.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)).ranges == {"action_noise": (0.1, 0.1)}
     assert NOMINAL.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)) == NOMINAL
     assert VIEW.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) == VIEW
