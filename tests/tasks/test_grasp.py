@@ -86,7 +86,10 @@ def test_what_is_observed_changes_steadily_with_the_yaw(shape: str, yaw: float, 
 
 
 def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
-    assert len(environment_state_names(ManipEnv().scene)) == len(environment_state_names(world_of("sphere:0.04").scene)) - 3
+    assert (
+        len(environment_state_names(ManipEnv().scene))
+        == len(environment_state_names(world_of("sphere:0.04").scene)) - 3
+    )
     cube = [name for name in environment_state_names(ManipEnv(object="box:0.03").scene) if name.startswith(OBJECT)]
     assert cube == [name for name in environment_state_names(ManipEnv().scene) if name.startswith(OBJECT)]
     assert {"object.folds", "object.width", "object.length", "object.height"} < set(
@@ -118,7 +121,9 @@ def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, 
         assert max(yaws) - min(yaws) > 1.8 * math.pi * 0.9
 
 
-@pytest.mark.parametrize("shape", ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06"])
+@pytest.mark.parametrize(
+    "shape", ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06"]
+)
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 def test_the_expert_brings_any_shape_to_its_goal(task: str, shape: str):
     job = RolloutJob(EnvConfig(task=task, object=shape), "expert", hold=0)
