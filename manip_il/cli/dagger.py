@@ -26,7 +26,7 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import varied, vary_option
+from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import MLP_STEPS, FitConfig
 from manip_il.option import option, option_of
@@ -72,7 +72,7 @@ class DaggerOptions(common.EnvOptions):
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
-    vary: list[str] = vary_option()
+    vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
     refit_steps: int | None = option_of(RunConfig, "refit_steps")

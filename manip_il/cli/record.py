@@ -18,7 +18,7 @@ from manip_il.cli.outputs import (
     save_options,
 )
 from manip_il.cli.progress import Stages, progress, say, warn
-from manip_il.cli.trials import varied, vary_option
+from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
@@ -64,7 +64,7 @@ class RecordOptions(common.EnvOptions):
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
-    vary: list[str] = vary_option()
+    vary: list[str] = option(list, VARY_HELP)
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
     workers: int | None = common.workers_option()

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import manip_il
 from manip_il.cli.progress import Stages, warn
@@ -33,6 +33,9 @@ SUITES = {
 }
 CONDITIONS = SUITES["all"]
 _YAML = (".yaml", ".yml")
+VARY_HELP = (
+    "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
+)
 SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
 
 
@@ -143,14 +146,6 @@ def suite_conditions(suite: str, task: str, shape: str = "", *, sees: bool) -> t
         blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
     return tuple(left)
-
-
-def vary_option() -> Any:
-    """Return the field of `--vary`."""
-    words = (
-        "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
-    )
-    return option(list, words)
 
 
 def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:

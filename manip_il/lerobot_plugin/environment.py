@@ -41,8 +41,8 @@ class ManipILEnv(EnvConfig):
 
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode: `none`
-    leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode:
+    `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """

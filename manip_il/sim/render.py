@@ -32,7 +32,8 @@ def pictures(
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    shape: of the task's object, as `EnvConfig.object`. A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
+    shape: of the task's object, as `EnvConfig.object`. A picture depends on `qpos`, the goal and what the episode draws
+    alone: it has the same bytes in any order.
     Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(robot, task, cameras.look, shape)
