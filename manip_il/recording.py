@@ -131,8 +131,13 @@ def record(
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:
-    """Return a job's driver, round and labels, as datasets name them."""
-    source = {"driver": job.driver, "round": job.round, "beta": job.beta}
+    """Return a job's driver, round and labels, as datasets name them, and the ranges that its episodes draw from.
+
+    An episode's draws follow from these and its seed, by `Condition.draw`.
+    """
+    source: dict[str, Any] = {"driver": job.driver, "round": job.round, "beta": job.beta}
+    if job.conditions:
+        source["vary"] = [condition.to_json() for condition in job.conditions]
     if job.driver not in ("policy", "mixture"):
         return source
     steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}

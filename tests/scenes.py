@@ -18,6 +18,12 @@ SEED = 5_000_000
 SIZES = Condition("sizes", size=(0.03, 0.07), mass=(0.05, 0.3))
 
 
+def sizes_of(task: str) -> list[Condition]:
+    """The other sizes and masses that a task can take."""
+    varied = SIZES.for_world(has_object=bool(TASKS[task].objects), sees=False, sizes=TASKS[task].sizes)
+    return [] if varied is None else [varied]
+
+
 def started(robot: str = "panda", task: str = "pick_place", seed: int = SEED, **settings: Any) -> ManipEnv:
     env = ManipEnv(robot, task, **settings)
     env.start(seed)

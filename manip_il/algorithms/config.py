@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     from numpy.typing import NDArray
 
     from manip_il.engine.drivers import QueryRule
+    from manip_il.sim.conditions import Condition
 
     F64 = NDArray[np.float64]
 
@@ -149,6 +150,7 @@ class RunConfig:
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
     many steps after success. disturbed_share: of a round's learner rollouts that run under
     `manip_il.sim.events.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
+    conditions: what the worlds of all episodes differ in, validation's too.
     """
 
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -175,6 +177,7 @@ class RunConfig:
         0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
     )
     cameras: CameraConfig | None = None
+    conditions: tuple[Condition, ...] = ()
     seed: int = 0
     datasets: tuple[Path, ...] = ()
     start: Path | None = None

@@ -94,5 +94,5 @@ def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
     """Return how often each frame of the datasets is drawn, (N,); None where all are alike."""
     if config.sampling.is_even:
         return None
-    scale = build_scene(config.env.robot, config.env.task).actions.scale
+    scale = build_scene(config.env.robot, config.env.task, config.env.object).actions.scale
     return config.sampling.weights(read_tables(roots, COLUMNS), scale)

@@ -41,7 +41,8 @@ from manip_il.learn.checkpoint import PRETRAINED_MODEL
 from manip_il.mdp import Episode
 from manip_il.recording import MAX_TRIES, Collected, check_journals, collect, collect_successes, provenance, record
 from manip_il.seeding import stream_seeds
-from manip_il.sim.events import STANDARD
+from manip_il.sim.conditions import NOMINAL
+from manip_il.sim.events import standard_in
 
 _LOG = logging.getLogger(__name__)
 BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "journals", "policy"
@@ -98,7 +99,7 @@ class Run:
         """Record a round's episodes, successful or not, with the expert's labels as `config.label` has them.
 
         query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
-        `STANDARD`.
+        `STANDARD` as well.
         """
         config, rule = self.config, query or QueryRule()
         count, per_state = config.episodes_per_round, config.label == "per_state"
@@ -180,7 +181,8 @@ class Run:
     def _job(self, round_: int) -> RolloutJob:
         """The expert's rollouts."""
         config = self.config
-        return RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
+        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
+        return replace(job, conditions=config.conditions)
 
     def _left(self, round_: int) -> int | None:
         """Labels that may still be had in a round; None where there is no limit."""
@@ -193,8 +195,9 @@ class Run:
         """A round's episodes, of which the first `disturbed` are."""
         seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
         journals, on_episode = self._folder(job.round) / JOURNALS, self._watch.on_episode
+        hard = replace(job, conditions=(standard_in(job.conditions),))
         return itertools.chain(
-            collect(self._engine, replace(job, conditions=(STANDARD,)), seeds[:disturbed], journals, on_episode),
+            collect(self._engine, hard, seeds[:disturbed], journals, on_episode),
             collect(self._engine, job, seeds[disturbed:], journals, on_episode),
         )
 
@@ -249,9 +252,10 @@ class Run:
     def _evaluate(self, policy: Fitted, path: Path) -> EvalResult:
         config = self.config
         job = RolloutJob(config.env, "policy", policy=policy.path, label="last", hold=config.hold)  # solved is solved
-        job = replace(job, trust=config.fit.trust)
+        job = replace(job, trust=config.fit.trust, conditions=config.conditions)
         seeds = stream_seeds("validation", config.validation_episodes, config.seed)
-        result = evaluate(self._engine, job, seeds, f"DAgger round {policy.round}", self._watch.on_episode)
+        suite, name = next((one.name for one in job.conditions), NOMINAL.name), f"DAgger round {policy.round}"
+        result = evaluate(self._engine, job, seeds, name, self._watch.on_episode, suite=suite)
         result.write(path)
         return result
 

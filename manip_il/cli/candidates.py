@@ -8,13 +8,14 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manip_il.cli.common_options import EnvGroup
+from manip_il.cli.common_options import EnvGroup, MaybeTaskGroup
 from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
 from manip_il.cli.inputs import find_policy, hub_hint
 from manip_il.cli.outputs import CONFIG_FILE, read_jsonl
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages
 from manip_il.cli.trials import Trial
+from manip_il.data.schema import OWN_OBJECT
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.comparison import Member
 from manip_il.evaluation.results import FILE_NAME, EvalResult
@@ -137,7 +138,7 @@ def limit_of(rule: Rule, sources: Iterable[Source]) -> float | None:
     return budget(rule, [source.history for source in sources])
 
 
-def common_env(sources: Sequence[Source], group: EnvGroup, robot: str | None, task: str | None) -> EnvConfig:
+def common_env(sources: Sequence[Source], group: EnvGroup, robot: str | None, task: MaybeTaskGroup) -> EnvConfig:
     """Return the environment that all are tested in: the runs' own, else `--env.*` with the policies' robot and task.
 
     Raises `MismatchError` naming the first setting in which two differ.
@@ -154,6 +155,8 @@ def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) ->
     """Raise `MismatchError` naming the first field that differs."""
     for field in fields(env):
         ours, theirs = getattr(env, field.name), getattr(other, field.name)
+        if field.name == "object":
+            ours, theirs = ours or OWN_OBJECT, theirs or OWN_OBJECT
         if ours != theirs:
             raise MismatchError(field.name, left, ours, right, theirs)
 
@@ -207,15 +210,16 @@ def _run_options(folder: Path) -> DaggerOptions | None:
 
 
 def _policy_env(
-    source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: str | None
+    source: Source, run: EnvConfig | None, group: EnvGroup, robot: str | None, task: MaybeTaskGroup
 ) -> EnvConfig:
     """Return the environment of a policy, whose checkpoint holds robot, task and rate, but no tolerance or horizon."""
     from manip_il.learn.checkpoint import read_meta
 
     meta = read_meta(source.policy or round_policy(source.path, 0))
     if run is not None:
-        return run if meta is None else replace(run, robot=meta.robot, task=meta.task, control_hz=meta.fps)
-    return group.config(robot, task, meta)
+        own = {} if meta is None else {"robot": meta.robot, "task": meta.task, "object": meta.object}
+        return run if meta is None else replace(run, control_hz=meta.fps, **own)
+    return group.config(robot, task.type, meta, task.object)
 
 
 def _with_seeds(candidate: Candidate, seeds: set[int | None]) -> Candidate:

@@ -10,6 +10,7 @@ from manip_il.errors import UsageError
 from manip_il.option import option, option_of
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
+from manip_il.sim.shape import SHAPE_HELP
 from manip_il.tasks import NAMES
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ class TaskGroup:
     """`--task.*`."""
 
     type: str = option_of(EnvConfig, "task")
+    object: str = option_of(EnvConfig, "object")
 
 
 @dataclass
@@ -73,6 +75,7 @@ class MaybeTaskGroup:
     """`--task.*` where a checkpoint may say it."""
 
     type: str | None = option(None, f"{', '.join(NAMES)}; by default the policy's, else {EnvConfig.task}")
+    object: str | None = option(None, f"{SHAPE_HELP}; by default the policy's, else the task's own")
 
 
 @dataclass
@@ -86,20 +89,29 @@ class EnvGroup:
     )
     success_steps: int = option_of(EnvConfig, "success_steps")
 
-    def config(self, robot: str | None, task: str | None, meta: CheckpointMeta | None = None) -> EnvConfig:
+    def config(
+        self, robot: str | None, task: str | None, meta: CheckpointMeta | None = None, shape: str | None = None
+    ) -> EnvConfig:
         """Return the environment; `UnknownName` for a robot or task, `UsageError` for a value.
 
-        robot, task: None for those of the policy. meta: what a policy says of itself, where there is one.
+        robot, task, shape (of its object): None for those of the policy. meta: what a policy says of itself, where
+        there is one.
         """
         from manip_il.robots.robot import get_robot
+        from manip_il.sim.scene import build_scene
         from manip_il.tasks.table import get_task
 
         robot = robot or (meta.robot if meta else EnvConfig.robot)
         task = task or (meta.task if meta else EnvConfig.task)
+        if shape is None:
+            shape = meta.object if meta and meta.task == task else ""
         get_robot(robot)
         get_task(task)
         hz = (meta.fps if meta else EnvConfig.control_hz) if self.control_hz is None else self.control_hz
-        return EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon)
+        env = EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon, shape)
+        if env.object:
+            build_scene(robot, task, env.object)  # which finds an object that is too wide
+        return env
 
 
 @dataclass
@@ -112,7 +124,7 @@ class EnvOptions:
 
     def env_config(self) -> EnvConfig:
         """Return the environment, see `EnvGroup.config`."""
-        return self.env.config(self.robot.type, self.task.type)
+        return self.env.config(self.robot.type, self.task.type, shape=self.task.object)
 
 
 @dataclass

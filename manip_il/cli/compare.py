@@ -110,7 +110,7 @@ class CompareOptions:
             _require_same(results[0], other)
         if len(results) == len(sources):
             return None
-        env = common_env(sources, self.env, self.robot.type, self.task.type)
+        env = common_env(sources, self.env, self.robot.type, self.task)
         policies = {source.name: source.select(rule, limit)[0] for source in sources if source.result is None}
         seeds = stream_seeds("test", self.eval.n_episodes, self.seed)
         trial = Trial.of(env, seeds, self.suite, policies.values(), self.trust)

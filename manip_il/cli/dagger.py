@@ -26,6 +26,7 @@ from manip_il.cli.outputs import (
 )
 from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
+from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import MLP_STEPS, FitConfig, check_weights
 from manip_il.option import option, option_of
@@ -82,6 +83,7 @@ class DaggerOptions(common.EnvOptions):
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
+    vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
@@ -141,8 +143,10 @@ class DaggerOptions(common.EnvOptions):
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
         same = ("action_space", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        env = self.env_config()
         made = {
-            "env": self.env_config(),
+            "env": env,
+            "conditions": varied(self.vary, env, sees=cameras is not None),
             "fit": FitConfig(policy=policy, observation=observation, **{name: getattr(self, name) for name in same}),
             "cameras": cameras,
             "datasets": tuple(self.dataset.root),

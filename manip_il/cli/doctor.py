@@ -89,7 +89,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     if spec.robot not in ROBOTS or spec.task not in TASKS:
         yield warning(OURS, f"is for {spec.robot} {spec.task}, which is not known here")
         return
-    env = EnvConfig(spec.robot, spec.task, spec.fps)
+    env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
     here = env_spec(env)
     for what in ("joint_names", "environment_state_names", "sim_state_size", "action_meaning"):
         found, wanted = getattr(spec, what), getattr(here, what)

@@ -91,7 +91,7 @@ class EvalOptions:
             self._check_space(find_policy(self.policy.path))
         require_suite(self.suite)
         require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
-        self.env.config(self.robot.type, self.task.type)
+        self.env.config(self.robot.type, self.task.type, shape=self.task.object)
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
@@ -139,12 +139,12 @@ class EvalOptions:
             from manip_il.learn.checkpoint import read_meta
 
             meta = read_meta(path)
-        env = self.env.config(self.robot.type, self.task.type, meta)
+        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object)
         if path is not None:
             cameras = check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:
                 say(observation_text(cameras, path))
-        conditions = suite_conditions(self.suite, env.task, sees=cameras is not None)
+        conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
         job = RolloutJob(env, self.policy.type or "policy", policy=path, label="last", conditions=conditions)
         return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
 

@@ -104,7 +104,7 @@ def _draw() -> str:
     world.start(0)
 
     def draw() -> Mapping[str, Picture]:
-        return pictures(world.config.robot, world.config.task, world.data, cameras)
+        return pictures(world.config.robot, world.config.task, world.data, cameras, shape=world.config.object)
 
     check_pictures(draw())
     begin = time.perf_counter()

@@ -140,7 +140,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     if spec.robot not in ROBOTS or spec.task not in TASKS:
         warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])
         return
-    env = EnvConfig(spec.robot, spec.task, spec.fps)
+    env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(str(root), spec, "this program", env_spec(env))
     # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}

@@ -168,7 +168,12 @@ class _Quickstart:
 
     def _trial(self, folder: str, seeds: range) -> Trial:
         suite = SUITES[folder]
-        return Trial(self.config.env, seeds, suite, suite_conditions(suite, self.config.env.task, sees=False))
+        return Trial(
+            self.config.env,
+            seeds,
+            suite,
+            suite_conditions(suite, self.config.env.task, self.config.env.object, sees=False),
+        )
 
     def _measure(self, contestants: Sequence[Contestant]) -> dict[str, dict[str, EvalResult]]:
         """Return folder -> policy -> evaluation; those of an interrupted run are read."""

@@ -18,6 +18,7 @@ from manip_il.cli.outputs import (
     save_options,
 )
 from manip_il.cli.progress import Stages, progress, say, warn
+from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
@@ -63,6 +64,7 @@ class RecordOptions(common.EnvOptions):
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
     cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
+    vary: list[str] = option(list, VARY_HELP)
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
     workers: int | None = common.workers_option()
@@ -79,7 +81,7 @@ class RecordOptions(common.EnvOptions):
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
             require_output(journals, "record", resume=self.resume, overwrite=self.overwrite)
-        self.env_config()
+        varied(self.vary, self.env_config(), sees=bool(self.cameras))
         self.image.config(self.cameras)
 
     def run(self) -> None:
@@ -100,7 +102,8 @@ class RecordOptions(common.EnvOptions):
             if self._is_complete(root, journals):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
-                job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras)
+                conditions = varied(self.vary, env, sees=bool(cameras))
+                job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras, conditions=conditions)
                 self._record(engine, job, root, journals)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 

@@ -33,6 +33,9 @@ SUITES = {
 }
 CONDITIONS = SUITES["all"]
 _YAML = (".yaml", ".yml")
+VARY_HELP = (
+    "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
+)
 SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
 
 
@@ -59,7 +62,7 @@ class Trial:
         from manip_il.engine.environments import policy_cameras
 
         sees = any(policy_cameras(policy) is not None for policy in policies)
-        return cls(env, seeds, suite, suite_conditions(suite, env.task, sees=sees), trust)
+        return cls(env, seeds, suite, suite_conditions(suite, env.task, env.object, sees=sees), trust)
 
     def job(self, policy: Path | None) -> RolloutJob:
         """Return the rollouts of one policy; None: of the expert."""
@@ -130,21 +133,44 @@ class Trial:
                 check_policy(policy, meta, self.env, draw=engine == "local", trust=self.trust)
 
 
-def suite_conditions(suite: str, task: str, *, sees: bool) -> tuple[Condition, ...]:
+def suite_conditions(suite: str, task: str, shape: str = "", *, sees: bool) -> tuple[Condition, ...]:
     """Return the conditions of a suite, in the order in which seeds take turns.
 
-    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera.
-    Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where nothing is left.
+    Without those that change nothing: for a task without an object, or (`sees` false) for what looks at no camera; with
+    sizes that the task can take. Raises `UnknownName` for a suite, `UsageError` for a file that is not one or where
+    nothing is left.
     """
-    from manip_il.tasks.table import get_task
-
-    has_object = bool(get_task(task).grasped)
     asked = [read_condition(name) for name in SUITES.get(suite, (suite,))]
-    left = [one for condition in asked if (one := condition.for_world(has_object=has_object, sees=sees)) is not None]
+    left = [one for condition in asked if (one := for_task(condition, task, shape, sees=sees)) is not None]
     if not left:
         blind = "" if sees else " and a policy without cameras"
         raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
     return tuple(left)
+
+
+def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Condition, ...]:
+    """Return what `--vary` names as one condition, from which every episode draws; none for no names.
+
+    Raises `UnknownName` for another name, `UsageError` for what is no YAML of ranges or changes nothing here.
+    """
+    from manip_il.sim.conditions import merged
+
+    if not names:
+        return ()
+    if odd := next((name for name in names if name not in CONDITIONS[1:] and not name.endswith(_YAML)), None):
+        raise UnknownName("--vary", odd, CONDITIONS[1:])
+    kept = for_task(merged([read_condition(name) for name in names]), env.task, env.object, sees=sees)
+    if kept is None:
+        raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+    return (kept,)
+
+
+def for_task(condition: Condition, task: str, shape: str = "", *, sees: bool) -> Condition | None:
+    """Return what of a condition has an effect on a task with an object of a shape, see `Condition.for_world`."""
+    from manip_il.tasks.table import get_task
+
+    the_task = get_task(task, shape)
+    return condition.for_world(has_object=bool(the_task.objects), sees=sees, sizes=the_task.sizes)
 
 
 def require_suite(suite: str) -> None:

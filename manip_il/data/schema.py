@@ -30,6 +30,7 @@ SEED = "seed"
 ROUND = "round"
 BETA = "beta"
 
+OWN_OBJECT = "the task's own"  # what an empty name of an object means
 VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FRAMES = 1_000_000  # of an episode
 MOST_FPS = 10_000  # control steps a second
@@ -60,6 +61,7 @@ class RobotTaskSpec:
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
     phases: tuple[str, ...] = ()  # what `expert_phase` counts: none, then the rungs of the task's ladder
+    object: str = ""  # shape and size of what the task moves; empty for the task's own
     schema: int = VERSION
 
     def __post_init__(self) -> None:
@@ -70,7 +72,7 @@ class RobotTaskSpec:
         for what in ("joint_names", "environment_state_names", "phases"):
             for one in checks.array(what, getattr(self, what), MOST_NAMES):
                 checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
-        for what in ("instruction", "action_meaning"):
+        for what in ("instruction", "action_meaning", "object"):
             checks.text(what, getattr(self, what))
         for camera in checks.array("cameras", self.cameras, MOST_CAMERAS):
             checks.name("a camera", camera)
@@ -79,8 +81,9 @@ class RobotTaskSpec:
         check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the spec as JSON types."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        """Return the spec as JSON types; without an object where it is the task's own."""
+        values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        return {key: value for key, value in values.items() if value or key != "object"}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
@@ -148,8 +151,10 @@ def check_same_spec(left_name: str, left: RobotTaskSpec, right_name: str, right:
 
     The task may differ: a policy may be tried on another one.
     """
-    for what in ("robot", "fps", "joint_names", "environment_state_names", "action_meaning"):
+    for what in ("robot", "fps", "joint_names", "object", "environment_state_names", "action_meaning"):
         left_value, right_value = getattr(left, what), getattr(right, what)
+        if what == "object":
+            left_value, right_value = left_value or OWN_OBJECT, right_value or OWN_OBJECT
         if left_value != right_value:
             raise MismatchError(what, left_name, left_value, right_name, right_value)
 

@@ -30,7 +30,8 @@ _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part
 @cache
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
     """Return names, sizes and rate that a dataset or policy for this environment must share."""
-    scene, task = build_scene(config.robot, config.task), get_task(config.task)
+    scene = build_scene(config.robot, config.task, config.object)
+    task = get_task(config.task, config.object)
     return RobotTaskSpec(
         robot=scene.robot.name,
         task=config.task,
@@ -40,6 +41,7 @@ def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTas
         sim_state_size=scene.state_size + len(scene.nominal) + STATE_EXTRAS,
         instruction=task.instruction,
         phases=phases(task),
+        object=config.object,
         cameras=cameras.names if cameras else (),
         image_size=(cameras.height, cameras.width) if cameras else (0, 0),
     )
@@ -53,7 +55,11 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
 
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
-    return environment_fingerprint(build_scene(config.robot, config.task).model_bytes(), asdict(config))
+    settings = asdict(config)
+    if not config.object:  # as before there were any
+        del settings["object"]
+    model = build_scene(config.robot, config.task, config.object).model_bytes()
+    return environment_fingerprint(model, settings)
 
 
 def policy_sha256(policy: Path) -> str:
@@ -88,19 +94,19 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
         raise ManipError(f"{policy}: its pictures cannot be rendered ({error}); see its {META_FILE}") from error
 
 
-def positions(robot: str, task: str, sim_state: NDArray[np.float64]) -> dict[str, list[float]]:
+def positions(env: EnvConfig, sim_state: NDArray[np.float64]) -> dict[str, list[float]]:
     """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects and, where there is one, `goal`.
 
     The first of the task's objects is called `object`.
     """
-    world, state = _world(robot, task), State.from_vector(sim_state)
+    world, state = _world(env.robot, env.task, env.object), State.from_vector(sim_state)
     world.restore(state.physics, state.variation)
     found = {"hand": world.ee.position} | ({"goal": world.goal} if world.has_goal else {})
     for name in world.scene.objects:
-        found["object" if name in get_task(task).objects[:1] else name] = world.pose(name).position
+        found["object" if name in get_task(env.task).objects[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 
 @cache
-def _world(robot: str, task: str) -> World:
-    return World(build_scene(robot, task))
+def _world(robot: str, task: str, shape: str) -> World:
+    return World(build_scene(robot, task, shape))

@@ -95,7 +95,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         return
     cameras = observed_cameras(job)
     envs = [ManipEnv.of(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
-    expert = _expert(job.env.robot, job.env.task)
+    expert = _expert(job.env.robot, job.env.task, job.env.object)
     transitions = rollout(envs, seeds, _make_driver(job, envs[0]), _rules(job), expert)
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
@@ -223,5 +223,5 @@ def _without_pictures(transition: Transition) -> Transition:
 
 
 @cache
-def _expert(robot: str, task: str) -> Expert:
-    return Expert(build_scene(robot, task))
+def _expert(robot: str, task: str, shape: str) -> Expert:
+    return Expert(build_scene(robot, task, shape))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.data import schema
 from manip_il.data.fingerprint import compare_fingerprints
@@ -34,7 +35,7 @@ from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
-from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.tasks.table import TASKS
@@ -45,16 +46,20 @@ _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that pictures o
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset whose states can be pictured. warnings: what may make the pictures differ from the recorded world."""
+    """A dataset whose states can be pictured. warnings: what may make the pictures differ from the recorded world.
+
+    conditions: what its episodes draw from.
+    """
 
     root: Path
     spec: RobotTaskSpec
     warnings: tuple[str, ...]
+    conditions: tuple[Condition, ...] = ()
 
     @property
     def env(self) -> EnvConfig:
         """An environment that its states fit."""
-        return EnvConfig(self.spec.robot, self.spec.task)
+        return EnvConfig(self.spec.robot, self.spec.task, object=self.spec.object)
 
 
 def open_source(root: Path) -> Source:
@@ -72,13 +77,29 @@ def open_source(root: Path) -> Source:
                 f"{root} is for the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
                 "so its states cannot be rendered"
             )
-    env = EnvConfig(spec.robot, spec.task)
+    env = EnvConfig(spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
     if spec.sim_state_size != size:
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), read_fingerprint(root)
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
-    return Source(root, spec, tuple(compare_fingerprints(str(root), left, "this machine", right)))
+    differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
+    return Source(root, spec, differences, recorded_conditions(root, read_provenance(root)))
+
+
+def recorded_conditions(root: Path, provenance: Mapping[str, Any]) -> tuple[Condition, ...]:
+    """Return what the episodes of a dataset drew from, by its provenance; none where their worlds were nominal.
+
+    Raises `ManipError` for a merged one whose parts differ in that.
+    """
+    parts = [checks.mapping(f"{root}: a part", part) for part in provenance.get("merged", [])]
+    if parts:
+        found = {recorded_conditions(root, checks.mapping(f"{root}: a part", part["provenance"])) for part in parts}
+        if len(found) > 1:
+            raise ManipError(f"{root} was merged from datasets that vary in different ways; render those, then merge")
+        return found.pop()
+    trees = [dict(checks.mapping(f"{root}: vary", tree)) for tree in provenance.get("vary", [])]
+    return tuple(Condition.from_mapping(tree.pop("name"), tree) for tree in trees)
 
 
 def render_dataset(
@@ -103,7 +124,7 @@ def render_dataset(
     states = read_episodes(source.root, pictures=False)
     with (
         new_dataset(target, spec, repo_id=repo_id, fingerprint=fingerprint, replace=replace) as writer,
-        closing(render_episodes(states, source.env, cameras, workers)) as episodes,
+        closing(render_episodes(states, source.env, cameras, workers, source.conditions)) as episodes,
     ):
         for episode in episodes:
             writer.add(episode)
@@ -113,23 +134,29 @@ def render_dataset(
 
 
 def render_episodes(
-    episodes: Iterable[Episode], env: EnvConfig, cameras: CameraConfig, workers: int = 1
+    episodes: Iterable[Episode],
+    env: EnvConfig,
+    cameras: CameraConfig,
+    workers: int = 1,
+    conditions: Sequence[Condition] = (),
 ) -> Generator[Episode]:
     """Yield the episodes, in order, with pictures of their states; at most `workers` + 1 of them wait in memory.
 
+    conditions: what they drew from by their seeds.
     Raises `RenderError` where there is no OpenGL, `ManipError` where a worker dies.
     """
     render = partial(render_states, env, cameras)
     if workers == 1:
         for episode in episodes:
-            yield _with_pictures(episode, render(episode.columns[schema.SIM_STATE]))
+            yield _with_pictures(episode, render(episode.columns[schema.SIM_STATE], draw(conditions, episode.seed)))
         return
     pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=initialize_worker)
     waiting: deque[tuple[Episode, Future[Pictures]]] = deque()
     try:
         for episode in episodes:
             with bound_to_this_process():  # it starts processes as they are needed
-                waiting.append((episode, pool.submit(render, episode.columns[schema.SIM_STATE])))
+                drawn = draw(conditions, episode.seed)
+                waiting.append((episode, pool.submit(render, episode.columns[schema.SIM_STATE], drawn)))
             if len(waiting) > workers:
                 yield _next(waiting)
         while waiting:

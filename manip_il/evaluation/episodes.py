@@ -129,7 +129,7 @@ class EvalSettings:
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
     of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    where it goes on to the horizon.
+    where it goes on to the horizon. object: shape and size of what is grasped, empty for the task's own.
     """
 
     horizon: int
@@ -139,18 +139,21 @@ class EvalSettings:
     suite: str = NOMINAL.name
     conditions: tuple[Condition, ...] = (NOMINAL,)
     hold: int | None = None
+    object: str = ""
 
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
         """Return those of a job whose conditions are called `suite`."""
         env, conditions = job.env, job.conditions or (NOMINAL,)
-        return cls(env.horizon, env.tolerance, env.control_hz, env.success_steps, suite, conditions, job.hold)
+        steps, hz = env.success_steps, env.control_hz
+        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object)
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
         from manip_il.sim.env import EnvConfig  # here, as reading results needs no simulator
 
-        return EnvConfig(robot, task, self.control_hz, self.tolerance, self.success_steps, self.horizon)
+        steps = self.success_steps
+        return EnvConfig(robot, task, self.control_hz, self.tolerance, steps, self.horizon, self.object)
 
     @property
     def disturbance(self) -> str:
@@ -160,13 +163,15 @@ class EvalSettings:
     def __str__(self) -> str:
         rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
         ends = "" if self.hold is None else f", ended {self.hold} steps after success"
-        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}"
+        shape = f", object {self.object}" if self.object else ""
+        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}{shape}"
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
         conditions = [condition.to_json() for condition in self.conditions]
-        return {key: getattr(self, key) for key in plain} | {"conditions": conditions}
+        shape = {"object": self.object} if self.object else {}
+        return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | shape
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
@@ -184,6 +189,7 @@ class EvalSettings:
             suite=checks.text("suite", data.get("suite", NOMINAL.name)),
             conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
             hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
+            object=checks.text("object", data.get("object", ""), checks.LONGEST_NAME),
         )
 
 

@@ -78,7 +78,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     solved = episode.columns[schema.SUCCESS].ravel()
     first = int(np.argmax(solved)) + 1 if solved.any() else None
     states = episode.columns[schema.SIM_STATE]
-    start, end = (positions(job.env.robot, job.env.task, states[row]) for row in (0, -1))
+    start, end = (positions(job.env, states[row]) for row in (0, -1))
     drawn = draw(job.conditions or (NOMINAL,), episode.seed)
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # nobody asks the expert about a state in which the task is solved

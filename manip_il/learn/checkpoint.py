@@ -30,7 +30,7 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data.atomic import umask, writing
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.schema import OWN_OBJECT, RobotTaskSpec
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
 
 META_FILE = "manip_il.json"
@@ -45,6 +45,7 @@ _MUST_AGREE = {
     "robot": "robot",
     "fps": "control rate [1/s]",
     "joint_names": "joint names",
+    "object": "object",
     "environment_state_names": "environment state",
     "action_meaning": "meaning of the action",
 }
@@ -74,12 +75,14 @@ class CheckpointMeta:
     look: dict[str, Any] | None = None
     datasets: list[dict[str, Any]] = field(default_factory=list)
     action_space: str | None = None
+    object: str = ""  # see `RobotTaskSpec`
 
     def __post_init__(self) -> None:
         for name in ("robot", "task"):
             checks.name(name, getattr(self, name))
         checks.whole("fps", self.fps, 1, _FASTEST)
         checks.text("action_meaning", self.action_meaning, _LONGEST_WORDS)
+        checks.text("object", self.object, _LONGEST_WORDS)
         checks.text("observation", self.observation, checks.LONGEST_NAME)
         if self.action_space is not None:
             checks.text("action_space", self.action_space, checks.LONGEST_NAME)
@@ -157,6 +160,8 @@ def check_fits(meta: CheckpointMeta, spec: RobotTaskSpec) -> None:
         if name == "environment_state_names" and meta.observation == "images":
             continue  # it does not look at it
         ours, theirs = getattr(meta, name), getattr(spec, name)
+        if name == "object":
+            ours, theirs = ours or OWN_OBJECT, theirs or OWN_OBJECT
         if name == "environment_state_names" and ours != theirs and meta.task != spec.task:
             raise MismatchError("task", "the policy", meta.task, "the environment", spec.task)
         if ours != theirs:
@@ -256,5 +261,6 @@ def publish(temporary: Path, final: Path) -> None:
 
 def write_own_files(checkpoint: Path, meta: CheckpointMeta, step: Mapping[str, Any]) -> None:
     """Write what LeRobot's checkpoints have not: the meta, and the step with the resume key."""
-    for path, values in ((f"{PRETRAINED_MODEL}/{META_FILE}", asdict(meta)), (f"{TRAINING_STATE}/{STEP_FILE}", step)):
+    words = {name: value for name, value in asdict(meta).items() if value or name != "object"}
+    for path, values in ((f"{PRETRAINED_MODEL}/{META_FILE}", words), (f"{TRAINING_STATE}/{STEP_FILE}", step)):
         (checkpoint / path).write_text(json.dumps(values, indent=2) + "\n")

@@ -41,8 +41,8 @@ class ManipILEnv(EnvConfig):
 
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode: `none`
-    leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode:
+    `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """
@@ -56,6 +56,7 @@ class ManipILEnv(EnvConfig):
     episode_length: int = option_of(SimConfig, "horizon")
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
+    object: str = option_of(SimConfig, "object")
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -102,7 +103,8 @@ class ManipILEnv(EnvConfig):
 
     def _simulation(self) -> SimConfig:
         robot, task = TASKS[self.task or ""]
-        return SimConfig(robot, task, self.fps, self.tolerance, self.success_steps, self.episode_length)
+        steps = self.success_steps
+        return SimConfig(robot, task, self.fps, self.tolerance, steps, self.episode_length, self.object)
 
     def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":
@@ -119,7 +121,7 @@ class ManipILEnv(EnvConfig):
             "agent_pos": PolicyFeature(FeatureType.STATE, joints),
         }
         if self.observation != "images":
-            size = len(environment_state_names(build_scene(simulation.robot, simulation.task)))
+            size = len(environment_state_names(build_scene(simulation.robot, simulation.task, simulation.object)))
             features["environment_state"] = PolicyFeature(FeatureType.ENV, (size,))
         if cameras is not None:
             picture = PolicyFeature(FeatureType.VISUAL, (*cameras.size, 3))

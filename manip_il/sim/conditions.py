@@ -71,13 +71,16 @@ class Condition:
         kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
-    def for_world(self, *, has_object: bool, sees: bool) -> Condition | None:
+    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
         """Return the condition without what has no effect on a task without an object, or a policy without cameras.
 
-        None where nothing of it is left.
+        sizes: of its objects, that the task can take [m]; None: their own alone. None where nothing of it is left.
+        Raises `UsageError` where the condition's sizes are all others.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED)}
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED), *(() if sizes else ("size",))}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
+        if "size" in kept and sizes is not None:
+            kept["size"] = _overlap(self.name, kept["size"], sizes)
         if self.ranges and not kept.keys() - {"knock_step"}:
             return None
         return Condition(self.name, **kept)
@@ -125,6 +128,12 @@ class Drawn:
         return float(self.values.get(name, default))
 
 
+def merged(conditions: Sequence[Condition]) -> Condition:
+    """Return the condition that has the ranges of all, named after them; a later one's count where two have one."""
+    ranges = {name: range_ for condition in conditions for name, range_ in condition.ranges.items()}
+    return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
+
+
 def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
     """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal."""
     return (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
@@ -167,6 +176,15 @@ def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> No
         raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {bounds[0]} to {bounds[1]}")
     if whole and (low % 1 or high % 1):
         raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers of control steps")
+
+
+def _overlap(name: str, asked: Range, sizes: Range) -> Range:
+    """The sizes that are asked for and that a task can take."""
+    low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
+    if low > high:
+        takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
+        raise UsageError(f"{name}: size is {_words(asked)} m, and the task takes objects of {takes}; choose others")
+    return low, high
 
 
 def _as_range(what: str, value: Any) -> Range:

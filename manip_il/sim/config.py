@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.robots import ROBOTS
+from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES
 
 DT_SIM = 0.002  # [s]
@@ -14,7 +15,10 @@ DT_SIM = 0.002  # [s]
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Settings of one environment; every field is part of the fingerprint. Raises `UsageError` for a wrong number."""
+    """Settings of one environment; every field is part of the fingerprint. Raises `UsageError` for a wrong value.
+
+    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own.
+    """
 
     robot: str = option("panda", " or ".join(ROBOTS))
     task: str = option("pick_place", ", ".join(NAMES))
@@ -24,10 +28,12 @@ class EnvConfig:
         0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
     )
     horizon: int = option(0, "control steps in an episode; 0: the task's own")
+    object: str = option("", f"{SHAPE_HELP}; by default the task's own")
 
     def __post_init__(self) -> None:
         from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
 
+        self._take_object()
         self._take_limits()
         if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
             raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
@@ -37,6 +43,16 @@ class EnvConfig:
             raise UsageError(f"horizon is {self.horizon}; expected at most {LONGEST_EPISODE} control steps")
         if self.success_steps < 1 or self.horizon < self.success_steps:
             raise UsageError(f"horizon is {self.horizon}; expected at least success_steps ({self.success_steps}) >= 1")
+
+    def _take_object(self) -> None:
+        """Say the object as short as can be, the cube that is the default not at all."""
+        if not self.object:
+            return
+        from manip_il.tasks.table import get_task  # here, as help needs no simulator
+
+        shape = Shape.parse(self.object)
+        get_task(self.task, self.object)
+        object.__setattr__(self, "object", "" if shape == CUBE else str(shape))
 
     def _take_limits(self) -> None:
         """Take from the task what is not given."""

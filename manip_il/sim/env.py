@@ -57,8 +57,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.look = look or Look()
         self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
-        self.world = World(build_scene(self.config.robot, self.config.task))
-        self._task = get_task(self.config.task)
+        self.world = World(build_scene(self.config.robot, self.config.task, self.config.object))
+        self._task = get_task(self.config.task, self.config.object)
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
         self.render_mode = render_mode
@@ -214,7 +214,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras, self.drawn)
+        return pictures(self.config.robot, self.config.task, self.data, cameras, self.drawn, self.config.object)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

@@ -5,7 +5,7 @@ Functions that change the world do it in place, and draw from the generator that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,6 +170,12 @@ class _Training(Condition):
     def draw(self, seed: int) -> Drawn:
         late = {name: self.ranges[name] for name in ("knock", "knock_step")}
         return Drawn(self.name, {**super().draw(seed).values, **late})
+
+
+def standard_in(varied: Sequence[Condition]) -> Condition:
+    """Return `STANDARD` in worlds that vary besides; itself where they do not."""
+    ranges = {name: range_ for condition in varied for name, range_ in condition.ranges.items()}
+    return _Training(STANDARD.name, **{**ranges, **STANDARD.ranges}) if ranges else STANDARD
 
 
 STANDARD = _Training("standard", action_noise=(0.1, 0.1), knock=(0.05, 0.08), knock_step=(5, 24))

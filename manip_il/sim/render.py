@@ -23,14 +23,20 @@ _MAX_GEOMS = 1_000
 
 
 def pictures(
-    robot: str, task: str, data: mujoco.MjData, cameras: CameraConfig, drawn: Drawn = NOMINAL_VALUES
+    robot: str,
+    task: str,
+    data: mujoco.MjData,
+    cameras: CameraConfig,
+    drawn: Drawn = NOMINAL_VALUES,
+    shape: str = "",
 ) -> dict[str, Picture]:
     """Return what every camera sees of the physics in `data`: name -> RGB, uint8 (height, width, 3).
 
-    A picture depends on `qpos`, the goal and what the episode draws alone: it has the same bytes in any order.
+    shape: of the task's object, as `EnvConfig.object`. A picture depends on `qpos`, the goal and what the episode draws
+    alone: it has the same bytes in any order.
     Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
     """
-    renderer = _process.renderer(robot, task, cameras.look)
+    renderer = _process.renderer(robot, task, cameras.look, shape)
     renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
 
@@ -43,8 +49,8 @@ def close() -> None:
 class _Renderer:
     """Draws one scene in one look, in pictures of any size. Needs a current OpenGL context."""
 
-    def __init__(self, robot: str, task: str, look: Look):
-        self._view = ViewModel(robot, task, look)
+    def __init__(self, robot: str, task: str, look: Look, shape: str):
+        self._view = ViewModel(robot, task, look, shape)
         self._model = self._view.model
         self._data = mujoco.MjData(self._model)
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
@@ -91,12 +97,12 @@ class _Process:
     def __init__(self) -> None:
         self._gl: Any = None
         self._pid = 0  # of the process that made the context
-        self._key: tuple[str, str, Look] | None = None
+        self._key: tuple[str, str, Look, str] | None = None
         self._renderer: _Renderer | None = None
 
-    def renderer(self, robot: str, task: str, look: Look) -> _Renderer:
-        key = (robot, task, look)
-        build_scene(robot, task)  # first: an unknown name is no fault of OpenGL's
+    def renderer(self, robot: str, task: str, look: Look, shape: str) -> _Renderer:
+        key = (robot, task, look, shape)
+        build_scene(robot, task, shape)  # first: an unknown name is no fault of OpenGL's
         if self._gl is not None and self._pid != os.getpid():
             raise RenderError("OpenGL does not survive a fork; start processes that make pictures by 'spawn'")
         try:

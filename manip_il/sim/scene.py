@@ -29,16 +29,23 @@ _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
 
+def build_scene(robot: str, task: str, shape: str = "") -> Scene:
+    """Return the scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`.
+
+    shape: of its object, as `EnvConfig.object`; empty for the task's own.
+    """
+    return _build(robot, task, shape)
+
+
 @cache
-def build_scene(robot: str, task: str) -> Scene:
-    """Return the scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`."""
-    the_robot, the_task = get_robot(robot), get_task(task)
+def _build(robot: str, task: str, shape: str) -> Scene:
+    the_robot, the_task = get_robot(robot), get_task(task, shape)
     try:
         model = scene_spec(the_robot, the_task).compile()
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(f"robot {the_robot.name} and task {the_task.name} make no scene: {why}") from None
-    return _index(the_robot, the_task, model)
+    return _index(the_robot, the_task, model, shape)
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
@@ -70,7 +77,7 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
     raise UnknownName("camera", name, known)
 
 
-def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
+def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene:
     joints = [model.joint(PREFIX + name) for name in robot.joints]
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
@@ -86,6 +93,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel) -> Scene:
         arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
         ee_site=model.site(PREFIX + "ee").id,
         nominal=variation.nominal(model, objects),
+        shape=shape,
     )
 
 
@@ -106,11 +114,11 @@ def _check_objects(
     """Raise `UsageError` for an object that the gripper cannot go around."""
     for name in task.grasped:
         one = objects[name]
-        width = float(np.sort(variation.extents(int(model.geom_type[one.geom]), model.geom_size[one.geom]))[0])
+        width = variation.widest_grasp(int(model.geom_type[one.geom]), model.geom_size[one.geom])
         if width >= gripper.most:
             raise UsageError(
                 f"task {task.name}: {name!r} is {width:.3f} m wide, and the gripper of {robot.name} opens to "
-                f"{gripper.most:.3f} m; choose another task or robot"
+                f"{gripper.most:.3f} m; choose another object, task or robot"
             )
 
 

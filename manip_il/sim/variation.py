@@ -100,6 +100,12 @@ def extents(kind: int, size: F64) -> F64:
     raise ManipError(f"an object of MuJoCo's geom type {kind}; expected a box, sphere, cylinder or capsule")
 
 
+def widest_grasp(kind: int, size: F64) -> float:
+    """Return how wide a geom is between fingers from above, on whichever side it lies [m]."""
+    lengths = np.sort(extents(kind, size))
+    return float(lengths[1] if kind == int(mujoco.mjtGeom.mjGEOM_BOX) else extents(kind, size)[0])
+
+
 def _bound(kind: int, size: F64) -> float:
     """Return the radius of the sphere around a geom [m]."""
     if kind == int(mujoco.mjtGeom.mjGEOM_BOX):

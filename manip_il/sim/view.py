@@ -34,12 +34,12 @@ _CHANGED = ("geom_size", "geom_matid", "geom_rgba", "cam_pos", "cam_quat", "ligh
 class ViewModel:
     """A model to draw from, not to simulate: every name, address and pose in `model` is the physics model's."""
 
-    def __init__(self, robot: str, task: str, look: Look):
-        self.model: Any = copy.copy(_with_few_faces(robot, task))
+    def __init__(self, robot: str, task: str, look: Look, shape: str = ""):
+        self.model: Any = copy.copy(_with_few_faces(robot, task, shape))
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
             self.model.vis.quality.shadowsize = 0
-        self._geoms = [one.geom for one in build_scene(robot, task).objects.values()]
+        self._geoms = [one.geom for one in build_scene(robot, task, shape).objects.values()]
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
         self._headlight = [colour.copy() for colour in self._headlight_colours()]
@@ -96,8 +96,8 @@ class ViewModel:
 
 
 @cache
-def _with_few_faces(robot: str, task: str) -> mujoco.MjModel:
-    model = copy.copy(build_scene(robot, task).model)
+def _with_few_faces(robot: str, task: str, shape: str) -> mujoco.MjModel:
+    model = copy.copy(build_scene(robot, task, shape).model)
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
             _simplify(model, mesh)

@@ -43,6 +43,7 @@ class Scene:
 
     task: its name. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies
     by name. ee_site: id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
+    shape: of its object, as `EnvConfig.object`.
     """
 
     robot: Robot
@@ -55,6 +56,7 @@ class Scene:
     arm_ctrl: NDArray[np.int64]
     ee_site: int
     nominal: F64
+    shape: str = ""
 
     @cached_property
     def state_size(self) -> int:

@@ -88,6 +88,7 @@ class ClearTable:
     limits: Limits = Limits(tolerance=0.005, horizon=800)
     objects: tuple[str, ...] = tuple(COLOURS)
     grasped: tuple[str, ...] = tuple(COLOURS)
+    sizes: tuple[float, float] | None = (0.03, 0.04)
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

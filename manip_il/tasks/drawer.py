@@ -248,6 +248,7 @@ class Drawer:
     limits: Limits = Limits(tolerance=SHUT, horizon=400)
     objects: tuple[str, ...] = (OBJECT,)
     grasped: tuple[str, ...] = (OBJECT,)
+    sizes: tuple[float, float] | None = (0.03, 0.045)
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

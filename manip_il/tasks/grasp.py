@@ -33,10 +33,11 @@ SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any 
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
+_BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 
 
 class Lie(NamedTuple):
-    """Pose of an object at rest, as a hand sees it.
+    """Ways to grasp an object as it lies.
 
     grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
     for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how
@@ -82,6 +83,11 @@ class Grasp(NamedTuple):
 def grasp_of(world: World, name: str) -> Grasp:
     """Return the pose of an object relative to the hand; computed once a state."""
     return world.remember(("grasp", name), partial(_grasp, world, name))
+
+
+def is_cube(world: World, name: str) -> bool:
+    """Return whether an object is a box with equal edges."""
+    return world.kind(name) == _BOX and len(set(world.extents(name))) == 1
 
 
 def lie_of(world: World, name: str) -> Lie:
@@ -158,10 +164,10 @@ def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float
 
 
 def _lie(kind: int, rotation: F64, extents: Sequence[float]) -> Lie:
-    if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
+    if kind == _BOX:
         return _box_lie(rotation, extents)
     width, _, length = extents
-    if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
+    if kind == _SPHERE:
         return Lie(((0.0, width, width),), width, 0.0, 0)
     ahead, left, up = rotation[:, 2].tolist()
     if abs(up) > math.sqrt(0.5):

@@ -8,7 +8,7 @@ import numpy as np
 
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT, PickPlace
-from manip_il.tasks.starts import LIFT, UPRIGHT, draw_resting, draw_until, draw_yaw
+from manip_il.tasks.starts import LIFT, UPRIGHT, draw_lying, draw_until
 from manip_il.tasks.task import Start
 
 
@@ -20,7 +20,7 @@ class Lift(PickPlace):
     instruction: str = "Lift the cube to the green goal above it."
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the cube on the table, at any yaw, and the height of the goal over it."""
-        at, turn = draw_resting(rng, world, OBJECT), draw_yaw(rng)
+        """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
+        at, turn = draw_lying(rng, world, OBJECT)
         goal = draw_until(lambda: at + [0.0, 0.0, rng.uniform(*LIFT)], world.reach.has, world, "the goal")
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})

@@ -3,42 +3,57 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import mujoco
 import numpy as np
 
+from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.grasp import lie_of
+from manip_il.tasks.grasp import Lie, is_cube, lie_of
 from manip_il.tasks.ladder import pick_progress, pick_rungs
-from manip_il.tasks.objects import add_cube, add_goal
+from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_resting, draw_yaw, resting_height
-from manip_il.tasks.task import Limits, Observed, Rung, Start
+from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying
+from manip_il.tasks.task import CUBE_SIZES, Limits, Observed, Rung, Start
 
 OBJECT = "object"
 
 
 @dataclass(frozen=True)
 class PickPlace:
-    """Bring the cube's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace."""
+    """Bring the object's centre to the goal. Ranges are those of gymnasium-robotics' FetchPickAndPlace.
+
+    shape: of the object, a cube of 5 cm unless `--task.object=` says otherwise.
+    """
 
     name: str = "pick_place"
     instruction: str = "Pick up the cube and bring it to the green goal."
     limits: Limits = Limits()
     objects: tuple[str, ...] = (OBJECT,)
     grasped: tuple[str, ...] = (OBJECT,)
+    sizes: tuple[float, float] | None = CUBE_SIZES
     rungs: tuple[Rung, ...] = pick_rungs(OBJECT)
+    shape: Shape = CUBE
+
+    def with_shape(self, shape: Shape) -> Self:
+        """Return the task with another object, in its instruction too."""
+        instruction = self.instruction.replace(self.shape.word, shape.word)
+        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction)
 
     def build(self, spec: mujoco.MjSpec) -> None:
-        """Add the cube and the goal."""
-        add_cube(spec, OBJECT)
+        """Add the object and the goal."""
+        if self.shape == CUBE:
+            add_cube(spec, OBJECT)
+        else:
+            add_object(spec, OBJECT, self.shape.kind, self.shape.size, self.shape.mass, RED)
         add_goal(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
-        """Draw the cube on the table, at any yaw, and the goal, half of the time in the air."""
-        at, turn = draw_resting(rng, world, OBJECT), draw_yaw(rng)
-        goal = draw_goal(rng, world, resting_height(world, OBJECT))
+        """Draw the object on the table, lying or standing at any yaw, and the goal, half of the time in the air."""
+        at, turn = draw_lying(rng, world, OBJECT)
+        goal = draw_goal(rng, world, float(at[2]))
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})
 
     def observe(self, world: World) -> Observed:
@@ -62,8 +77,10 @@ def observe_cube(world: World, name: str) -> Observed:
 
 
 def observe_object(world: World, name: str) -> Observed:
-    """Return an object's position, yaw modulo its symmetry, tilt and width, and the way to it from the hand."""
+    """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the way to it from the hand."""
     position, lie = world.pose(name).position, lie_of(world, name)
+    if not is_cube(world, name):
+        return {name: position, **_observe_lie(name, lie), f"{name}_from_ee": position - world.ee.position}
     return {
         name: position,
         f"{name}.cos4yaw": math.cos(4 * lie.yaw),
@@ -71,4 +88,18 @@ def observe_object(world: World, name: str) -> Observed:
         f"{name}.tilt": lie.tilt,
         f"{name}.width": world.extents(name)[0],
         f"{name}_from_ee": position - world.ee.position,
+    }
+
+
+def _observe_lie(name: str, lie: Lie) -> Observed:
+    """How anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns."""
+    yaw, width, length = min(lie.grasps, key=lambda grasp: grasp[1])
+    return {
+        f"{name}.folds": float(lie.folds),
+        f"{name}.cosyaw": math.cos(lie.folds * yaw),
+        f"{name}.sinyaw": math.sin(lie.folds * yaw),
+        f"{name}.tilt": lie.tilt,
+        f"{name}.width": width,
+        f"{name}.length": length,
+        f"{name}.height": lie.tall,
     }

@@ -72,6 +72,7 @@ class Press:
     limits: Limits = Limits(tolerance=STOPPED)
     objects: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
+    sizes: tuple[float, float] | None = None
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

@@ -114,6 +114,7 @@ class Push:
     limits: Limits = Limits(horizon=150)
     objects: tuple[str, ...] = (PUCK,)
     grasped: tuple[str, ...] = ()
+    sizes: tuple[float, float] | None = (0.055, 0.07)
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

@@ -35,6 +35,7 @@ class ReachGoal:
     limits: Limits = Limits()
     objects: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
+    sizes: tuple[float, float] | None = None
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

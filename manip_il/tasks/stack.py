@@ -75,6 +75,7 @@ class Stack:
     limits: Limits = Limits(success_steps=20, horizon=300)
     objects: tuple[str, ...] = (TOP, BASE)
     grasped: tuple[str, ...] = (TOP,)
+    sizes: tuple[float, float] | None = (0.03, 0.07)
     rungs: tuple[Rung, ...] = _RUNGS
 
     def build(self, spec: mujoco.MjSpec) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import mujoco
 import numpy as np
+from mujoco import mjtGeom
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
 from manip_il.sim.world import World
+from manip_il.tasks.grasp import is_cube
 
 F64 = NDArray[np.float64]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
@@ -16,6 +19,32 @@ FROM_HAND = 0.1  # of an object from the hand at the start, x and y, as in gymna
 IN_AIR = 0.5  # share of goals that are off the table, as in the same environment
 LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
 _MOST_DRAWS = 1_000
+_BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
+_HALF = np.sqrt(0.5)
+_UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)  # turn x, y or z up
+
+
+def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
+    """Draw on which side an object lies or stands, where, and its yaw: (3,) [m] and wxyz (4,).
+
+    Sides that look alike count once; a capsule lies. A cube turns within an eighth of a turn, as its faces are alike.
+    """
+    lengths = world.extents(name)
+    if is_cube(world, name):
+        return draw_resting(rng, world, name), draw_yaw(rng)
+    sides = _sides(world.kind(name), lengths)
+    up = sides[int(rng.integers(len(sides)))]
+    at = draw_resting_place(rng, world, name, lengths[up] / 2)
+    turn = np.empty(4)
+    mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), _UPWARDS[up])
+    return at, turn
+
+
+def _sides(kind: int, lengths: Sequence[float]) -> list[int]:
+    """Own axes that may point up: one of each length, where an object may rest so."""
+    if kind in (_SPHERE, _CAPSULE):
+        return [0]
+    return [axis for axis in range(3) if lengths[axis] not in lengths[:axis] or (kind != _BOX and axis == 2)]
 
 
 def draw_resting(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> F64:

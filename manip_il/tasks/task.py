@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
 
 F64 = NDArray[np.float64]
@@ -91,6 +92,11 @@ class Task(Protocol):
         ...
 
     @property
+    def sizes(self) -> tuple[float, float] | None:
+        """Least and greatest length of an object, along its longest edge, that the task can take [m]; None: its own."""
+        ...
+
+    @property
     def rungs(self) -> tuple[Rung, ...]:
         """The ladder."""
         ...
@@ -139,9 +145,19 @@ def objects_in(task: Task, world: World) -> tuple[str, ...]:
     return task.objects_in(world) if isinstance(task, Instructing) else task.objects
 
 
+@runtime_checkable
+class TakesShape(Protocol):
+    """A task whose object may be of any shape."""
+
+    def with_shape(self, shape: Shape) -> Task:
+        """Return the task with such an object."""
+        ...
+
+
 def phases(task: Task) -> tuple[str, ...]:
     """Return names of a task's phases by their number in `expert_phase`: none, then the rungs from the first on."""
     return (NO_PHASE, *(rung.name for rung in reversed(task.rungs)))
 
 
+CUBE_SIZES = (0.03, 0.07)  # of a cube that every gripper goes around [m]
 NO_PHASE = "none"  # where there is no sound label

@@ -13,12 +13,16 @@ from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_pro
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.render import open_source, render_dataset, render_episodes, render_states
+from manip_il.engine.render import open_source, recorded_conditions, render_dataset, render_episodes, render_states
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mdp import Episode
+from manip_il.expert import Expert
+from manip_il.mdp import Episode, State
+from manip_il.recording import provenance
 from manip_il.seeding import stream_seeds
+from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, Look
-from manip_il.sim.env import EnvConfig
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.scene import build_scene
 
 ENV = EnvConfig("panda", "pick_place")
 CAMERAS = CameraConfig(("front", "wrist"), 64, 96)
@@ -157,3 +161,28 @@ def test_what_does_not_name_its_task_or_is_no_dataset_is_refused(source, tmp_pat
     for folder, words in ((source, r"meta/manip_il\.json is missing"), (tmp_path, "is not a LeRobot dataset")):
         with pytest.raises(ManipError, match=words):
             open_source(folder)
+
+
+def test_the_provenance_says_what_episodes_drew_from_and_merging_keeps_it():
+    varied = Condition("varied", size=(0.03, 0.07), brightness=(0.5, 1.0))
+    origin = json.loads(json.dumps(provenance(RolloutJob(ENV, "expert", conditions=(varied,)))))
+    plain = provenance(RolloutJob(ENV, "expert"))
+    here = Path("demos")
+    assert recorded_conditions(here, origin) == (varied,)
+    assert recorded_conditions(here, plain) == ()
+    assert recorded_conditions(here, {"merged": [{"name": "a", "provenance": origin}] * 2}) == (varied,)
+    with pytest.raises(ManipError, match="datasets that vary in different ways"):
+        recorded_conditions(here, {"merged": [{"provenance": origin}, {"provenance": plain}]})
+
+
+def test_varied_episodes_have_their_draws_in_every_state_and_the_experts_labels_of_it():
+    varied = Condition("varied", size=(0.03, 0.07), mass=(0.05, 0.3))
+    env, expert = ManipEnv.of(ENV), Expert(build_scene(ENV.robot, ENV.task))
+    job = RolloutJob(ENV, "expert", hold=0, conditions=(varied,))
+    for episode in run_job(job, stream_seeds("demonstrations", 2)):
+        drawn = varied.draw(episode.seed).values
+        for state, action in zip(episode.columns[schema.SIM_STATE], episode.columns[schema.ACTION], strict=True):
+            env.set_state(State.from_vector(state))
+            assert env.world.extents("object") == pytest.approx([drawn["size"]] * 3)
+            assert env.world.variation[3] == drawn["mass"]
+            np.testing.assert_array_equal(expert.label(env.get_state()).action.astype(action.dtype), action)

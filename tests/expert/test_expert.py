@@ -22,10 +22,10 @@ from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import get_task
 
-from ..scenes import SIZES, started
+from ..scenes import sizes_of, started
 from ..tables import SCENES, every_robot, every_scene, every_scene_with_a_cube
 
-DRIVERS = {"expert": (), "random": (), "varied": (SIZES,)}  # the last is the expert with cubes of many sizes
+DRIVERS = ("expert", "random", "varied")  # the last is the expert with cubes of many sizes
 STEEPEST = 50.0  # change of a joint target per change of the object's position [rad/m]
 
 
@@ -38,7 +38,8 @@ def expert_of(robot: str, task: str) -> Expert:
 def visited_states(robot: str, task: str, driver: str) -> tuple[State, ...]:
     """States of two episodes that a driver visited."""
     name, config = "random" if driver == "random" else "expert", EnvConfig(robot, task, horizon=40)
-    episodes = run_job(RolloutJob(config, name, hold=3, conditions=DRIVERS[driver]), stream_seeds("certificate", 2))
+    conditions = tuple(sizes_of(task)) if driver == "varied" else ()
+    episodes = run_job(RolloutJob(config, name, hold=3, conditions=conditions), stream_seeds("certificate", 2))
     return tuple(State.from_vector(row) for episode in episodes for row in episode.columns["sim_state"])
 
 

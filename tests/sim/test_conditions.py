@@ -67,12 +67,22 @@ def test_only_mass_size_and_friction_change_the_model():
 
 
 def test_what_nobody_notices_is_left_out():
-    assert VIEW.for_world(has_object=True, sees=False) is None
-    assert OBJECT.for_world(has_object=False, sees=True) is None
-    assert OBJECT.for_world(has_object=True, sees=False).ranges == {"mass": (0.05, 0.3), "size": (0.04, 0.06)}
-    assert KNOCKED.for_world(has_object=False, sees=False).ranges == {"action_noise": (0.1, 0.1)}
-    assert NOMINAL.for_world(has_object=False, sees=False) == NOMINAL
-    assert VIEW.for_world(has_object=False, sees=True) == VIEW
+    assert VIEW.for_world(has_object=True, sees=False, sizes=(0.03, 0.07)) is None
+    assert OBJECT.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) is None
+    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.03, 0.07)).ranges == {
+        "mass": (0.05, 0.3),
+        "size": (0.04, 0.06),
+    }
+    assert KNOCKED.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)).ranges == {"action_noise": (0.1, 0.1)}
+    assert NOMINAL.for_world(has_object=False, sees=False, sizes=(0.03, 0.07)) == NOMINAL
+    assert VIEW.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) == VIEW
+
+
+def test_sizes_are_those_that_a_task_can_take():
+    assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.05, 0.08)).ranges["size"] == (0.05, 0.06)
+    assert "size" not in OBJECT.for_world(has_object=True, sees=True, sizes=None).ranges
+    with pytest.raises(UsageError, match=r"size is 0[.]04 to 0[.]06 m, and the task takes objects of 0[.]01 to"):
+        OBJECT.for_world(has_object=True, sees=True, sizes=(0.01, 0.03))
 
 
 def test_a_condition_is_its_json_again():

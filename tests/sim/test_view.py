@@ -83,7 +83,7 @@ def test_few_faces_look_like_all_of_them(robot, monkeypatch):
     env = started(robot, cameras=CAMERAS)
     few = env.observe().images
     with monkeypatch.context() as patch:
-        patch.setattr(view, "_with_few_faces", lambda robot, task: build_scene(robot, task).model)
+        patch.setattr(view, "_with_few_faces", lambda *names: build_scene(*names).model)
         render.close()
         every = env.observe().images
     render.close()

@@ -28,7 +28,7 @@ from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import NO_PHASE, Instructing, phases
 
-from ..scenes import SIZES, started, still
+from ..scenes import sizes_of, started, still
 from ..tables import SCENES, WITH_A_CUBE, every_scene, every_task
 
 SEEDS = stream_seeds("certificate", 2)
@@ -105,7 +105,7 @@ def expert_path(robot: str, task: str, other_cubes: bool) -> list[tuple[list[flo
     """Progress along the expert's path, solved episodes each with the environment as it ended."""
     paths = []
     for seed in SEEDS:
-        env = started(robot, task, seed, conditions=[SIZES] if other_cubes else [])
+        env = started(robot, task, seed, conditions=sizes_of(task) if other_cubes else [])
         expert, path = Expert(env.scene), []
         while not env.solved and len(path) < env.config.horizon:
             path.append(env.progress)

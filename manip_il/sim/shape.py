@@ -1,0 +1,115 @@
+"""Shapes and sizes of the object that a task moves, as text: `cylinder:0.04`, `box:0.06x0.03x0.03`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from manip_il.errors import UnknownName, UsageError, shorten
+
+SHORTEST, LONGEST = 0.02, 0.12  # of an object's lengths [m]
+DEFAULT_WIDTH = 0.05  # where none is said [m]
+LIGHTEST = 0.05  # [kg]: a fingertip's contact with less is soft, and what is held creeps out of the hand
+DENSITY = 800.0  # [kg/m^3]: a cube of 5 cm has 0.1 kg
+_CAPSULE = 1.5  # length of a capsule whose length is not said, in diameters
+_SIZES = {
+    "box": "EDGE or LENGTHxWIDTHxHEIGHT",
+    "cylinder": "DIAMETER or DIAMETERxLENGTH",
+    "sphere": "DIAMETER",
+    "capsule": "DIAMETER or DIAMETERxLENGTH",
+}
+SHAPE_HELP = "box, cylinder, sphere or capsule, with lengths [m] as in cylinder:0.04x0.08, box:0.06x0.03x0.03"
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A solid of wood. kind: box, cylinder, sphere or capsule; lengths: along its own axes x, y and z [m].
+
+    Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
+    Raises `UsageError` for a length out of `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
+    """
+
+    kind: str
+    lengths: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        for length in self.lengths:
+            if not SHORTEST <= length <= LONGEST:
+                raise UsageError(f"a {self.kind} of {length:g} m; expected lengths from {SHORTEST} to {LONGEST} m")
+        if self.kind == "capsule" and self.lengths[2] <= self.lengths[0]:
+            raise UsageError(
+                f"a capsule {self.lengths[2]:g} m long and {self.lengths[0]:g} m wide; expected it longer than wide"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Shape:
+        """Return the shape that a text means; raises `UnknownName` or `UsageError`."""
+        kind, colon, size = text.partition(":")
+        if kind not in _SIZES:
+            raise UnknownName("shape", kind, _SIZES)
+        try:
+            numbers = [float(number) for number in size.split("x")] if colon else [DEFAULT_WIDTH]
+            return cls(kind, _lengths(kind, *numbers))
+        except (ValueError, TypeError):
+            raise UsageError(f"size of {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
+
+    def __str__(self) -> str:
+        """Text that means it, as short as can be."""
+        ways = ((self.lengths[0],), (self.lengths[0], self.lengths[2]), self.lengths)
+        fitting = (way for way in ways if (len(way) == 3) <= (self.kind == "box") and self._is(way))
+        return f"{self.kind}:{'x'.join(f'{length:.12g}' for length in next(fitting))}"
+
+    def _is(self, numbers: tuple[float, ...]) -> bool:
+        try:
+            return _lengths(self.kind, *numbers) == self.lengths
+        except TypeError:
+            return False
+
+    @property
+    def size(self) -> tuple[float, ...]:
+        """MuJoCo's `geom_size` of it [m]."""
+        width, _, length = self.lengths
+        if self.kind == "box":
+            return tuple(one / 2 for one in self.lengths)
+        if self.kind == "sphere":
+            return (width / 2,)
+        return width / 2, (length - width if self.kind == "capsule" else length) / 2
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        width, depth, length = self.lengths
+        round_, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
+        volumes = {
+            "box": width * depth * length,
+            "cylinder": round_ * length,
+            "sphere": ball,
+            "capsule": round_ * (length - width) + ball,
+        }
+        return max(LIGHTEST, DENSITY * volumes[self.kind])
+
+    @property
+    def word(self) -> str:
+        """Name of it in an instruction."""
+        return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
+
+    @property
+    def sizes(self) -> tuple[float, float] | None:
+        """Greatest lengths between which it may be scaled and still be grasped, however it lies [m]; None for none."""
+        least, between, most = sorted(self.lengths)
+        low, high = most * _THINNEST / least, most * min(_WIDEST / between, LONGEST / most)
+        return (low, high) if low < high else None
+
+
+def _lengths(kind: str, first: float, second: float | None = None, *rest: float) -> tuple[float, float, float]:
+    """Lengths along the axes of a shape given by as many numbers as it takes; raises `TypeError` for another count."""
+    if kind == "box" and (second is None) != (len(rest) == 1):
+        return first, first if second is None else second, rest[0] if rest else first
+    if rest or (second is not None and kind in ("box", "sphere")):
+        raise TypeError(kind)
+    longer = first * _CAPSULE if kind == "capsule" else first
+    return first, first, longer if second is None else second
+
+
+_THINNEST, _WIDEST = 0.02, 0.07  # of a scaled object: its least length, and the one between the fingers at most [m]
+CUBE = Shape("box", (DEFAULT_WIDTH, DEFAULT_WIDTH, DEFAULT_WIDTH))

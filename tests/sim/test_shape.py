@@ -1,0 +1,105 @@
+"""Shapes of objects as text, and what they weigh."""
+
+from __future__ import annotations
+
+import mujoco
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.errors import UsageError
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.scene import build_scene
+from manip_il.sim.shape import CUBE, LIGHTEST, Shape
+from manip_il.sim.variation import extents
+from manip_il.tasks.table import get_task
+
+lengths = st.integers(20, 120).map(lambda millimetres: millimetres / 1000)
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [
+        ("box", (0.05, 0.05, 0.05)),
+        ("box:0.03", (0.03, 0.03, 0.03)),
+        ("box:0.06x0.03x0.02", (0.06, 0.03, 0.02)),
+        ("cylinder:0.04", (0.04, 0.04, 0.04)),
+        ("cylinder:0.04x0.08", (0.04, 0.04, 0.08)),
+        ("sphere:0.06", (0.06, 0.06, 0.06)),
+        ("capsule:0.04", (0.04, 0.04, 0.06)),
+        ("capsule:0.03x0.1", (0.03, 0.03, 0.1)),
+    ],
+)
+def test_a_text_means_lengths_along_the_shapes_own_axes(text: str, meant: tuple[float, float, float]):
+    assert Shape.parse(text).lengths == pytest.approx(meant)
+
+
+@given(st.sampled_from(["box", "cylinder", "sphere"]), lengths, lengths, lengths)
+def test_a_shapes_text_means_the_shape(kind: str, x: float, y: float, z: float):
+    shape = Shape(kind, {"box": (x, y, z), "cylinder": (x, x, z), "sphere": (x, x, x)}[kind])
+    assert Shape.parse(str(shape)) == shape
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("ball", "unknown shape 'ball'"),
+        ("sphere:0.01", "a sphere of 0.01 m; expected lengths from 0.02 to 0.12 m"),
+        ("box:nan", "expected lengths from 0.02 to 0.12 m"),
+        ("box:0.03x0.04", "expected box:EDGE or LENGTHxWIDTHxHEIGHT"),
+        ("sphere:0.03x0.04", "expected sphere:DIAMETER"),
+        ("cylinder:wide", "expected cylinder:DIAMETER or DIAMETERxLENGTH"),
+        ("capsule:0.05x0.04", "a capsule 0.04 m long and 0.05 m wide; expected it longer than wide"),
+    ],
+)
+def test_what_is_no_shape_is_refused_in_one_line(text: str, words: str):
+    with pytest.raises(UsageError, match=words) as refused:
+        EnvConfig(object=text)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["box:0.06x0.03x0.04", "cylinder:0.04x0.08", "sphere:0.06", "capsule:0.04x0.1"])
+def test_the_model_has_the_lengths_and_the_mass(text: str):
+    shape, scene = Shape.parse(text), build_scene("panda", "pick_place", text)
+    one = scene.objects["object"]
+    kind, size = int(scene.model.geom_type[one.geom]), scene.model.geom_size[one.geom]
+    assert extents(kind, size) == pytest.approx(shape.lengths)
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="solid").add_geom(
+        type=scene.model.geom_type[one.geom], size=[*shape.size, 0, 0][:3], density=800
+    )
+    assert shape.mass == pytest.approx(spec.compile().body("solid").mass[0])
+    assert scene.model.body_mass[one.body] == shape.mass >= LIGHTEST
+
+
+def test_a_cube_of_5_cm_is_the_default():
+    assert EnvConfig(object="box:0.05") == EnvConfig(object="box") == EnvConfig()
+    assert CUBE.mass == pytest.approx(0.1)
+
+
+def test_what_is_wider_than_the_gripper_opens_is_refused_with_both_numbers():
+    with pytest.raises(UsageError, match=r"'object' is 0.090 m wide, and the gripper of panda opens to 0.078 m"):
+        build_scene("panda", "pick_place", "sphere:0.09")
+    with pytest.raises(UsageError, match=r"0.080 m wide"):  # on its largest face, nothing narrower is left
+        build_scene("panda", "lift", "box:0.08x0.1x0.02")
+
+
+def test_a_task_with_objects_of_its_own_takes_no_other():
+    with pytest.raises(UsageError, match=r"'sphere:0[.]04', but stack has objects of its own; it is for lift"):
+        EnvConfig(task="stack", object="sphere:0.04")
+
+
+def test_an_instruction_names_the_shape():
+    assert get_task("lift", "capsule:0.03").instruction == "Lift the capsule to the green goal above it."
+    assert get_task("lift", "box:0.03").instruction == get_task("lift").instruction
+
+
+@given(lengths, lengths, lengths)
+def test_a_shape_in_any_of_its_sizes_fits_between_fingers(x: float, y: float, z: float):
+    least, between, most = sorted((x, y, z))
+    if (sizes := Shape("box", (x, y, z)).sizes) is None:
+        assert most * 0.02 / least >= min(0.12, most * 0.07 / between) - 1e-9
+        return
+    low, high = sizes
+    assert low * least / most == pytest.approx(0.02)
+    assert high * between / most <= 0.07 + 1e-9
