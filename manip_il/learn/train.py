@@ -78,7 +78,6 @@ def fit(
     Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the
     data. The same table, config and number of threads give the same bits, resumed or not. Metrics go to `on_log`,
     `metrics.jsonl`, and where the config says.
-
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for
     data or a loss that is not finite, `MismatchError` for a table that does not fit `spec` or a
     run that is resumed on other data or options, and what `conversion_for` raises.
@@ -91,9 +90,8 @@ def fit(
     rows = learning_rows(table, conversion)
     drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
     options = _options(lerobot)
-    meta = CheckpointMeta.of(
-        spec, fingerprint, options, datasets=sources.to_json() if sources else (), action_space=conversion.space
-    )
+    data = sources.to_json() if sources else ()
+    meta = CheckpointMeta.of(spec, fingerprint, options, datasets=data, action_space=conversion.space)
     digest = _digest(rows, drawn)
     key = {"data": digest, "options": {k: v for k, v in options.items() if k not in _FREE_ON_RESUME}}
     with threads(config.threads):

@@ -1,3 +1,15 @@
 """Tasks: a file each. Names in `table.py`'s order, for help that needs no simulator."""
 
-NAMES = ("reach", "lift", "pick_place", "push", "press", "stack", "drawer", "clear_table")
+NAMES = (
+    "reach",
+    "lift",
+    "pick_place",
+    "push",
+    "press",
+    "stack",
+    "drawer",
+    "clear_table",
+    "insert",
+    "insert_tight",
+    "sort",
+)

@@ -120,6 +120,7 @@ class Insert:
     name: str = "insert"
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
+    sizes: tuple[float, float] | None = None
     limits: Limits = field(default=Limits(tolerance=0.004, horizon=400))
     objects: tuple[str, ...] = (PEG,)
     grasped: tuple[str, ...] = (PEG,)

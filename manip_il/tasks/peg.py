@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots.reach import ARRIVES
+from manip_il.robots.reach import ARRIVES, reach_of
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, angle_between, lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
@@ -160,7 +160,7 @@ def _grip(world: World) -> Grip:
 def _farthest(scene: Scene) -> float:
     """How far from the robot along x the hand gets to the table [m]."""
     x, y = scene.robot.workspace.centre
-    while scene.reach.error((x + 0.01, y, 0.0)) < ARRIVES:
+    while reach_of(scene.robot).error((x + 0.01, y, 0.0)) < ARRIVES:
         x += 0.01
     return x
 

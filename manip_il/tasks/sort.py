@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.bins import LIFT, LIFT_SLOPE, OVER, WALL, add_bin, drop_place, drop_rungs, is_in
+from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in
 from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
 from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
@@ -86,7 +86,7 @@ def _to(world: World) -> F64:
 def _carry_progress(world: World) -> float:
     """Progress by the way that is left around the other bins, and by the height that is missing on it, 0 to 1."""
     along, across, up = (_place(world) - world.pose(asked(world)).position).tolist()
-    lift = min(LIFT, LIFT_SLOPE * max(0.0, math.hypot(along, across) - INSIDE[0]))
+    lift = OVER_WALL.over(max(0.0, math.hypot(along, across) - INSIDE[0]))
     return nearness(abs(along) + abs(across) + max(0.0, up + lift))
 
 
@@ -181,6 +181,7 @@ class Sort:
     limits: Limits = _LIMITS
     objects: tuple[str, ...] = tuple(COLOURS)
     grasped: tuple[str, ...] = tuple(COLOURS)
+    sizes: tuple[float, float] | None = (0.03, 0.04)
     rungs: tuple[Rung, ...] = _RUNGS
 
     def instruction_in(self, world: World) -> str:
