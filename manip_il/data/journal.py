@@ -115,8 +115,7 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
             pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
             columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
         final = take_final(columns)
-        ends = header.success, header.success_at_end
-        episode = Episode(header.seed, columns, *ends, final, header.instruction)
+        episode = Episode(header.seed, columns, header.success, header.success_at_end, final, header.instruction)
         if len(episode) != header.frames:
             raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
         return header, episode
