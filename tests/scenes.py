@@ -52,6 +52,11 @@ def cube(env: ManipEnv) -> np.ndarray:
     return env.data.joint(TASKS[env.task].grasped[0]).qpos[:3].copy()
 
 
+def half_height(world: World, name: str) -> float:
+    """Half the height of an object as it lies, its faces level or upright [m]."""
+    return float(np.abs(world.pose(name).rotation[2]) @ np.array(world.extents(name))) / 2
+
+
 def in_hand(env: ManipEnv) -> np.ndarray:
     """The cube's position in the hand's frame [m]."""
     return env.world.ee.rotation.T @ (cube(env) - env.world.ee.position)

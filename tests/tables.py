@@ -14,10 +14,13 @@ from manip_il.tasks.table import TASKS
 ONE_CUBE = ("reach", "lift", "pick_place")
 SCENES = [(robot, task) for robot in ROBOTS for task in TASKS if task in ONE_CUBE or robot == next(iter(ROBOTS))]
 GRASPING = [(robot, task) for robot, task in SCENES if TASKS[task].grasped]
+WITH_A_PEG = [(robot, task) for robot, task in GRASPING if task in ("insert", "insert_tight")]  # it may lie
+WITH_CUBES = [scene for scene in GRASPING if scene not in WITH_A_PEG]
 WITH_A_CUBE = [(robot, task) for robot, task in GRASPING if task in ONE_CUBE]
 
 every_robot = pytest.mark.parametrize("robot", list(ROBOTS))
 every_task = pytest.mark.parametrize("task", list(TASKS))
 every_scene = pytest.mark.parametrize(("robot", "task"), SCENES)
 every_scene_that_grasps = pytest.mark.parametrize(("robot", "task"), GRASPING)
+every_scene_with_cubes = pytest.mark.parametrize(("robot", "task"), WITH_CUBES)
 every_scene_with_a_cube = pytest.mark.parametrize(("robot", "task"), WITH_A_CUBE)

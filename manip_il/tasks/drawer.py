@@ -10,9 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
+from manip_il.tasks.cabinet import (
+    BAR,
+    BAR_HALF,
+    BAR_Z,
+    CABINET,
+    INSIDE,
+    OPEN,
+    WALL,
+    add_cabinet,
+    hand_at_handle,
+    middle_of_drawer,
+    pulled,
+)
 from manip_il.tasks.grasp import angle_ahead, angle_from_down, hand_down, lie_of
 from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go, nearness
-from manip_il.tasks.objects import GREY, WOOD, add_cube, add_furniture, add_part
+from manip_il.tasks.objects import add_cube
 from manip_il.tasks.pick_place import OBJECT, observe_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
@@ -20,23 +33,10 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 
-CABINET, TRAY, BAR = "cabinet", "drawer", "handle"
 HALF = 0.02  # of the cube's edge [m]
-# The cabinet's frame lies on the table under the handle of the closed drawer, x into the cabinet.
-GAP = 0.056  # of the handle's middle from the drawer's front [m]
-INSIDE = (0.05, 0.06)  # half the drawer's inner length and width [m]
-WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height of walls, floor, front; half a wall [m]
-ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
-MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
-BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
-OPEN, OPEN_ENOUGH, SHUT = (
-    0.125,
-    0.105,
-    0.008,
-)  # how far the drawer is pulled, may be for the object to go in, is shut [m]
+OPEN_ENOUGH, SHUT = 0.105, 0.008  # how far the drawer is pulled for the object to go in, and is shut at most [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
-HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
 AROUND = (0.024, 0.03, 0.018, 0.25)  # of the hand off the handle while it moves it: x, y, z [m], angle [rad]
 HOVER, SLOPE = 0.08, 2.0  # of the hand over the handle on its way there [m]; height gained per distance from it
 BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.055  # of the object from the closed drawer's handle at the start [m]
@@ -51,24 +51,10 @@ WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.10, -0.06, (-0.04, 0.15)
 _STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
 
 
-def pulled(world: World) -> float:
-    """Return how far the drawer is open [m]."""
-    return float(world.pose(CABINET).position[0] - world.pose(TRAY).position[0])
-
-
 def is_inside(world: World) -> bool:
     """Return whether the object is in the drawer."""
-    x, y, z = (world.pose(OBJECT).position - _middle(world)).tolist()
+    x, y, z = (world.pose(OBJECT).position - middle_of_drawer(world)).tolist()
     return abs(x) < INSIDE[0] and abs(y) < INSIDE[1] and z < WALL + 0.01
-
-
-def _middle(world: World) -> F64:
-    """Middle of the drawer's floor, (3,)."""
-    return world.pose(TRAY).position + [MIDDLE, 0.0, FLOOR]
-
-
-def _bar(world: World) -> F64:
-    return world.pose(TRAY).position + [0.0, 0.0, HAND_Z]
 
 
 def _yaw(world: World) -> float:
@@ -78,7 +64,7 @@ def _yaw(world: World) -> float:
 
 
 def _at_bar(world: World) -> bool:
-    x, y, z = (world.ee.position - _bar(world)).tolist()
+    x, y, z = (world.ee.position - hand_at_handle(world)).tolist()
     most_x, most_y, most_z, most_angle = AROUND
     return (
         abs(x) < most_x
@@ -91,7 +77,7 @@ def _at_bar(world: World) -> bool:
 
 def _to_bar(world: World) -> Target:
     """Over the handle and down around it; straight up if too low beside it."""
-    ee, bar, yaw = world.ee, _bar(world), _yaw(world)
+    ee, bar, yaw = world.ee, hand_at_handle(world), _yaw(world)
     off = math.hypot(*(bar - ee.position)[:2]) + 0.05 * max(0.0, angle_from_down(ee.rotation, yaw) - 0.1)
     height = min(HOVER, SLOPE * max(0.0, off - 0.006))
     if abs(world.opening - FINGERS) > 0.012:
@@ -105,7 +91,7 @@ def _move_drawer(world: World, to: float) -> Target:
     """Move the drawer by its handle until it is open so far [m]."""
     way = pulled(world) - to
     step = way + math.copysign(SLACK, way)
-    return Target(_bar(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
+    return Target(hand_at_handle(world) + [step, 0.0, 0.0], hand_down(_yaw(world)), FINGERS, max_step=_STEP)
 
 
 def _is_shut(world: World) -> bool:
@@ -133,7 +119,7 @@ def _carry(world: World) -> Target:
 
 def _place(world: World) -> F64:
     """Where the object's centre is let go in the drawer, (3,)."""
-    return _middle(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
+    return middle_of_drawer(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
 
 
 def _leave(world: World) -> Target:
@@ -143,7 +129,7 @@ def _leave(world: World) -> Target:
 
 
 def _is_around_bar(world: World) -> bool:
-    x, y, z = (world.ee.position - _bar(world)).tolist()
+    x, y, z = (world.ee.position - hand_at_handle(world)).tolist()
     return abs(x) < LEFT[0] and abs(y) < LEFT[1] and z < LEFT[2]
 
 
@@ -254,34 +240,7 @@ class Drawer:
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the cube, and a cabinet with a drawer."""
         add_cube(spec, OBJECT, HALF)
-        cabinet = add_furniture(spec, CABINET)
-        front = GAP + 2 * THIN  # where the drawer's inside begins
-        length, width = INSIDE
-        deep, wide = length + 2 * THIN, width + 3 * THIN  # of the cabinet, half
-        back = front + 2 * deep
-        for side, sign in (("left", 1), ("right", -1)):
-            add_part(
-                cabinet, f"cabinet {side}", (deep, THIN, ROOF / 2), (front + deep, sign * (wide + THIN), ROOF / 2), WOOD
-            )
-        add_part(cabinet, "cabinet back", (THIN, wide + 2 * THIN, ROOF / 2), (back + THIN, 0, ROOF / 2), WOOD)
-        add_part(
-            cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD
-        )
-        tray = cabinet.add_body(name=TRAY)
-        tray.add_joint(
-            name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN + 0.01],
-            damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
-        )  # fmt: skip
-        middle = front + length
-        add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
-        for side, sign in (("left", 1), ("right", -1)):
-            add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, sign * (width + THIN), WALL / 2), WOOD)
-        add_part(tray, "drawer back", (THIN, width, WALL / 2), (front + 2 * length + THIN, 0, WALL / 2), WOOD)
-        add_part(tray, "drawer front", (THIN, wide + 2 * THIN, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
-        add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
-        for side, sign in (("left", 1), ("right", -1)):
-            add_part(tray, f"{BAR} {side}", (GAP / 2, BAR_HALF, BAR_HALF), (GAP / 2, sign * BAR_LENGTH, BAR_Z), GREY)
-        spec.add_exclude(bodyname1=CABINET, bodyname2=TRAY)
+        add_cabinet(spec)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any yaw."""
@@ -297,19 +256,19 @@ class Drawer:
 
     def observe(self, world: World) -> Observed:
         """Return hand, cube and handle, how far the drawer is open, and the ways between them."""
-        ee, bar, cube = world.ee.position, _bar(world), world.pose(OBJECT).position
+        ee, bar, cube = world.ee.position, hand_at_handle(world), world.pose(OBJECT).position
         return {
             **observe_hand(world),
             **observe_object(world, OBJECT),
             BAR: bar,
             "drawer.open": pulled(world),
             "handle_from_ee": bar - ee,
-            "drawer_from_object": _middle(world) - cube,
+            "drawer_from_object": middle_of_drawer(world) - cube,
         }
 
     def error(self, world: World) -> float:
         """Return how far the drawer is open [m], and as much more as the object is from its inside."""
-        missing = 0.0 if is_inside(world) else math.dist(world.pose(OBJECT).position, _middle(world))
+        missing = 0.0 if is_inside(world) else math.dist(world.pose(OBJECT).position, middle_of_drawer(world))
         return max(0.0, pulled(world)) + missing
 
     def progress(self, world: World) -> float:
@@ -320,9 +279,9 @@ class Drawer:
                 return 1.0
             if _hand_is_in(world):
                 return 0.75
-            return 0.8 + 0.05 * nearness(math.dist(world.ee.position, _bar(world))) + 0.15 * (1 - opened)
+            return 0.8 + 0.05 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.15 * (1 - opened)
         if held(world, OBJECT) and _is_open(world):
             return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
             return 0.3 + 0.2 * grasp_progress(world, OBJECT)
-        return 0.1 * nearness(math.dist(world.ee.position, _bar(world))) + 0.2 * opened
+        return 0.1 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.2 * opened

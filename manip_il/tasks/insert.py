@@ -13,23 +13,9 @@ from manip_il.sim.world import World
 from manip_il.tasks.grasp import angle_between, lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
-from manip_il.tasks.peg import (
-    HOLE,
-    LIFT,
-    LIFT_SLOPE,
-    PEG,
-    PEG_RUNGS,
-    Way,
-    azimuth,
-    hangs,
-    held,
-    lower_end,
-    move,
-    peg_progress,
-    upper_axis,
-    way_to,
-)
+from manip_il.tasks.peg import HOLE, PEG, azimuth, held, lower_end, upper_axis
 from manip_il.tasks.reach import observe_hand
+from manip_il.tasks.set_up import LIFT, LIFT_SLOPE, PEG_RUNGS, Way, hangs, move, peg_progress, way_to
 from manip_il.tasks.starts import draw_resting_place, draw_until, draw_yaw
 from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 

@@ -1,9 +1,8 @@
-"""Grip and set upright a peg that stands, lies or falls: geometry and rungs for tasks with one."""
+"""How a peg stands, lies or is held, and how the hand grips it, as pure geometry of a world."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -13,8 +12,6 @@ from numpy.typing import NDArray
 from manip_il.robots.reach import ARRIVES, reach_of
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import OPEN_SLACK, angle_between, lie_of
-from manip_il.tasks.ladder import CLOSED, nearness
-from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 
@@ -28,17 +25,7 @@ AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand o
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.075, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
 BARE = 0.012  # of the hand beside a held peg's faces and beyond its ends [m]
-LIFT, LIFT_SLOPE = 0.025, 2.5  # of the peg's lower end over the rim; per error
-ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
-SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
-LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
-CLEAR = 0.03  # of the hand over the peg once it has let go [m]
-ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand sets the peg up [rad]
-NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
-FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
 ASLANT = 0.40  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
-ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 
 
 class Grip(NamedTuple):
@@ -54,21 +41,6 @@ class Grip(NamedTuple):
     angle: float
     height: float
     open_enough: bool
-
-
-class Way(NamedTuple):
-    """Way that is left for a peg in the hand.
-
-    rotation: of the hand when the peg stands upright, in line with the hole if it is for that, (3, 3); angle: to there
-    [rad]. off: sideways to there [m], (2,). error: both together [m]. low: of the peg's lower end over the table, when
-    it stands [m].
-    """
-
-    rotation: F64
-    angle: float
-    off: F64
-    error: float
-    low: float
 
 
 def hand_at(yaw: float, pitch: float) -> F64:
@@ -101,7 +73,7 @@ def _upper_axis(world: World) -> F64:
     """In the hand the end that it holds; else the upper end, or of a peg that lies the one away from the robot."""
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
-    if _stands(world):
+    if stands(world):
         return math.copysign(1.0, axis[2]) * axis
     if held(world):
         return math.copysign(1.0, float(axis @ (ee.position - peg.position))) * axis
@@ -114,7 +86,8 @@ def _far_turn(yaw: float, at: float) -> float:
     return abs(yaw - at) + 0.5 * abs(yaw)
 
 
-def _stands(world: World) -> bool:
+def stands(world: World) -> bool:
+    """Return whether the peg stands, or nearly so: it is grasped from above."""
     return abs(world.pose(PEG).rotation[2, 2]) > math.cos(STANDS)
 
 
@@ -126,8 +99,8 @@ def held(world: World) -> bool:
     return max(x, y) < side / 2 + BARE and z < length / 2 + BARE and world.touched(PEG)
 
 
-def _is_aslant(world: World) -> bool:
-    """Whether the hand is at an angle to the peg, and does not point along it: it cannot carry it into a hole."""
+def is_aslant(world: World) -> bool:
+    """Return whether the hand does not point along the peg: it cannot carry it into a hole."""
     return -float(upper_axis(world) @ world.ee.rotation[:, 2]) < math.cos(ASLANT)
 
 
@@ -141,7 +114,7 @@ def _grip(world: World) -> Grip:
     width, _, length = world.extents(PEG)
     axis = upper_axis(world)
     position = peg.position + (length / 2 - FROM_END) * axis
-    if _stands(world):
+    if stands(world):
         at = azimuth(ee.rotation)
         yaw = min((grasp[0] for grasp in lie_of(world, PEG).grasps), key=lambda yaw: _far_turn(yaw, at))
         rotation = hand_at(yaw, 0.0)
@@ -163,174 +136,3 @@ def _farthest(scene: Scene) -> float:
     while reach_of(scene.robot).error((x + 0.01, y, 0.0)) < ARRIVES:
         x += 0.01
     return x
-
-
-def to_stand(world: World) -> Way:
-    """Return what is left to do for a peg in the hand that is to stand on the table first; computed once a state."""
-    return world.remember("to stand", lambda: _to_stand(world))
-
-
-def _to_stand(world: World) -> Way:
-    """Turn the peg upright on the shortest way, and the hand to one side; near the middle, and not at the hole."""
-    hand, axis = world.ee.rotation, upper_axis(world)
-    upright = _upright(axis) @ hand
-    y, at = float(world.ee.position[1]) - world.scene.robot.workspace.centre[1], azimuth(hand)
-    least, most = ASIDE
-    yaw = min(
-        (math.copysign(min(most, max(least, side * at)), side) for side in (1.0, -1.0)),
-        key=lambda yaw: abs(yaw - at) + 8.0 * max(0.0, math.copysign(y, yaw * y)),
-    )
-    turn = yaw - azimuth(upright)
-    c, s = math.cos(turn), math.sin(turn)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ upright
-    return way_to(world, rotation, _free_place)
-
-
-def _upright(axis: F64) -> F64:
-    """The rotation on the shortest way that turns an axis up, (3, 3)."""
-    x, y, z = axis.tolist()
-    if z < -0.99:
-        return np.diag([1.0, -1.0, -1.0])
-    k = 1 / (1 + z)
-    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
-
-
-def _free_place(world: World, end: F64) -> F64:
-    """Where a peg is set up: on the table, nearest to where its lower end (3,) would be, (3,) [m]."""
-    x, y, _ = end.tolist()
-    middle = world.scene.robot.workspace.centre[0]
-    at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])
-    from_hole = at - world.pose(HOLE).position
-    distance = math.hypot(from_hole[0], from_hole[1])
-    return at + max(0.0, FROM_HOLE / max(distance, 1e-6) - 1) * from_hole
-
-
-def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
-    """Return what is left when the peg turns with the hand to a rotation (3, 3).
-
-    to: where the lower end of the upright peg goes from a point (3,) [m].
-    """
-    ee, peg = world.ee, world.pose(PEG)
-    angle = angle_between(ee.rotation, rotation)
-    end = peg.position - world.extents(PEG)[2] / 2 * upper_axis(world)
-    turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))  # the lower end, once the peg is upright
-    off = (to(world, turned) - turned)[:2]
-    return Way(rotation, angle, off, math.hypot(*off) + ANGLE_AS_LENGTH * angle, float(turned[2]))
-
-
-def _set_up(world: World) -> Target:
-    """Up and upright, to a free place; then down on the table."""
-    way = to_stand(world)
-    return move(world, way, _set_up_height(way) - way.low, sideways_at=0.03)
-
-
-def _set_up_height(way: Way) -> float:
-    return min(LIFT, LIFT_SLOPE * max(0.0, way.error - 0.006)) - 0.001
-
-
-def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
-    """Return the target that moves the peg with the hand.
-
-    missing: height [m]; sideways_at: how little may be missing for a move sideways.
-    """
-    sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
-    turn = 0.6 * min(1.0, max(0.05, 1.0 - missing / 0.06))
-    position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
-    step = min(FAST, SLOW + max(0.0, way.error - 0.02))
-    return Target(position, way.rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
-
-
-def is_up(world: World) -> bool:
-    """Return whether the peg stands on the table in a hand that does not point down, or is just above that."""
-    stands = float(upper_axis(world)[2]) > math.cos(0.15) and lower_end(world)[2] < ON_TABLE
-    return stands and _is_aslant(world) and _hand_is_at(world)
-
-
-def _hand_is_at(world: World) -> bool:
-    x, y, z = (world.ee.position - lower_end(world)).tolist()
-    return math.hypot(x, y) < 0.03 and z < world.extents(PEG)[2] + CLEAR
-
-
-def _let_stand(world: World) -> Target:
-    """Open the fingers, then rise straight up."""
-    ee, width = world.ee, world.extents(PEG)[0]
-    free = world.opening > width + LET_GO and not world.touched(PEG)
-    up = 0.1 if free else 0.0
-    return Target(
-        ee.position + [0.0, 0.0, up], ee.rotation.copy(), min(width + RELEASE, world.most_opening), max_step=0.04
-    )
-
-
-def _falls(world: World) -> bool:
-    """Whether the peg, between the fingers or just under their tips, neither stands nor lies."""
-    peg, ee = world.pose(PEG), world.ee
-    way = ee.position - peg.position
-    along = float(peg.rotation[:, 2] @ way)
-    beside = ee.rotation.T @ (way - along * peg.rotation[:, 2])
-    between = abs(beside[1]) < world.opening / 2 and math.hypot(*beside) < BESIDE
-    if not between or abs(along) > world.extents(PEG)[2] / 2:
-        return False
-    return lie_of(world, PEG).tilt > 0.06 or float(peg.position[2]) - lie_of(world, PEG).tall / 2 > IN_AIR
-
-
-def _catch(world: World) -> Target:
-    """Close the fingers, and go with the peg."""
-    peg, ee = world.pose(PEG), world.ee
-    axis = upper_axis(world)
-    along = float(axis @ (ee.position - peg.position))
-    down = (world.extents(PEG)[2] / 2 - FROM_END - along) * axis
-    return Target(ee.position + down, ee.rotation.copy(), CLOSED)
-
-
-def _at_grip(world: World) -> bool:
-    grip = grip_of(world)
-    box = AT_GRIP if grip.open_enough else CLOSING
-    offset = np.abs(grip.rotation.T @ (world.ee.position - grip.position))
-    return bool((offset < box).all()) and grip.angle < AT_ANGLE
-
-
-def _close(world: World) -> Target:
-    grip = grip_of(world)
-    return Target(grip.position, grip.rotation, CLOSED)
-
-
-def _approach(world: World) -> Target:
-    """Over the grip and down to it, fingers open; straight up if too low beside it."""
-    grip, ee = grip_of(world), world.ee.position
-    height = grip.height if grip.open_enough else max(grip.height, OVER)
-    too_low = grip.position[2] + height - ee[2]
-    sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
-    position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.most_opening)
-
-
-def hangs(world: World) -> bool:
-    """Return whether the peg hangs from a hand that points down."""
-    return held(world) and not _is_aslant(world) and _stands(world)
-
-
-def peg_progress(world: World) -> float:
-    """Return progress of gripping a peg from above, 0 to 1, after setting it up where it lies."""
-    grip = grip_of(world)
-    above = float(world.ee.position[2] - grip.position[2])
-    if is_up(world):
-        return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
-    if held(world):
-        way = to_stand(world)
-        height = _set_up_height(way)
-        rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
-        return 0.33 + 0.2 * nearness(rest)
-    near = nearness(grip.off + abs(above - grip.height) + grip.height)
-    return 0.68 + 0.31 * near if _stands(world) else 0.3 * near
-
-
-PEG_RUNGS = (
-    Rung("let_stand", "the peg has been set up on the table, and the hand lets go of it", is_up, _let_stand),
-    Rung("set_up", "the peg is held aslant, and set up on the table", held, _set_up),
-    Rung("catch", "the peg falls between the open fingers, and they close", _falls, _catch),
-    Rung("grasp", "the fingers are around the peg and close, but do not hold it yet", _at_grip, _close),
-    Rung("open", "the fingers are closed, or not open wide enough to go around the peg",
-         lambda w: not grip_of(w).open_enough, _approach),
-    Rung("descend", "the hand goes down to the peg", lambda w: grip_of(w).height < OVER, _approach),
-    Rung("approach", "the hand is on its way to above the peg", lambda w: True, _approach),
-)  # fmt: skip

@@ -39,10 +39,10 @@ HALF = 0.018  # of a cube's edge [m]
 APART = 0.085  # of the cubes at the start [m]
 FROM_BINS = 0.14  # of a cube from the row's middle at the start, sideways [m]
 BEYOND = 0.15  # of a cube at most from the workspace's middle on the side without bins [m]
-LOWER = 0.04  # of a carried cube than over a deeper box: what falls from there does not fly far [m]
+LOWER = 0.028  # of a carried cube than over a deeper box: what falls from there does not fly far [m]
 STEP = 0.1  # how far ahead of the hand its target runs while it carries: soon there, it loses less on the way [m]
 SLOPE = 5.0  # of the way around other bins: distance from the row per distance along it
-NEAR_WALL = 0.045  # of a cube from a wall that a finger has no room at [m]
+NEAR_WALL, BY_WALL = 0.045, 0.065  # of a cube in a bin and beside it from the wall, where a finger has no room [m]
 NARROW = 0.024  # opening beyond a cube's width where it lies in a bin [m]
 TURNED = 0.3  # of the hand from such a grasp: it stays over the cube until it has turned [rad]
 AWAY = 0.2  # of the hand over the bin once the cube is in it [m]
@@ -116,7 +116,7 @@ def _free_yaw(world: World) -> float | None:
     row = [world.pose(one).position for one in BINS.values()]
     off = abs(y - row[0][1])
     beyond = max(min(float(at[0]) for at in row) - x, x - max(float(at[0]) for at in row)) - PITCH / 2
-    if off > INSIDE[1] + NEAR_WALL or beyond > NEAR_WALL:
+    if off > INSIDE[1] + BY_WALL or beyond > BY_WALL:
         return None
     return 0.0 if beyond > 0.0 or off < INSIDE[1] - NEAR_WALL else math.pi / 2
 

@@ -8,10 +8,11 @@ import pytest
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names, joint_state
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import World
+from manip_il.tasks.sort import asked
 from manip_il.tasks.table import TASKS
 
-from ..scenes import cube, started
-from ..tables import every_scene, every_scene_that_grasps
+from ..scenes import started
+from ..tables import every_scene, every_scene_with_cubes
 
 
 def values_of(env: ManipEnv) -> dict[str, float]:
@@ -34,19 +35,20 @@ def test_the_hand_and_a_goal_are_shown_where_they_are(robot: str, task: str):
         np.testing.assert_allclose(env.world.goal, env.data.mocap_pos[0])
 
 
-@every_scene_that_grasps
+@every_scene_with_cubes
 def test_the_cubes_numbers_are_what_their_names_say(robot: str, task: str):
     env = started(robot, task)
     values = values_of(env)
-    name = TASKS[task].grasped[0]
+    thing = asked(env.world) if task == "sort" else TASKS[task].grasped[0]
+    name = "cube" if task == "sort" else thing  # in words, the one that the episode is about
     place, hand = vector(values, name), vector(values, "ee")
-    np.testing.assert_allclose(place, cube(env), atol=1e-6)
+    np.testing.assert_allclose(place, env.data.joint(thing).qpos[:3], atol=1e-6)
     np.testing.assert_allclose(vector(values, f"{name}_from_ee"), place - hand, atol=1e-6)
-    w, _, _, z = env.data.joint(name).qpos[3:]
+    w, _, _, z = env.data.joint(thing).qpos[3:]
     turns = np.exp(4j * 2 * np.arctan2(z, w))
     assert (values[f"{name}.cos4yaw"], values[f"{name}.sin4yaw"]) == pytest.approx((turns.real, turns.imag), abs=1e-6)
     assert values[f"{name}.tilt"] == pytest.approx(0, abs=1e-6)
-    assert values[f"{name}.width"] == pytest.approx(env.world.extents(name)[0])
+    assert values[f"{name}.width"] == pytest.approx(env.world.extents(thing)[0])
     env.world.vary(with_drawn(env.scene.nominal, {"size": 0.03}))
     env.world.update()
     assert values_of(env)[f"{name}.width"] == pytest.approx(0.03)

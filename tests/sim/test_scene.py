@@ -10,7 +10,7 @@ from manip_il.errors import UnknownName
 from manip_il.sim.scene import DT_SIM, _build, build_scene, camera_id
 from manip_il.tasks.objects import CUBE_HALF
 
-from ..scenes import cube, drive_until, in_hand, started, still
+from ..scenes import cube, drive_until, half_height, in_hand, started, still
 from ..tables import SCENES, every_robot, every_scene
 
 
@@ -24,7 +24,7 @@ def test_an_arm_told_to_stand_still_and_an_untouched_cube_do(robot: str, task: s
     np.testing.assert_allclose(env.data.qpos[env.scene.arm_q], q, atol=2e-3)
     for name, at in lying.items():
         np.testing.assert_allclose(env.world.pose(name).position, at, atol=1e-3)
-        assert env.world.pose(name).position[2] == pytest.approx(env.world.extents(name)[2] / 2, abs=5e-4)
+        assert env.world.pose(name).position[2] == pytest.approx(half_height(env.world, name), abs=5e-4)
 
 
 @every_robot
