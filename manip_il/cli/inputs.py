@@ -108,6 +108,7 @@ def check_given(config: RunConfig) -> None:
     from manip_il.data.lerobot_read import read_fingerprint, read_spec
     from manip_il.engine.environments import env_spec
     from manip_il.learn.checkpoint import read_meta
+    from manip_il.learn.pretrained import read_config, require_trust
     from manip_il.learn.sources import check_same_sources
 
     here, run = env_spec(config.env, config.cameras), f"{config.env.robot} {config.env.task} of this run"
@@ -117,6 +118,7 @@ def check_given(config: RunConfig) -> None:
         check_dataset(root, spec, read_fingerprint(root))
     if config.start is None:
         return
+    require_trust(read_config(config.start), str(config.start), config.fit.trust, config.start)
     meta = read_meta(config.start)
     cameras = check_policy(config.start, meta, config.env, draw=False, trust=config.fit.trust)
     for what in ("names", "height", "width"):

@@ -178,7 +178,8 @@ def test_runs_of_other_environments_are_refused_by_name(here, policy, error):
     make_run(here / "a", policy)
     make_run(here / "b", policy)
     config = here / "b" / "config.yaml"
-    config.write_text(config.read_text().replace("tolerance: 0.02", "tolerance: 0.03"))
+    config.write_text(config.read_text().replace("tolerance: 0.0\n", "tolerance: 0.03\n"))
     assert compare("a", "b", *SIZES) == 1
     assert "tolerance differs: a has 0.02, b has 0.03" in error()
-    assert OPTIONS.env.tolerance == 0.02
+    assert ENV.tolerance == 0.02, "reach's own, as the run gives none"
+    assert OPTIONS.env.tolerance == 0

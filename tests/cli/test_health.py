@@ -54,7 +54,7 @@ def test_without_any_backend_the_packages_are_named():
 
 
 def test_opengl_that_fails_is_one_line(monkeypatch, error):
-    def fail(*_):
+    def fail(*_, **__):
         raise RenderError("no off-screen OpenGL here")
 
     monkeypatch.setenv("MUJOCO_GL", "egl")

@@ -45,7 +45,8 @@ def named(tmp_path) -> Path:
     """A policy whose options name an encoder."""
     folder = tmp_path / "named"
     folder.mkdir()
-    features = {"input_features": {}, "output_features": {}}
+    action = {"action": {"type": "ACTION", "shape": [8]}}
+    features = {"input_features": {}, "output_features": action}
     config = {"type": "gaussian_actor", "vision_encoder_name": "evil/x", **features}
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "model.safetensors").touch()
@@ -122,7 +123,8 @@ def test_a_training_run_without_its_link_means_its_newest_checkpoint(tmp_path, p
 @pytest.mark.parametrize("command", ["train", "dagger"])
 def test_what_is_fitted_starts_from_the_policy_that_eval_would_measure(command, here, policy):
     run = make_run(here / "run", policy)
-    options = parse(load(command), [*REQUIRED.get(command, []), "--policy.path=run"])
+    task = ["--task.type=reach"] if command == "dagger" else []
+    options = parse(load(command), [*REQUIRED.get(command, []), *task, "--policy.path=run"])
     fit = options.config().fit if command == "dagger" else options._fit_config()  # pyright: ignore[reportAttributeAccessIssue]
     assert Path(LeRobotFit(fit).policy.pretrained_path).resolve() == find_policy(run).resolve()
 
