@@ -146,7 +146,7 @@ def test_another_compiled_model_is_a_warning_that_names_both_sides(source):
     ("entry", "kind", "words"),
     [
         ({"robot": "ur5"}, ManipError, "for the robot 'ur5', which is not known here .known: panda, fetch.*"),
-        ({"task": "stack"}, ManipError, "for the task 'stack', which is not known here"),
+        ({"task": "juggle"}, ManipError, "for the task 'juggle', which is not known here"),
         ({"sim_state_size": 7}, MismatchError, "size of sim_state differs: .* has 7, this program has"),
     ],
 )

@@ -15,6 +15,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
+from manip_il.tasks.table import get_task
 
 STATE, PICTURE = "observation.state", "observation.images.wrist"
 POSES = "observation.environment_state"
@@ -50,7 +51,7 @@ def test_every_task_gives_what_its_features_say(task: str):
     given = {key: tuple(value.shape[1:]) for key, value in seen.items()}
     assert given | {"action": envs.single_action_space.shape} == shapes(config)
     assert envs.call("task_description")[0]
-    assert envs.call("_max_episode_steps") == (100, 100)
+    assert envs.call("_max_episode_steps") == (get_task(TASKS[task][1]).limits.horizon,) * 2
     assert envs.metadata["render_fps"] == 20
 
 
