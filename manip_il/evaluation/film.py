@@ -102,7 +102,10 @@ def encode_picture(picture: NDArray[np.uint8], kind: Literal["png", "jpeg"]) -> 
 
 
 def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "") -> Paths:
-    """Return positions of hand, object (the hand again where the task has none) and goal; needs no OpenGL."""
+    """Return positions of hand, object and goal, which not every task has; needs no OpenGL.
+
+    Of several objects the one that moves most; the hand again where there is none.
+    """
     rows = episode.columns[schema.ENVIRONMENT_STATE][: filmed_steps(episode, spec.fps)].astype(np.float64)
     names = list(spec.environment_state_names)
 
@@ -110,5 +113,8 @@ def paths(episode: Episode, spec: RobotTaskSpec, policy: str, caption: str = "")
         return rows[:, [names.index(f"{thing}.{axis}") for axis in "xyz"]]
 
     hand = positions("ee")
-    obj = positions("object") if "object.x" in names else hand
-    return Paths(policy, hand, obj, positions("goal")[-1], 1 / spec.fps, caption)
+    places = [name.removesuffix(".x") for name in names if name.endswith(".x") and "_from_" not in name]
+    things = [name for name in places if "." not in name and name not in ("ee", "goal") and f"{name}.z" in names]
+    obj = max(map(positions, things), key=lambda rows: float(np.ptp(rows, axis=0).sum()), default=hand)
+    goal = positions("goal")[-1] if "goal" in places else None
+    return Paths(policy, hand, obj, goal, 1 / spec.fps, caption)

@@ -138,23 +138,22 @@ def paired_maps(comparison: Comparison) -> list[FailureMap]:
 
 
 class DrawnPaths(NamedTuple):
-    """Hand, object and goal in one view [px]: lines (T, 2), the goal (2,)."""
+    """Hand, object and goal in one view [px]: lines (T, 2), the goal (2,), None where there is none."""
 
     view: View
-    goal: F64
+    goal: F64 | None
     hand: F64
     object: F64
 
 
 def draw_paths(paths: Paths) -> list[DrawnPaths]:
     """Return the paths from above, and from the side: height over x or y, whichever they use more [px]."""
-    points = np.vstack([paths.hand, paths.obj, paths.goal[None]])
+    goal = np.empty((0, 3)) if paths.goal is None else paths.goal[None]
+    points = np.vstack([paths.hand, paths.obj, goal])
     spread = np.ptp(points, axis=0)
     views = [fit_view(points, *axes, PATHS_HEIGHT) for axes in ((0, 1), (0 if spread[0] >= spread[1] else 1, 2))]
     lines = [line[_evenly(len(line), MAX_POINTS)] for line in (paths.hand, paths.obj)]
-    return [
-        DrawnPaths(view, view.project(paths.goal[None])[0], *(view.project(line) for line in lines)) for view in views
-    ]
+    return [DrawnPaths(view, next(iter(view.project(goal)), None), *map(view.project, lines)) for view in views]
 
 
 def _map_mark(episode: EpisodeResult, outcome: Outcome) -> MapMark | None:

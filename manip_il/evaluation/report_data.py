@@ -124,22 +124,23 @@ class Film:
 class Paths:
     """Positions of hand and object in one episode: a picture that needs no renderer.
 
-    hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m]; dt: between rows [s]. success: None where
-    not known.
+    hand, obj: (T, 3) positions [m] in the world frame; goal: (3,) [m], None where the task has none; dt: between rows
+    [s]. success: None where not known.
     """
 
     policy: str
     hand: F64
     obj: F64
-    goal: F64
+    goal: F64 | None
     dt: float = 0.0
     caption: str = ""
     success: bool | None = None
 
     def __post_init__(self) -> None:
-        shapes = {"hand": np.shape(self.hand), "obj": np.shape(self.obj), "goal": np.shape(self.goal)}
+        goal = {} if self.goal is None else {"goal": np.shape(self.goal)}
+        shapes = {"hand": np.shape(self.hand), "obj": np.shape(self.obj), **goal}
         steps = shapes["hand"][0] if shapes["hand"] else 0
-        if shapes != {"hand": (steps, 3), "obj": (steps, 3), "goal": (3,)} or steps == 0:
+        if shapes != {"hand": (steps, 3), "obj": (steps, 3), **dict.fromkeys(goal, (3,))} or steps == 0:
             raise ManipError(f"paths of {self.policy}: shapes {shapes}; expected hand and obj (T, 3), goal (3,)")
         for name in shapes:
             require_finite(f"paths of {self.policy}, {name}", np.asarray(getattr(self, name)))

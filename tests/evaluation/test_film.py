@@ -12,7 +12,9 @@ from manip_il.engine.environments import env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4, film, filmed_steps, make_film, paths, pictures_of, run_states
+from manip_il.evaluation.maps import draw_paths
 from manip_il.sim.env import EnvConfig
+from manip_il.tasks import NAMES
 
 JOB = RolloutJob(EnvConfig(), "expert", label="last")
 SEED = 4_000_000
@@ -88,6 +90,15 @@ def test_paths_of_a_task_without_an_object_follow_the_hand():
     job = RolloutJob(EnvConfig(task="reach"), "expert")
     drawn = paths(run_states(job, SEED), env_spec(job.env), "expert")
     assert np.array_equal(drawn.hand, drawn.obj)
+
+
+@pytest.mark.parametrize("task", NAMES)
+def test_paths_are_drawn_of_every_task_with_a_goal_or_without(task):
+    job = RolloutJob(EnvConfig(task=task, horizon=20), "expert")
+    drawn = paths(run_states(job, SEED), env_spec(job.env), "expert")
+    assert np.array_equal(drawn.hand, drawn.obj) == (task == "reach")
+    for view in draw_paths(drawn):
+        assert (view.goal is None) == (drawn.goal is None) == (task not in ("reach", "lift", "pick_place", "push"))
 
 
 @pytest.mark.gl

@@ -126,6 +126,14 @@ def test_what_cannot_be_shown_is_refused_by_name():
         Paths("p", np.full((4, 3), np.nan), np.zeros((4, 3)), np.zeros(3))
 
 
+def test_paths_without_a_goal_draw_and_name_none():
+    shown = replace(REPORT, paths=(Paths("Expert", HAND, HAND - 0.01, None, dt=0.05),)).render()
+    with_goal, goal = REPORT.render(), '<i class="key goal">'
+    assert with_goal.count('<circle class="goal"') == 2
+    assert '<circle class="goal"' not in shown
+    assert shown.count(goal) == with_goal.count(goal) - 1
+
+
 def test_a_row_takes_its_numbers_from_an_evaluation():
     episodes = tuple(EpisodeResult(i, i > 0, i > 1, 40, 0.0, detail={"steps_to_success": 10 * i}) for i in range(4))
     result = EvalResult("mlp", "panda", "pick", {}, episodes, EvalSettings(100, 0.02))
