@@ -13,7 +13,7 @@ from typing import Any, override
 import numpy as np
 from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 from lerobot.datasets.aggregate import aggregate_datasets
-from lerobot.datasets.compute_stats import aggregate_stats
+from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
@@ -96,6 +96,11 @@ class Metadata(LeRobotDatasetMetadata):
     episodes_of: tuple[int, ...] = ()
     task_numbers: tuple[I64, ...] = ()
     learnt_actions: NDArray[np.float32] | None = None
+
+    def learn_actions(self, actions: NDArray[np.float32]) -> None:
+        """Learn these (N, n) in place of the column `action`, with statistics of their own."""
+        self.learnt_actions = actions
+        self.stats = {**(self.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
 
     def joint_tasks(self, own: I64) -> I64:
         """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""

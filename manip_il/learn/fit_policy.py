@@ -21,7 +21,6 @@ from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
 from lerobot.common.train_utils import get_step_checkpoint_dir, load_training_state, save_checkpoint
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
@@ -266,9 +265,7 @@ def _convert(dataset: Metadata, conversion: Conversion) -> None:
     """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
     table = read_tables(dataset.roots, [STATE, ACTION])
     same_width(table[ACTION], table[STATE], conversion.space)
-    actions = conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE])
-    dataset.learnt_actions = actions
-    dataset.stats = {**(dataset.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
+    dataset.learn_actions(conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
