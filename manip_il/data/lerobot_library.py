@@ -97,11 +97,6 @@ class Metadata(LeRobotDatasetMetadata):
     task_numbers: tuple[I64, ...] = ()
     learnt_actions: NDArray[np.float32] | None = None
 
-    def learn_actions(self, actions: NDArray[np.float32]) -> None:
-        """Learn these (N, n) in place of the column `action`, with statistics of their own."""
-        self.learnt_actions = actions
-        self.stats = {**(self.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
-
     def joint_tasks(self, own: I64) -> I64:
         """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""
         if len(self.roots) == 1:
@@ -135,6 +130,12 @@ class _Numbered:
         task = int(frame["task_index"])
         more = {"index": self.frames, "episode_index": self.episodes, "task_index": int(self.tasks[task]) - task}
         return frame | {key: frame[key] + number for key, number in more.items()}
+
+
+def learn_actions(meta: Metadata, actions: NDArray[np.float32]) -> None:
+    """Learn these (N, n) in place of the column `action`, with statistics of their own."""
+    meta.learnt_actions = actions
+    meta.stats = {**(meta.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
 
 
 def read_metadata(*roots: Path) -> Metadata:

@@ -24,7 +24,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_library import Metadata, read_metadata
+from manip_il.data.lerobot_library import Metadata, learn_actions, read_metadata
 from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError, UsageError
@@ -265,7 +265,7 @@ def _convert(dataset: Metadata, conversion: Conversion) -> None:
     """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
     table = read_tables(dataset.roots, [STATE, ACTION])
     same_width(table[ACTION], table[STATE], conversion.space)
-    dataset.learn_actions(conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
+    learn_actions(dataset, conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
 
 
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
