@@ -133,7 +133,7 @@ class _Numbered:
 
 
 def learn_actions(meta: Metadata, actions: NDArray[np.float32]) -> None:
-    """Learn these (N, n) in place of the column `action`, with statistics of their own."""
+    """Set what is learnt in place of the column `action`, (N, n), with statistics of its own."""
     meta.learnt_actions = actions
     meta.stats = {**(meta.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
 
