@@ -232,7 +232,7 @@ def lr_at(step: int, steps: int, peak: float) -> float:
 
 
 def _drawn(table: Table, rows: Rows, config: FitConfig, sources: Sources | None) -> NDArray[np.float64] | None:
-    """How often each row of R is drawn, (R,), where the datasets have weights; 0 for those that are held out."""
+    """Weights of the R rows, (R,), where the datasets have weights; 0 for rows that are held out."""
     if sources is None or not sources.weights:
         return None
     train, _ = split_by_episode(rows.episodes, config.eval_split, config.seed)

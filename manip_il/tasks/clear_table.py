@@ -55,7 +55,7 @@ def _current(world: World) -> str:
 
 
 def _to(world: World) -> F64:
-    """Where the current cube is let go: over a quarter of the box of its own."""
+    """Place over its own quarter of the box where the current cube is let go, (3,) [m]."""
     name = current(world)
     slot = list(COLOURS).index(name)
     return drop_place(world, name, BOX, (SLOT * (1 if slot % 2 else -1), SLOT * (1 if slot // 2 else -1)))

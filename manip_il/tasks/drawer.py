@@ -118,7 +118,7 @@ def _carry(world: World) -> Target:
 
 
 def _place(world: World) -> F64:
-    """Where the object's centre is let go in the drawer, (3,)."""
+    """Place in the drawer where the object's centre is let go, (3,) [m]."""
     return middle_of_drawer(world) + [0.0, 0.0, lie_of(world, OBJECT).tall / 2 + DROP]
 
 

@@ -1,4 +1,4 @@
-"""How an object lies, and where a hand that points down grasps it, by the symmetry of its shape."""
+"""Grasps of an object as it lies, by a hand that points down, from the symmetry of its shape."""
 
 from __future__ import annotations
 

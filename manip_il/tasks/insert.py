@@ -67,7 +67,7 @@ def _play(world: World) -> float:
 
 
 def _lift(world: World) -> float:
-    """How high over the hole's floor the peg's lower end is to be [m]."""
+    """Height over the hole's floor that the peg's lower end is to have [m]."""
     error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
     if _is_entered(world) or error <= 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""What tasks put on the table: free objects, furniture, and the markers of goals."""
+"""Free objects, furniture and markers of goals, which tasks put on the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a peg stands, lies or is held, and how the hand grips it, as pure geometry of a world."""
+"""Grips of a peg that stands, lies or is held, as pure geometry of a world."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def upper_axis(world: World) -> F64:
 
 
 def _upper_axis(world: World) -> F64:
-    """In the hand the end that it holds; else the upper end, or of a peg that lies the one away from the robot."""
+    """Upper end: in the hand the end that it holds, of a peg that lies the one away from the robot."""
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
@@ -82,7 +82,7 @@ def _upper_axis(world: World) -> F64:
 
 
 def _far_turn(yaw: float, at: float) -> float:
-    """How unwelcome a yaw is: far from the hand's, and from straight ahead."""
+    """Cost of a yaw, by its distance from the hand's and from straight ahead [rad]."""
     return abs(yaw - at) + 0.5 * abs(yaw)
 
 
@@ -131,7 +131,7 @@ def _grip(world: World) -> Grip:
 
 @cache
 def _farthest(scene: Scene) -> float:
-    """How far from the robot along x the hand gets to the table [m]."""
+    """Farthest x at which the hand gets to the table [m]."""
     x, y = scene.robot.workspace.centre
     while reach_of(scene.robot).error((x + 0.01, y, 0.0)) < ARRIVES:
         x += 0.01

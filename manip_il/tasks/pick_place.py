@@ -92,7 +92,7 @@ def observe_object(world: World, name: str) -> Observed:
 
 
 def _observe_lie(name: str, lie: Lie) -> Observed:
-    """How anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns."""
+    """Return how anything but a cube lies, by its narrowest grasp, so that numbers change steadily as it turns."""
     yaw, width, length = min(lie.grasps, key=lambda grasp: grasp[1])
     return {
         f"{name}.folds": float(lie.folds),

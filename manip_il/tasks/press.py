@@ -37,7 +37,7 @@ def pressed(world: World) -> float:
 
 
 def _off(world: World) -> float:
-    """How far the hand is from over the button, sideways [m]."""
+    """Sideways distance of the hand from over the button [m]."""
     x, y = (world.ee.position - world.pose(BUTTON).position)[:2].tolist()
     return math.hypot(x, y)
 

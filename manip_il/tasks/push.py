@@ -51,7 +51,7 @@ def _across(world: World, direction: F64) -> F64:
 
 
 def _behind(world: World) -> tuple[float, float]:
-    """How far the hand is behind the puck on the line to the goal, and beside that line [m]."""
+    """Distances of the hand behind the puck on the line to the goal, and beside that line [m]."""
     direction, _ = _way(world)
     x, y = (world.ee.position - world.pose(PUCK).position)[:2].tolist()
     return -(x * direction[0] + y * direction[1]), abs(x * direction[1] - y * direction[0])

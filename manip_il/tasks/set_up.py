@@ -90,7 +90,7 @@ def _upright(axis: F64) -> F64:
 
 
 def _free_place(world: World, end: F64) -> F64:
-    """Where a peg is set up: on the table, nearest to where its lower end (3,) would be, (3,) [m]."""
+    """Place on the table where a peg is set up, nearest to where its lower end (3,) would be, (3,) [m]."""
     x, y, _ = end.tolist()
     middle = world.scene.robot.workspace.centre[0]
     at = np.array([min(middle + NEAR_MIDDLE, max(middle - NEAR_MIDDLE, x)), y, 0.0])

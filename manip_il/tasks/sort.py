@@ -64,18 +64,18 @@ def _is_sorted(world: World, name: str) -> bool:
 
 
 def _wrong(world: World) -> int:
-    """How many cubes that are to be left alone are in a bin."""
+    """Number of cubes in a bin that are to be left alone."""
     others = [name for name in COLOURS if name != asked(world)]
     return sum(any(is_in(world, name, one, INSIDE) for one in BINS.values()) for name in others)
 
 
 def _place(world: World) -> F64:
-    """Where the named cube is let go, over its bin, (3,) [m]."""
+    """Place over its bin where the named cube is let go, (3,) [m]."""
     return drop_place(world, asked(world), BINS[asked(world)]) - [0.0, 0.0, LOWER]
 
 
 def _to(world: World) -> F64:
-    """Where the named cube is let go, or beside it, off the bins, while it would be over another's."""
+    """Place where the named cube is let go, (3,) [m], or off the bins beside it while over another's."""
     name = asked(world)
     place = _place(world)
     along = abs(place[0] - world.pose(name).position[0])
@@ -136,7 +136,7 @@ def _approach(world: World) -> Target:
 
 
 def _middle(world: World) -> tuple[float, float]:
-    """Where cubes and bins are around [m]: what falls from the hand shall fall where it can be picked up."""
+    """Middle of cubes and bins [m]: what falls from the hand shall fall where it can be picked up."""
     x, y = world.scene.robot.workspace.centre
     line = [(across, height) for across in (-0.2, -0.1, 0.0, 0.1, 0.2) for height in (0.03, 0.15)]
     shifts = [
