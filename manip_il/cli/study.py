@@ -8,10 +8,10 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
@@ -20,16 +20,22 @@ from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
 from manip_il.cli.options import to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, read_jsonl, require_output, save_options
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.study_file import Plan, check_same_file, keep_file, read_plan
-from manip_il.cli.trials import Trial
+from manip_il.cli.study_file import ExpertTest, Plan, check_same_file, keep_file, read_plan
+from manip_il.cli.trials import Trial, varied
 from manip_il.data.atomic import new_folder
-from manip_il.errors import UsageError
+from manip_il.errors import NoEffect, UsageError
 from manip_il.evaluation.comparison import Arm
 from manip_il.evaluation.results import write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
 from manip_il.evaluation.tables import print_table
 from manip_il.option import option
+from manip_il.robots.robot import get_robot
 from manip_il.seeding import stream_seeds
+
+if TYPE_CHECKING:
+    from manip_il.engine.engine import Engine
+    from manip_il.evaluation.results import EvalResult
+    from manip_il.sim.config import EnvConfig
 
 ROUND_0 = "round_000"
 # Options on which round 0 (demonstrations and the first fit) does not depend
@@ -72,8 +78,9 @@ class StudyOptions:
             check_same_file(self.output_dir, plan.file)
         with open_output(self, (*FREE, "file", "training_seeds")) as folder:  # what the file says is compared above
             keep_file(folder, plan.file)
+            experts = expert_trials(plan)
             self._learn(plan)
-            study = self._test(plan)
+            study = self._test(plan, experts)
             write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})
             atomic_write(folder / TABLE_FILE, table_markdown(study))
             self._report(plan, study)
@@ -102,21 +109,38 @@ class StudyOptions:
         own = replace(plan.arms[name], seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
         return replace(own, engine=self.engine, workers=self.workers)
 
-    def _test(self, plan: Plan) -> Study:
+    def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
         from manip_il.engine.engine import Engine
 
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]
         limit = limit_of(plan.rule, everything)
         policies = {source.name: source.select(plan.rule, limit)[0] for source in everything}
-        seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
-        trial = Trial.of(plan.env, seeds, plan.file.suite, policies.values(), self.trust)
-        trial.check_policies(policies, self.output_dir, self.engine)
+        trials = {name: self._trial(plan, name, sources[name], policies) for name in plan.arms}
         kept = f"every finished run and evaluation, in {self.output_dir}"
         with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
-            last = (plan.rule, limit, trial, self.output_dir, engine, stages)
-            arms = tuple(Arm(name, tuple(source.measure(*last) for source in arm)) for name, arm in sources.items())
-        return Study(arms, plan.baseline, plan.file.target, plan.rule, limit)
+            arms: list[Arm] = []
+            for name, arm in sources.items():
+                last = (plan.rule, limit, trials[name], self.output_dir, engine, stages)
+                arms.append(Arm(name, tuple(source.measure(*last) for source in arm)))
+            solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
+        return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved)
+
+    def _test_expert(
+        self, arm: str, trials: Mapping[str, Trial], engine: Engine, stages: Stages
+    ) -> dict[str, EvalResult]:
+        """Return what the expert solves of an arm's task: name of the test -> result."""
+        names = {test: f"expert, {arm}, {test}" for test in trials}
+        files = {test: trial.file(self.output_dir, None) for test, trial in trials.items()}
+        return {test: trial.measure(None, names[test], files[test], engine, stages) for test, trial in trials.items()}
+
+    def _trial(self, plan: Plan, name: str, sources: list[Source], policies: dict[str, Path]) -> Trial:
+        """The test of an arm's policies, which are checked before any episode runs."""
+        own = {source.name: policies[source.name] for source in sources}
+        seeds = stream_seeds("test", plan.file.eval.n_episodes, 0)
+        trial = Trial.of(plan.envs[name], seeds, plan.file.suite, own.values(), self.trust)
+        trial.check_policies(own, self.output_dir, self.engine)
+        return trial
 
     def _sources(self, plan: Plan, name: str) -> list[Source]:
         folders = {seed: self._folder(name, seed) for seed in range(plan.file.training_seeds)}
@@ -134,16 +158,41 @@ class StudyOptions:
             words.append(f"--training_seeds={self.training_seeds}")
         if self.trust:
             words.append("--trust=true")
-        title = f"Study: {result.robot} {result.task}, {self.file.stem}"
+        what = f"{result.robot} {result.task}" if plan.baseline else result.robot
+        title = f"Study: {what}, {self.file.stem}"
         study_report(study, title, shlex.join(words), to_plain(plan.file)).write(self.output_dir / REPORT_FILE)
 
     def _next(self, study: Study) -> str:
         best = max(study.arms, key=lambda arm: arm.test_rate)
         other = study.baseline if best.name != study.baseline else study.arms[-1].name
-        if other == best.name:
+        if other in (None, best.name):
             return f"manip-il eval --policy.path={best.members[0].policy} --eval.films=3"
         left, right = self.output_dir / other, self.output_dir / best.name
         return f"manip-il compare {left} {right} --at=seconds --output_dir={self.output_dir}_seconds"
+
+
+def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
+    """Return the expert's tests in every arm's task, arm -> name of the test -> trial.
+
+    Without those that change nothing there, such as another object where there is none. Raises `ManipError` for names.
+    """
+    return {
+        name: {test: trial for test, one in plan.experts.items() if (trial := expert_trial(env, one)) is not None}
+        for name, env in plan.envs.items()
+    }
+
+
+def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
+    """Return a test in an arm's environment; None where it would change nothing."""
+    env = replace(env, robot=test.robot or env.robot)
+    get_robot(env.robot)
+    seeds = stream_seeds("test", test.n_episodes, 0)
+    try:
+        if test.vary:
+            return Trial(env, seeds, "+".join(test.vary), varied(test.vary, env, sees=False))
+        return Trial.of(env, seeds, test.suite, ())
+    except NoEffect:
+        return None
 
 
 def same_start(left: DaggerOptions, right: DaggerOptions) -> bool:

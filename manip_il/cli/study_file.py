@@ -31,15 +31,30 @@ ARM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass
+class ExpertTest:
+    """One test of the expert in every arm's task, by default on the arm's robot.
+
+    suite: as of `manip-il eval`. vary: as of `manip-il dagger`.
+    """
+
+    robot: str | None = None
+    suite: str = "nominal"
+    vary: list[str] = field(default_factory=list[str])
+    n_episodes: int = 500
+
+
+@dataclass
 class StudyFile:
     """Content of a study's YAML file.
 
-    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. suite: as
+    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. Where that
+    is the task, nothing is compared, and expert (name -> `ExpertTest`) adds what the expert solves of each. suite: as
     `manip-il eval --suite=`, for the test.
     """
 
     common: Open = field(default_factory=dict[str, Any])
     arms: Open = field(default_factory=dict[str, Any])
+    expert: Open = field(default_factory=dict[str, Any])
     training_seeds: int = 3
     eval: TrialGroup = field(default_factory=TrialGroup)
     suite: str = "nominal"
@@ -51,13 +66,17 @@ class StudyFile:
 
 @dataclass(frozen=True)
 class Plan:
-    """A checked file: the options of every arm are valid, and all arms have one environment."""
+    """A checked file: the options of every arm are valid.
+
+    envs: arm -> its environment, the same for all where there is a baseline. experts: name -> test.
+    """
 
     file: StudyFile
     arms: Mapping[str, DaggerOptions]
     rule: Rule
-    baseline: str
-    env: EnvConfig
+    baseline: str | None
+    envs: Mapping[str, EnvConfig]
+    experts: Mapping[str, ExpertTest]
 
 
 def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Plan:
@@ -74,13 +93,20 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
     for name, options in arms.items():
         with _named(path, name):
             envs[name] = options.config().env
+    experts = {name: _expert_test(path, name, file.expert[name]) for name in file.expert}
+    return Plan(file, arms, Rule.parse(file.checkpoint, file.at), _baseline(file, envs), envs, experts)
+
+
+def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
+    """The arm that others are compared with; None where tasks differ and none is named."""
+    if file.baseline is None and len({env.task for env in envs.values()}) > 1:
+        return None
     first = next(iter(envs))
     for name, env in envs.items():
         require_same_env(f"arm {first!r}", envs[first], f"arm {name!r}", env)
-    baseline = file.baseline or first
-    if baseline not in arms:
-        raise UnknownName("arm as a baseline", baseline, arms)
-    return Plan(file, arms, Rule.parse(file.checkpoint, file.at), baseline, envs[first])
+    if file.baseline is not None and file.baseline not in envs:
+        raise UnknownName("arm as a baseline", file.baseline, envs)
+    return file.baseline or first
 
 
 def keep_file(folder: Path, file: StudyFile) -> None:
@@ -132,6 +158,18 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
             raise UsageError(f"{origin}: {own} is set by the study itself, for every run; take it out")
     with _named(path, name):
         return from_layers(DaggerOptions, layers)
+
+
+def _expert_test(path: Path, name: str, tree: Any) -> ExpertTest:
+    origin = f"{path}: expert.{name}"
+    if not isinstance(tree, dict | None):
+        raise UsageError(f"{origin}: expected robot, suite, vary and n_episodes, got {checks.shorten(tree)}")
+    test = from_layers(ExpertTest, [(origin, tree or {})])
+    if test.n_episodes < 1:
+        raise UsageError(f"{origin}: n_episodes is {test.n_episodes}; expected at least 1")
+    if test.vary and test.suite != "nominal":
+        raise UsageError(f"{origin}: has suite and vary; expected one of them")
+    return test
 
 
 @contextmanager

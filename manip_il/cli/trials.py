@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import manip_il
 from manip_il.cli.progress import Stages, warn
-from manip_il.errors import ManipError, MismatchError, RenderError, UnknownName, UsageError
+from manip_il.errors import ManipError, MismatchError, NoEffect, RenderError, UnknownName, UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
@@ -31,12 +31,11 @@ SUITES = {
     "randomised": ("object", "view"),
     "all": ("nominal", "knocked", "sensing", "object", "view"),
 }
-CONDITIONS = SUITES["all"]
+CONDITIONS = (*SUITES["all"], "random_actions")
 _YAML = (".yaml", ".yml")
-VARY_HELP = (
-    "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
-)
-SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
+_BLIND = "knocked, sensing, random_actions"
+VARY_HELP = f"how worlds differ from episode to episode: object, view (with cameras), {_BLIND}, or YAMLs of ranges"
+SUITE_HELP = f"nominal, disturbed, randomised, all; one condition (object, view, {_BLIND}); or a YAML of ranges"
 
 
 @dataclass
@@ -72,8 +71,8 @@ class Trial:
         job = RolloutJob(self.env, "expert" if policy is None else "policy", policy=policy, conditions=self.conditions)
         return replace(job, hold=HOLD, label="last", trust=self.trust)
 
-    def file(self, folder: Path, policy: Path) -> Path:
-        """Return the file of a policy's evaluation, named after its files, the environment and the episodes.
+    def file(self, folder: Path, policy: Path | None) -> Path:
+        """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
@@ -82,7 +81,13 @@ class Trial:
         from manip_il.evaluation.results import EvalSettings
 
         settings = EvalSettings.of(self.job(policy), self.suite).to_json()
-        made_of = (env_fingerprint(self.env), self.seeds.start, len(self.seeds), settings, policy_sha256(policy))
+        made_of = (
+            env_fingerprint(self.env),
+            self.seeds.start,
+            len(self.seeds),
+            settings,
+            policy and policy_sha256(policy),
+        )
         return folder / FOLDER / f"{hashlib.sha256(canonical_json(made_of).encode()).hexdigest()[:16]}.json"
 
     def measure(
@@ -144,7 +149,7 @@ def suite_conditions(suite: str, task: str, shape: str = "", *, sees: bool) -> t
     left = [one for condition in asked if (one := for_task(condition, task, shape, sees=sees)) is not None]
     if not left:
         blind = "" if sees else " and a policy without cameras"
-        raise UsageError(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
+        raise NoEffect(f"--suite={suite} changes nothing for {task}{blind}; choose another suite")
     return tuple(left)
 
 
@@ -161,7 +166,7 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
         raise UnknownName("--vary", odd, CONDITIONS[1:])
     kept = for_task(merged([read_condition(name) for name in names]), env.task, env.object, sees=sees)
     if kept is None:
-        raise UsageError(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
+        raise NoEffect(f"--vary={','.join(names)} changes nothing for {env.task}{'' if sees else ' without cameras'}")
     return (kept,)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from statistics import fmean
 from typing import Any
@@ -12,6 +12,7 @@ from manip_il.errors import ManipError, UnknownName
 from manip_il.evaluation.comparison import Arm, Comparison, Member, seeds_facts
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report_data import COSTS, Cost, format_amount
+from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip, rule_facts
 from manip_il.evaluation.tables import Table
 
@@ -22,18 +23,20 @@ FILE_NAME, TABLE_FILE = "study.json", "table.md"
 class Study:
     """All arms' runs with their tests. baseline: the arm that the others are compared with. target: in (0, 1].
 
-    rule, limit: by which a run's round was chosen. Every member is of a run, and has its history.
+    rule, limit: by which a run's round was chosen. Every member is of a run, and has its history. Arms of different
+    tasks have no baseline (None). experts: tests of the expert in an arm's task, arm -> name of the test -> result.
     """
 
     arms: tuple[Arm, ...]
-    baseline: str
+    baseline: str | None
     target: float
     rule: Rule
     limit: float | None = None
+    experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         names = [arm.name for arm in self.arms]
-        if self.baseline not in names:
+        if self.baseline is not None and self.baseline not in names:
             raise UnknownName("baseline", self.baseline, names)
         for arm in self.arms:
             if not all(member.history and member.chosen for member in arm.members):
@@ -46,14 +49,23 @@ class Study:
 
     @cached_property
     def comparisons(self) -> dict[str, Comparison]:
-        """Arm -> its comparison with the baseline, for every other arm."""
+        """Arm -> its comparison with the baseline, for every other arm; empty where there is no baseline."""
+        if self.baseline is None:
+            return {}
         [baseline] = [arm for arm in self.arms if arm.name == self.baseline]
         return {arm.name: Comparison(baseline, arm) for arm in self.arms if arm is not baseline}
 
     @property
     def verdict(self) -> str:
-        """The first sentence: success of the best arm, and of the baseline, or of the second where that is best."""
+        """The first sentence: success of the best arm, and of the baseline, or of the second where that is best.
+
+        Of arms without a baseline: how many reach the target, and the worst.
+        """
         ranked = sorted(self.arms, key=lambda arm: -arm.test_rate)
+        if self.baseline is None:
+            reach, worst = sum(arm.test_rate >= self.target for arm in ranked), ranked[-1]
+            least = f"the last, {worst.name}, solves {format_percent(worst.test_rate)}"
+            return f"{reach} of {len(ranked)} solve {100 * self.target:g} % of their unseen starts; {least}."
         best, count, seeds = ranked[0], ranked[0].members[0].result.success.n, len(self.training_seeds)
         over = f", the mean of {seeds} training seeds" if seeds > 1 else ""
         other = next((arm for arm in ranked[1:] if best.name == self.baseline or arm.name == self.baseline), None)
@@ -76,8 +88,8 @@ class Study:
         return [first_reaching(member.history, self.target) for member in arm.members]
 
     def results_table(self) -> Table:
-        """Return an arm a row: costs, success, difference from the baseline, largest dip."""
-        columns = ("arm", *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
+        """Return an arm a row: the expert's success, costs, success, difference from the baseline, largest dip."""
+        columns = ("arm", *self._tests, *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
         columns += ("validation", "test", f"test, against {self.baseline}")
         return Table((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
 
@@ -104,6 +116,7 @@ class Study:
             "test_success": arm.test_rate,
             "validation_success": fmean(_chosen(member).validation.rate for member in arm.members),
             "against_baseline": comparison.to_json() if comparison else None,
+            "expert": {name: _expert_json(result) for name, result in self.experts.get(arm.name, {}).items()},
             "training_seeds": [
                 {"seed": member.training_seed}
                 | member.to_json()
@@ -113,6 +126,15 @@ class Study:
             ],
         }
 
+    @property
+    def _tests(self) -> list[str]:
+        """Names of the expert's tests, in the order of the first arm that has them."""
+        return list(dict.fromkeys(test for tests in self.experts.values() for test in tests))
+
+    def _expert(self, arm: str, test: str) -> str:
+        result = self.experts.get(arm, {}).get(test)
+        return "" if result is None else format_percent(result.success.rate)
+
     def _row(self, arm: Arm) -> tuple[str, ...]:
         chosen = [_chosen(member) for member in arm.members]
         costs = [_plain(cost, fmean(one.amount(cost) for one in chosen)) for cost in COSTS]
@@ -120,7 +142,16 @@ class Study:
         test = _rates([member.result.success.rate for member in arm.members])
         comparison = self.comparisons.get(arm.name)
         dip = max(largest_dip(member.history) for member in arm.members)
-        return (arm.name, *costs, validation, test, comparison.numbers if comparison else "", f"{100 * dip:.1f}")
+        experts = [self._expert(arm.name, test) for test in self._tests]
+        return (
+            arm.name,
+            *experts,
+            *costs,
+            validation,
+            test,
+            comparison.numbers if comparison else "",
+            f"{100 * dip:.1f}",
+        )
 
     def _to_target(self, arm: Arm, cost: Cost) -> str:
         """Mean cost where all training seeds reached the target, else each: its cost, or more than its whole cost."""
@@ -132,7 +163,7 @@ class Study:
 
     def _fewer(self, arm: Arm) -> str:
         """Labels of the baseline over this arm's, to the target; a lower bound where the baseline missed it."""
-        if arm.name == self.baseline:
+        if self.baseline in (None, arm.name):
             return ""
         ours = [one.labels for one in self.reached(arm) if one]
         if len(ours) < len(arm.members):
@@ -147,10 +178,17 @@ def table_markdown(study: Study) -> str:
     """Return both tables, for the documentation."""
     results, target = study.results_table().filled(), study.target_table().filled()
     count = study.arms[0].members[0].result.success.n
+    tests = {test: len(one.episodes) for tests in study.experts.values() for test, one in tests.items()}
+    experts = "".join(f"- {test}: {count:,} test episodes.\n" for test, count in tests.items())
     seeds = ", ".join(map(str, study.training_seeds))
     episodes = f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."
     facts = "".join(f"- {fact}\n" for fact in [episodes, *study.facts])
-    return f"{results.markdown()}\n{target.markdown()}\n{facts}"
+    return f"{results.markdown()}\n{target.markdown()}\n{facts}{experts}"
+
+
+def _expert_json(result: EvalResult) -> dict[str, Any]:
+    success = result.success
+    return {"success_rate": success.rate, "interval": list(success.interval), "n_episodes": success.n}
 
 
 def _chosen(member: Member) -> Round:

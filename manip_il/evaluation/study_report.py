@@ -47,7 +47,8 @@ class StudyReport(Report):
     def kinds(self) -> dict[str, str]:
         """Arm -> CSS class of its colour: the baseline grey, the others in order."""
         others = [arm.name for arm in self.study.arms if arm.name != self.study.baseline]
-        return {self.study.baseline: "arm base"} | {name: f"arm arm-{i % COLOURS}" for i, name in enumerate(others)}
+        base = {} if self.study.baseline is None else {self.study.baseline: "arm base"}
+        return base | {name: f"arm arm-{i % COLOURS}" for i, name in enumerate(others)}
 
     @property
     def results(self) -> Table:
@@ -71,7 +72,8 @@ class StudyReport(Report):
     def note(self) -> str:
         """Number of episodes, the disturbance, meaning of brackets and dots."""
         first = self.study.arms[0].members[0].result
-        note = f"Every policy ran the same {first.success.n:,} test episodes, on which nothing was chosen."
+        same = "the same " if self.study.baseline is not None else ""
+        note = f"Every policy ran {same}{first.success.n:,} test episodes, on which nothing was chosen."
         if first.settings.disturbance != "none":
             note += f" Disturbed: {first.settings.disturbance}."
         if len(self.study.training_seeds) > 1:

@@ -23,6 +23,7 @@ Range = tuple[float, float]
 # Least and greatest value; a range beyond is a mistake and not an experiment.
 _BOUNDS: dict[str, Range] = {
     "action_noise": (0, 1),
+    "random_actions": (0, 1),
     "knock": (0, 0.3),
     "knock_step": (0, 10_000),
     "joint_noise": (0, 1),
@@ -49,6 +50,7 @@ class Condition:
     """Ranges (low, high), both ends included; without one the world is nominal in that.
 
     action_noise: standard deviation of Gaussian noise on every executed action, as a share of the action's full range.
+    random_actions: share of control steps at which a random action is executed, each joint within its longest step.
     knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
     [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
     policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction

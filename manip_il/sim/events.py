@@ -189,6 +189,7 @@ class Events:
 
     def __init__(self, world: World, drawn: Drawn, seed: int):
         self._world, self._share = world, drawn.number("action_noise")
+        self._random, self._random_rng = drawn.number("random_actions"), rng_for(seed, "random actions")
         self._noise, self._knock_rng = rng_for(seed, "action noise"), rng_for(seed, "knock")
         self._knock = _ends(drawn.values["knock"]) if "knock" in drawn.values else None
         low, high = _ends(drawn.values.get("knock_step", -1))
@@ -202,7 +203,11 @@ class Events:
     @staticmethod
     def of(world: World, drawn: Drawn, seed: int) -> Events | None:
         """Return what happens in an episode; None for nothing."""
-        return Events(world, drawn, seed) if drawn.values.keys() & {"knock", "action_noise", *KINDS} else None
+        return (
+            Events(world, drawn, seed)
+            if drawn.values.keys() & {"knock", "action_noise", "random_actions", *KINDS}
+            else None
+        )
 
     def before(self, step: int) -> bool:
         """Apply the events of a step to the world; returns whether a perturbation changed it.
@@ -226,6 +231,8 @@ class Events:
         """Return the action of a step as it reaches the robot, (n,)."""
         if self._kind is not None and self._kind.wrong is not None and step == self._kind_step:
             return self._kind.wrong(action, self._world, self._kind_rng)
+        if self._random and self._random_rng.uniform() < self._random:
+            return random_action(action, self._world, self._random_rng)
         return noisy(action, self._world, self._share, self._noise) if self._share else action
 
 
