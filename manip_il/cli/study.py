@@ -74,11 +74,11 @@ class StudyOptions:
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""
         plan = read_plan(self.file, self.training_seeds, self.trust)
+        experts = expert_trials(plan)
         if self.resume:
             check_same_file(self.output_dir, plan.file)
         with open_output(self, (*FREE, "file", "training_seeds")) as folder:  # what the file says is compared above
             keep_file(folder, plan.file)
-            experts = expert_trials(plan)
             self._learn(plan)
             study = self._test(plan, experts)
             write_json(folder / FILE_NAME, study.to_json() | {"rule": rule_json(study.rule, study.limit)})

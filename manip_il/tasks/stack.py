@@ -23,6 +23,7 @@ F64 = NDArray[np.float64]
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
 ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # off the place on the base: sideways, in height [m]; tilt [rad]
 OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # of the carried cube over its place
+PRESS = 0.01  # aimed at below the base's top: the cube comes down surely, and does not hang over it [m]
 AWAY, AWAY_ENOUGH = 0.06, 0.035  # of the hand over the stack's top once it has let go; at which it is away [m]
 APART = 0.09  # of the cubes at the start [m]
 ROOM = 0.05  # within reach around each of them at the start [m]
@@ -51,7 +52,7 @@ def _let_go(world: World) -> Target:
 
 
 def _carry(world: World) -> Target:
-    return carry(world, TOP, place_on_base(world), OVER_BASE)
+    return carry(world, TOP, place_on_base(world) - [0.0, 0.0, PRESS], OVER_BASE)
 
 
 def _is_done(world: World) -> bool:

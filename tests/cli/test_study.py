@@ -13,9 +13,10 @@ from manip_il.cli.common_options import TaskGroup
 from manip_il.cli.dagger import METRICS_FILE, DaggerOptions
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
-from manip_il.cli.study import ROUND_0, same_start, share_start
+from manip_il.cli.study import ROUND_0, expert_trials, same_start, share_start
 from manip_il.cli.study_file import read_plan
 from manip_il.data.lerobot_read import read_tables
+from manip_il.errors import MismatchError
 
 from .made_runs import files, make_run
 
@@ -158,6 +159,13 @@ def test_a_study_goes_on_with_its_own_file_alone(before, after, name, here, runs
         ("training_seeds: 2", "training_seeds: 0", "training_seeds is 0"),
         ("n_episodes: 2", "n_episodes: 0", "eval.n_episodes is 0"),
         ("method: cloning", "env.horizon: 9", "horizon differs: arm 'cloning' has 9, arm 'dagger' has 8"),
+        ("at: labels", "expert: {a: 3}", "x.yaml: expert.a: expected robot, suite, vary and n_episodes, got 3"),
+        ("at: labels", "expert: {a: {suit: all}}", "expert.a: 'suit' (did you mean 'suite'?)"),
+        ("at: labels", "expert: {a: {n_episodes: 0}}", "expert.a: n_episodes is 0; expected at least 1"),
+        ("at: labels", "expert: {a: {vary: [object], suite: all}}", "has suite and vary; expected one of them"),
+        ("at: labels", "expert: {a: {vary: [objects]}}", "did you mean 'object'?"),
+        ("at: labels", "expert: {a: {robot: pandas}}", "did you mean 'panda'?"),
+        ("at: labels", "expert: {a: {suite: al}}", "did you mean 'all'?"),
         (FILE, "", "arms is empty"),
         (FILE, "- 1", "expected a mapping"),
     ],
@@ -176,6 +184,31 @@ def test_the_baseline_is_the_first_arm_unless_named(here):
     (here / "x.yaml").write_text(FILE + "baseline: dagger\n")
     assert read_plan(here / "x.yaml", 5).baseline == "dagger"
     assert read_plan(here / "x.yaml", 5).file.training_seeds == 5
+
+
+def test_arms_of_different_tasks_have_no_baseline_and_each_its_own_environment(here):
+    text = FILE.replace("  dagger:", "  lift: {task.type: lift}")
+    (here / "x.yaml").write_text(text)
+    plan = read_plan(here / "x.yaml", None)
+    assert plan.baseline is None
+    assert [env.task for env in plan.envs.values()] == ["reach", "lift"]
+    (here / "x.yaml").write_text(text + "baseline: lift\n")
+    with pytest.raises(MismatchError, match="task differs: arm 'cloning' has reach, arm 'lift' has lift"):
+        read_plan(here / "x.yaml", None)
+
+
+def test_the_expert_is_tested_where_a_test_changes_something(here):
+    tests = "expert: {own: {n_episodes: 3}, other: {vary: [object]}, noise: {suite: random_actions, robot: fetch}}\n"
+    (here / "x.yaml").write_text(FILE.replace("  dagger:", "  lift: {task.type: lift}") + tests)
+    trials = expert_trials(read_plan(here / "x.yaml", None))
+    assert {arm: list(found) for arm, found in trials.items()} == {
+        "cloning": ["own", "noise"],
+        "lift": ["own", "other", "noise"],
+    }
+    noise = trials["lift"]["noise"]
+    assert (noise.env.robot, noise.env.task, len(noise.seeds)) == ("fetch", "lift", 500)
+    assert noise.conditions[0].ranges == {"random_actions": (0.1, 0.1)}
+    assert trials["cloning"]["own"].file(here, None) != trials["lift"]["own"].file(here, None)
 
 
 @pytest.mark.slow

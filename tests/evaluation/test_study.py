@@ -96,6 +96,23 @@ def test_study_json_holds_every_round_of_every_run():
     assert data["arms"]["dagger"]["against_baseline"]["difference"] == pytest.approx(0.3)
 
 
+def test_tasks_are_not_compared_and_have_what_the_expert_solves_beside_them():
+    tests = {"expert": STUDY.arms[1].members[0].result, "fetch": STUDY.arms[0].members[0].result}
+    study = replace(STUDY, baseline=None, experts={"dagger": tests, "dart": {"fetch": tests["fetch"]}})
+    worst = "1 of 3 solve 80 % of their unseen starts; the last, cloning, solves 50.0 %."
+    assert replace(study, target=0.8).verdict == worst
+    assert study.comparisons == {}
+    assert {name: row(study, "dagger")[name] for name in tests} == {"expert": "80.0 %", "fetch": "50.0 %"}
+    assert [row(study, "dart")[name] for name in tests] == ["", "50.0 %"]
+    text = table_markdown(study)
+    assert "against" not in text
+    assert "- fetch: 100 test episodes." in text
+    assert study.to_json()["arms"]["dagger"]["expert"]["fetch"]["n_episodes"] == 100
+    report = study_report(study, "t", "c")
+    assert report.note.startswith("Every policy ran 100 test episodes")
+    assert len(set(report.kinds.values())) == 3
+
+
 def test_what_is_no_study_is_refused():
     with pytest.raises(UnknownName, match="did you mean 'cloning'"):
         Study(arms(), "clonig", 0.9, Rule())

@@ -83,6 +83,18 @@ def test_a_dropped_object_falls_onto_the_table(env: ManipEnv, seed: int):
     assert 0 < cube(env)[2] < 0.1
 
 
+def test_a_share_of_the_actions_is_random_and_the_others_are_as_they_were(env: ManipEnv):
+    drawn = Condition("random", random_actions=(0.3, 0.3)).draw(SEED)
+    action, two = still(env, 0.04), [Events.of(env.world, drawn, SEED) for _ in range(2)]
+    executed = [[one.action(action, step) for step in range(400)] for one in two if one is not None]
+    np.testing.assert_array_equal(*executed)
+    changed = [not np.array_equal(one, action) for one in executed[0]]
+    assert 0.2 < np.mean(changed) < 0.4
+    actions = env.scene.actions
+    beyond = np.abs(np.array(executed[0]) - env.observe().state)[:, actions.arm] - actions.scale[actions.arm]
+    assert beyond.max() < 1e-6
+
+
 @every_scene
 def test_a_scene_without_an_object_has_none_to_knock(robot: str, task: str):
     env = started(robot, task)
