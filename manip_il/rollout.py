@@ -6,6 +6,7 @@ are consumers of what it yields, not branches inside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -17,6 +18,7 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
 
 F64 = NDArray[np.float64]
+GROWTH = 0.01  # of the share of a task that is done: less is no progress
 
 
 class Environment(Protocol):
@@ -99,11 +101,13 @@ class Rules:
     """Rules of an episode: how long it runs and when the expert is queried.
 
     horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
-    query: in every state, in the last one only, or only where the driver queries it.
+    patience: end it after this many steps without progress, too. query: in every state, in the last one only, or only
+    where the driver queries it.
     """
 
     horizon: int
     hold: int | None = None
+    patience: int | None = None
     query: Literal["every", "last", "driver"] = "every"
 
 
@@ -113,7 +117,15 @@ class _Slot:
     seed: int
     step: int = 0
     held: int = 0
+    best: float = -math.inf
+    since: int = 0
     turn: Turn = field(init=False)
+
+    def is_stuck(self, patience: int) -> bool:
+        """Return whether progress has grown by no `GROWTH` for so many steps."""
+        if self.turn.progress >= self.best + GROWTH:
+            self.best, self.since = self.turn.progress, self.step
+        return self.step - self.since >= patience
 
 
 def rollout(
@@ -168,6 +180,7 @@ def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition
     solved = slot.env.solved
     slot.held += slot.held > 0 or solved
     done = slot.step >= rules.horizon or (rules.hold is not None and slot.held > rules.hold)
+    done |= rules.patience is not None and not slot.held and slot.is_stuck(rules.patience)
     return Transition(
         seed=slot.seed,
         step=slot.step - 1,

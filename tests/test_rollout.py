@@ -61,6 +61,22 @@ class Kicked(Counter):
         return super().advance(action + 0.1)
 
 
+class Slowing(Counter):
+    """Its progress grows by a tenth a step, and from one step on by less than counts."""
+
+    def __init__(self, until: int):
+        super().__init__()
+        self._until = until
+
+    @property
+    def solved(self) -> bool:
+        return False
+
+    @property
+    def progress(self) -> float:
+        return 0.1 * min(self.steps, self._until) + 1e-6 * self.steps
+
+
 class Ones:
     """An expert that always adds one; remembers in which steps it was queried."""
 
@@ -151,6 +167,16 @@ def test_the_last_frame_alone_has_what_was_observed_after_it(envs: int):
 def test_hold_ends_an_episode_that_long_after_success(hold: int | None, length: int):
     frames = one_episode(Counter(), Follow(), Rules(30, hold))
     assert [frame.done for frame in frames] == [False] * (length - 1) + [True]
+
+
+@pytest.mark.parametrize(("patience", "length"), [(3, 9), (10, 16), (None, 30)])
+def test_an_episode_ends_that_long_after_its_last_progress(patience: int | None, length: int):
+    frames = one_episode(Slowing(5), Halves(), Rules(30, patience=patience))
+    assert [frame.done for frame in frames] == [False] * (length - 1) + [True]
+
+
+def test_what_is_solved_is_not_stuck():
+    assert len(one_episode(Counter(), Follow(), Rules(30, hold=9, patience=2))) == 12
 
 
 def test_an_episode_goes_on_to_its_end_where_success_is_lost_again():

@@ -126,7 +126,7 @@ class Sampling:
 
 
 _AT_LEAST_1 = (
-    *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble"),
+    *("demonstrations", "episodes_per_round", "validation_episodes", "ensemble", "patience"),
     *("label_budget", "branch_steps", "refit_steps"),
 )
 _LEARNER_ALONE = BetaSchedule("constant", 0.0)
@@ -148,7 +148,8 @@ class RunConfig:
 
     refit: each round's policy from scratch, or warm from the last one's in refit_steps. validation_episodes: on which
     the best round is chosen; disjoint from the test's by their stream. hold: end a rollout, of validation too, this
-    many steps after success. disturbed_share: of a round's learner rollouts that run under
+    many steps after success. patience: end a rollout in which every state is labelled after this many steps without
+    progress: what follows are the same states again. disturbed_share: of a round's learner rollouts that run under
     `manip_il.sim.events.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
     conditions: what the worlds of all episodes differ in, validation's too.
     """
@@ -173,6 +174,7 @@ class RunConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     validation_episodes: int = option(200, "unseen episodes that choose the best round")
     hold: int = option(10, "control steps of a rollout after success")
+    patience: int = option(100, "control steps without progress after which a rollout with a label a state ends")
     disturbed_share: float = option(
         0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
     )

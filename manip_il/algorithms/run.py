@@ -109,6 +109,7 @@ class Run:
                 steps = config.steps_of_branch if config.label == "branch" else 1
                 job = replace(drive.complete(self._job(round_)), trust=config.fit.trust)
                 job = replace(job, label=config.label, query=rule, branch_steps=steps)
+                job = replace(job, patience=config.patience if job.labels_all else None)
                 gated, name = not per_state or rule.kind != "every", self._repo_id(round_)
                 left = self._left(round_)
                 recording = Recording(name, provenance=provenance(job), only_labelled=gated, labels=left)

@@ -93,6 +93,7 @@ class DaggerOptions(common.EnvOptions):
     scheduler: Open = option_of(FitConfig, "scheduler")
     validation_episodes: int = option_of(RunConfig, "validation_episodes")
     hold: int = option_of(RunConfig, "hold")
+    patience: int = option_of(RunConfig, "patience")
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
     workers: int | None = common.workers_option()

@@ -58,7 +58,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings = asdict(config)
     if not config.object:  # as before there were any
         del settings["object"]
-    model = build_scene(config.robot, config.task, config.object).model_bytes()
+    model = build_scene(config.robot, config.task, config.object, config.physics_step).model_bytes()
     return environment_fingerprint(model, settings)
 
 

@@ -38,7 +38,7 @@ class RolloutJob:
     policy: a checkpoint's `pretrained_model` folder, needed where a learner drives; ensemble: others that answer with
     it where `query` wants their disagreement. beta: the share of steps that the expert drives (`mixture`). noise: the
     covariance (n, n) of a noisy expert's actions. hold: end an episode this many steps after success; None: at the
-    horizon.
+    horizon. patience: end it after this many steps without progress.
 
     label: what the expert gives in the states that `query` selects. `per_state`: its label. `takeover`: from the
     first one on it drives to the end, for which it has a horizon of its own. `branch`: in a copy of the simulator it
@@ -60,6 +60,7 @@ class RolloutJob:
     beta: float = 0.0
     noise: tuple[tuple[float, ...], ...] = ()
     hold: int | None = None
+    patience: int | None = None
     label: LabelMode = "per_state"
     query: QueryRule = field(default_factory=QueryRule)
     branch_steps: int = 1
@@ -170,9 +171,9 @@ def _load(job: RolloutJob, path: Path, env: ManipEnv) -> LearnedPolicy:
 
 def _rules(job: RolloutJob) -> Rules:
     if job.label == "last":
-        return Rules(job.env.horizon, job.hold, "last")
+        return Rules(job.env.horizon, job.hold, job.patience, "last")
     twice = 2 if job.label == "takeover" else 1  # a horizon for the learner, and one for the expert
-    return Rules(twice * job.env.horizon, job.hold, "every" if job.labels_all else "driver")
+    return Rules(twice * job.env.horizon, job.hold, job.patience, "every" if job.labels_all else "driver")
 
 
 def _to_episode(job: RolloutJob, frames: list[Transition], expert: Expert, branch_env: _BranchEnv | None) -> Episode:

@@ -10,7 +10,8 @@ from manip_il.robots import ROBOTS
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.tasks import NAMES
 
-DT_SIM = 0.002  # [s]
+DT_SIM = 0.002  # longest step of physics [s]
+MOST_HZ = round(1 / DT_SIM)
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,8 @@ class EnvConfig:
 
         self._take_object()
         self._take_limits()
-        if self.control_hz < 1 or round(1 / DT_SIM) % self.control_hz:
-            raise UsageError(f"control_hz is {self.control_hz}; expected a divisor of {round(1 / DT_SIM)}")
+        if not 1 <= self.control_hz <= MOST_HZ:
+            raise UsageError(f"control_hz is {self.control_hz}; expected 1 to {MOST_HZ}")
         if not 0 < self.tolerance < 1:
             raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
         if self.horizon > LONGEST_EPISODE:
@@ -67,7 +68,12 @@ class EnvConfig:
     @property
     def physics_steps(self) -> int:
         """MuJoCo steps in one control step."""
-        return round(1 / (DT_SIM * self.control_hz))
+        return -(-MOST_HZ // self.control_hz)
+
+    @property
+    def physics_step(self) -> float:
+        """Time of one of them: `DT_SIM`, or a little less where that does not divide a control step [s]."""
+        return 1 / (self.control_hz * self.physics_steps)
 
 
 CAMERAS = ("front", "wrist")

@@ -57,7 +57,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.look = look or Look()
         self._view = CameraConfig(tuple(cameras), *image_size, self.look) if cameras else None
         self.config = config or EnvConfig(robot, task, **settings)
-        self.world = World(build_scene(self.config.robot, self.config.task, self.config.object))
+        self.world = World(
+            build_scene(self.config.robot, self.config.task, self.config.object, self.config.physics_step)
+        )
         self._task = get_task(self.config.task, self.config.object)
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)

@@ -29,19 +29,21 @@ _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
 
-def build_scene(robot: str, task: str, shape: str = "") -> Scene:
+def build_scene(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
     """Return the scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`.
 
-    shape: of its object, as `EnvConfig.object`; empty for the task's own.
+    shape: of its object, as `EnvConfig.object`; empty for the task's own. step: of physics [s].
     """
-    return _build(robot, task, shape)
+    return _build(robot, task, shape, step)
 
 
 @cache
-def _build(robot: str, task: str, shape: str) -> Scene:
+def _build(robot: str, task: str, shape: str, step: float) -> Scene:
     the_robot, the_task = get_robot(robot), get_task(task, shape)
     try:
-        model = scene_spec(the_robot, the_task).compile()
+        spec = scene_spec(the_robot, the_task)
+        spec.option.timestep = step
+        model = spec.compile()
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(f"robot {the_robot.name} and task {the_task.name} make no scene: {why}") from None
@@ -52,7 +54,6 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     """Return the uncompiled scene; world z = 0 is the table's top, x points away from the robot."""
     spec = mujoco.MjSpec()
     spec.modelname = f"{robot.name}_{task.name}"
-    spec.option.timestep = DT_SIM
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10  # holds the cube: with the pyramidal default it creeps out of the hand

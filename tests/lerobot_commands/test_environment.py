@@ -97,7 +97,7 @@ def test_the_plugin_brings_our_policies():
         ({"observation": "images", "cameras": "front, top"}, UnknownName, "unknown camera 'top'.*front, wrist"),
         ({"observation": "both", "observation_width": 33}, UsageError, "width 33"),
         ({"render_mode": "human"}, UnknownName, "rgb_array"),
-        ({"fps": 33}, UsageError, "divisor of 500"),
+        ({"fps": 501}, UsageError, "expected 1 to 500"),
     ],
 )
 def test_what_cannot_be_is_refused(options: dict[str, object], error: type[Exception], words: str):

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from manip_il.errors import ManipError, MismatchError, NotFiniteError, UsageError
 from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import Condition
+from manip_il.sim.config import DT_SIM
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.register import ENV_IDS, register_envs
 from manip_il.sim.world import GOAL
@@ -171,18 +172,25 @@ def test_an_episode_ends_at_the_horizon_and_by_nothing_else():
     assert ends == [(False, False)] * 6 + [(False, True)]
 
 
-def test_a_control_step_lasts_what_its_rate_says():
-    env = started("panda", "reach", control_hz=25)
-    for _ in range(25):
+@pytest.mark.parametrize("hz", [25, 30])  # of which physics steps of 2 ms divide one
+def test_a_control_step_lasts_what_its_rate_says(hz: int):
+    env = started("panda", "reach", control_hz=hz)
+    for _ in range(hz):
         env.advance(still(env))
     assert env.data.time == pytest.approx(1.0)
-    assert env.metadata["render_fps"] == 25
+    assert env.world.model.opt.timestep <= DT_SIM
+    assert env.metadata["render_fps"] == hz
+
+
+@pytest.mark.parametrize("hz", [hz for hz in range(1, 501) if 500 % hz == 0])
+def test_a_rate_that_two_milliseconds_divide_keeps_them(hz: int):
+    assert EnvConfig(control_hz=hz).physics_step == DT_SIM
 
 
 @pytest.mark.parametrize(
     "setting",
     [
-        *({"control_hz": 0}, {"control_hz": 30}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
+        *({"control_hz": 0}, {"control_hz": 501}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
         *({"success_steps": -1}, {"horizon": -1}, {"horizon": 4}),
     ],
 )

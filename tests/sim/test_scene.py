@@ -45,7 +45,7 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
 def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
     scene = build_scene(robot, task)
     assert build_scene(robot, task) is scene
-    assert _build.__wrapped__(robot, task, "").model_bytes() == scene.model_bytes()
+    assert _build.__wrapped__(robot, task, "", DT_SIM).model_bytes() == scene.model_bytes()
 
 
 def test_no_two_scenes_are_the_same_model():
