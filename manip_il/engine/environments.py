@@ -22,7 +22,7 @@ from manip_il.sim.env import EnvConfig, environment_state_names
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import phases
+from manip_il.tasks.task import objects_in, phases
 
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 
@@ -95,15 +95,16 @@ def policy_cameras(policy: Path) -> CameraConfig | None:
 
 
 def positions(env: EnvConfig, sim_state: NDArray[np.float64]) -> dict[str, list[float]]:
-    """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects and, where there is one, `goal`.
+    """Return the true positions [m] in one row of `sim_state` (m,): `hand`, objects, and `goal`.
 
-    The first of the task's objects is called `object`.
+    The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
     """
     world, state = _world(env.robot, env.task, env.object), State.from_vector(sim_state)
     world.restore(state.physics, state.variation)
-    found = {"hand": world.ee.position} | ({"goal": world.goal} if world.has_goal else {})
+    task = get_task(env.task, env.object)
+    found = {"hand": world.ee.position, "goal": task.destination(world)}
     for name in world.scene.objects:
-        found["object" if name in get_task(env.task).objects[:1] else name] = world.pose(name).position
+        found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
 
 

@@ -92,7 +92,7 @@ class EvalReport(Report):
             intervals = "Intervals are of a confidence sequence: they hold whenever one stops."
         return (
             f"{self.result.success.n:,} episodes of at most {settings.horizon:,} control steps{apart}. "
-            f"Success means being within {100 * settings.tolerance:g} cm of the goal for {settings.success_steps} "
+            f"Success means an error of at most {100 * settings.tolerance:g} cm for {settings.success_steps} "
             f"control steps in a row{ends}. {intervals}"
         )
 

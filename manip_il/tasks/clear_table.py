@@ -129,6 +129,10 @@ class ClearTable:
             "place_from_next": _to(world) - at,
         }
 
+    def destination(self, world: World) -> F64:
+        """Return the middle of the box, (3,) [m]."""
+        return world.pose(BOX).position
+
     def error(self, world: World) -> float:
         """Return how far the cubes that are not in the box are from its middle, together [m]."""
         at = world.pose(BOX).position

@@ -163,6 +163,10 @@ class Insert:
             "turn": _rotation_vector(way.rotation @ world.ee.rotation.T),
         }
 
+    def destination(self, world: World) -> F64:
+        """Return the middle of the hole's floor, (3,) [m]."""
+        return world.pose(HOLE).position
+
     def error(self, world: World) -> float:
         """Return the distance of the peg's lower end from the middle of the hole's floor [m]."""
         return math.dist(lower_end(world), world.pose(HOLE).position)

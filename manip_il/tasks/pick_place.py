@@ -8,6 +8,7 @@ from typing import Self
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.world import GOAL, World
@@ -17,6 +18,8 @@ from manip_il.tasks.objects import RED, add_cube, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
 from manip_il.tasks.starts import UPRIGHT, draw_goal, draw_lying
 from manip_il.tasks.task import CUBE_SIZES, Limits, Observed, Rung, Start
+
+F64 = NDArray[np.float64]
 
 OBJECT = "object"
 
@@ -59,6 +62,10 @@ class PickPlace:
     def observe(self, world: World) -> Observed:
         """Return hand, goal, cube, and the ways between them; four times the cube's yaw, as its faces are alike."""
         return observe_cube(world, OBJECT)
+
+    def destination(self, world: World) -> F64:
+        """Return the goal, (3,) [m]."""
+        return world.goal
 
     def error(self, world: World) -> float:
         """Return the distance of the cube's centre from the goal [m]."""

@@ -101,6 +101,10 @@ class Press:
         cap = world.pose(CAP).position
         return {**observe_hand(world), CAP: cap, "cap_from_ee": cap - world.ee.position}
 
+    def destination(self, world: World) -> F64:
+        """Return the middle of the cap's top, (3,) [m]."""
+        return world.pose(CAP).position
+
     def error(self, world: World) -> float:
         """Return how far the cap is from its stop [m]."""
         return TRAVEL - pressed(world)

@@ -150,6 +150,10 @@ class Push:
             "goal_from_puck": way,
         }
 
+    def destination(self, world: World) -> F64:
+        """Return the goal, (3,) [m]."""
+        return world.goal
+
     def error(self, world: World) -> float:
         """Return the distance of the puck from the goal on the table [m]."""
         return _way(world)[1]

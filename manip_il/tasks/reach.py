@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.grasp import hand_down
@@ -14,6 +15,8 @@ from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
 from manip_il.tasks.starts import UPRIGHT, draw_goal
 from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
 
 
 def _to_goal(world: World) -> Target:
@@ -49,6 +52,10 @@ class ReachGoal:
     def observe(self, world: World) -> Observed:
         """Return hand, goal, and the way from one to the other."""
         return {**observe_hand(world), "goal": world.goal, "goal_from_ee": world.goal - world.ee.position}
+
+    def destination(self, world: World) -> F64:
+        """Return the goal, (3,) [m]."""
+        return world.goal
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""

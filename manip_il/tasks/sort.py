@@ -232,6 +232,10 @@ class Sort:
             **{one: world.pose(one).position for one in BINS.values()},
         }
 
+    def destination(self, world: World) -> F64:
+        """Return the middle of the named bin, (3,) [m]."""
+        return world.pose(BINS[asked(world)]).position
+
     def error(self, world: World) -> float:
         """Return how far the named cube is from its bin's middle [m], 0 in it; more where another is in a bin."""
         name = asked(world)

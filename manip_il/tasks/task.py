@@ -113,6 +113,10 @@ class Task(Protocol):
         """Return `environment_state` by names, in its order: numbers, and vectors of x, y and z."""
         ...
 
+    def destination(self, world: World) -> F64:
+        """Return where the object, or the hand where there is none, is to go, (3,) [m]; for reports alone."""
+        ...
+
     def error(self, world: World) -> float:
         """Return how far the task is from being solved [m]; within the tolerance it is."""
         ...

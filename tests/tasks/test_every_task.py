@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -14,7 +15,7 @@ import pytest
 
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.engine import environments
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec, positions
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName
 from manip_il.expert import Expert
@@ -139,6 +140,18 @@ def test_progress_is_a_share_wherever_the_arm_gets_to(robot: str, task: str):
         for _ in range(30):
             env.advance(env.scene.actions.random_near(env.observe().state, rng))
             assert 0 <= TASKS[task].progress(env.world) <= 1
+
+
+def way_left(env: ManipEnv) -> float:
+    """Distance of the object, or else the hand, from where it is to go [m]."""
+    found = positions(env.config, env.get_state().to_vector())
+    return math.dist(found.get("object", found["hand"]), found["goal"])
+
+
+@every_scene
+def test_what_is_solved_has_come_to_where_it_was_to_go(robot: str, task: str):
+    for seed, (_, env) in zip(SEEDS, expert_path(robot, task, False), strict=True):
+        assert way_left(env) < min(0.07, way_left(started(robot, task, seed)))
 
 
 @every_scene
