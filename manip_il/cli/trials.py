@@ -28,15 +28,18 @@ FILM_EVERY = 2  # control steps a frame of film
 SUITES = {
     "nominal": ("nominal",),
     "disturbed": ("knocked", "sensing"),
-    "randomised": ("object", "view"),
-    "all": ("nominal", "knocked", "sensing", "object", "view"),
+    "randomised": ("object", "view", "dynamics"),
+    "all": ("nominal", "knocked", "sensing", "object", "view", "dynamics"),
 }
 CONDITIONS = SUITES["all"]
 _YAML = (".yaml", ".yml")
 VARY_HELP = (
-    "how worlds differ from episode to episode: object, view (with cameras), knocked, sensing, or YAMLs of ranges"
+    "how worlds differ from episode to episode: object, view (with cameras), dynamics, knocked, sensing, or YAMLs of "
+    "ranges"
 )
-SUITE_HELP = "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view); or a YAML of ranges"
+SUITE_HELP = (
+    "nominal, disturbed, randomised, all; one condition (knocked, sensing, object, view, dynamics); or a YAML of ranges"
+)
 
 
 @dataclass
