@@ -38,7 +38,7 @@ from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import NOMINAL_VALUES, PICTURED, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.variation import with_drawn
+from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -80,12 +80,14 @@ def open_source(root: Path) -> Source:
             )
     env = EnvConfig(spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
-    if spec.sim_state_size != size:
+    older = size - WORLD_SIZE  # of states from before they held all draws
+    if spec.sim_state_size not in (size, older):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), read_fingerprint(root)
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
     differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
-    return Source(root, spec, differences, recorded_conditions(root, read_provenance(root)))
+    conditions = recorded_conditions(root, read_provenance(root)) if spec.sim_state_size == older else ()
+    return Source(root, spec, differences, conditions)
 
 
 def recorded_conditions(root: Path, provenance: Mapping[str, Any]) -> tuple[Condition, ...]:

@@ -56,7 +56,7 @@ class Condition:
     knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
     [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
     policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
-    of the cube; colour: each of its red, green and blue. joint_damping: factor on the damping of every joint of the arm;
+    of the cube; colour: each of its red, green and blue. joint_damping: factor on that of every joint of the arm;
     actuator_gain: on kp of its actuators, and by its root on kv. posture: how far every joint begins from home, at most
     [rad]. camera_shift [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp;
     light_turn: of the lamps about the vertical [deg].

@@ -67,7 +67,7 @@ def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch)
 
 
 def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
-    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=8", *SMALL) == 0
+    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=10", *SMALL) == 0
     data = json.loads(Path("e/eval.json").read_text())
     conditions = suite_conditions("all", "pick_place", sees=False)
     counts = {name: one["n_episodes"] for name, one in data["by_condition"].items()}
