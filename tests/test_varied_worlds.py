@@ -138,7 +138,7 @@ def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(episodes:
 def test_a_dataset_from_before_is_read_and_has_the_looks_that_its_provenance_says(tmp_path: Path):
     varied, root = Condition("dim", brightness=(0.5, 0.7)), tmp_path / "older"
     [episode] = run_job(RolloutJob(REACH, "expert", conditions=(varied,)), [1])
-    states = np.delete(episode.columns[schema.SIM_STATE], range(-4 - WORLD_SIZE, -4), axis=1)
+    states = np.delete(episode.columns[schema.SIM_STATE].astype(np.float64), range(-4 - WORLD_SIZE, -4), axis=1)
     states[:, -4] -= WORLD_SIZE
     spec = replace(env_spec(REACH), sim_state_size=states.shape[1])
     older = replace(episode, columns={**episode.columns, schema.SIM_STATE: states}, drawn={})
