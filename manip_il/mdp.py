@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,8 @@ class Episode:
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
     at some time. success_at_end: within the tolerance for the required steps at the last frame. final: the
     observation after every frame that is `next.done`, in order, so that algorithms can bootstrap; empty where none was
-    made. instruction: its text for policies that read language; empty where it is that of the task.
+    made. instruction: its text for policies that read language; empty where it is that of the task. drawn: how its
+    world differed from the nominal one, plain JSON values by the names of their ranges.
     """
 
     seed: int
@@ -142,6 +143,7 @@ class Episode:
     success_at_end: bool
     final: tuple[Observation, ...] = ()
     instruction: str = ""
+    drawn: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lengths = {key: len(column) for key, column in self.columns.items()}

@@ -39,6 +39,7 @@ class DoctorOptions:
 
     def run(self) -> None:
         """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
+        from manip_il.data.draws import read_drawn, summary
         from manip_il.doctor.examine import has_errors, repair, verdict
         from manip_il.doctor.finding import NotWhole
 
@@ -52,6 +53,8 @@ class DoctorOptions:
         if has_errors(findings):
             raise NotWhole(verdict(dataset, findings))
         say(verdict(dataset, findings))
+        if drawn := summary(read_drawn(self.dataset).values()):
+            say(f"its episodes draw {drawn}")
 
     def _examine(self) -> tuple[Dataset, list[Finding]]:
         from manip_il.doctor.dataset import Dataset
@@ -84,6 +87,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     from manip_il.engine.environments import env_fingerprint, env_spec
     from manip_il.robots import ROBOTS
     from manip_il.sim.env import EnvConfig
+    from manip_il.sim.variation import WORLD_SIZE
     from manip_il.tasks.table import TASKS
 
     if spec.robot not in ROBOTS or spec.task not in TASKS:
@@ -93,7 +97,8 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     here = env_spec(env)
     for what in ("joint_names", "environment_state_names", "sim_state_size", "action_meaning"):
         found, wanted = getattr(spec, what), getattr(here, what)
-        if found != wanted:
+        older = what == "sim_state_size" and found == here.sim_state_size - WORLD_SIZE  # before it held all draws
+        if found != wanted and not older:
             yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
     # Versions are compared elsewhere; tolerance and horizon are not part of a dataset.
     if _MODEL in fingerprint:

@@ -28,14 +28,14 @@ FILM_EVERY = 2  # control steps a frame of film
 SUITES = {
     "nominal": ("nominal",),
     "disturbed": ("knocked", "sensing"),
-    "randomised": ("object", "view"),
-    "all": ("nominal", "knocked", "sensing", "object", "view"),
+    "randomised": ("object", "view", "dynamics"),
+    "all": ("nominal", "knocked", "sensing", "object", "view", "dynamics"),
 }
 CONDITIONS = (*SUITES["all"], "random_actions")
 _YAML = (".yaml", ".yml")
-_BLIND = "knocked, sensing, random_actions"
-VARY_HELP = f"how worlds differ from episode to episode: object, view (with cameras), {_BLIND}, or YAMLs of ranges"
-SUITE_HELP = f"nominal, disturbed, randomised, all; one condition (object, view, {_BLIND}); or a YAML of ranges"
+_NAMED = "object, view (with cameras), dynamics, knocked, sensing, random_actions"
+VARY_HELP = f"how worlds differ from episode to episode: {_NAMED}, or YAMLs of ranges"
+SUITE_HELP = f"nominal, disturbed, randomised, all; one condition of {_NAMED}; or a YAML of ranges"
 
 
 @dataclass

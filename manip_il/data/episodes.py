@@ -6,9 +6,10 @@ branch. Each of these parts ends with `next.done`; in a dataset each is an episo
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,13 @@ from manip_il.mdp import Episode, Observation, Transition
 
 _FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
 _LOG = logging.getLogger(__name__)
+_NEEDED = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")  # of a header
+_OPTIONAL = {"instruction": '""', "drawn": "{}"}
 
 
 @dataclass(frozen=True)
 class Header:
-    """An episode without its columns: how it ended, and the environment that it comes from."""
+    """An episode without its columns: how it ended, what it drew, and the environment that it comes from."""
 
     seed: int
     success: bool
@@ -36,12 +39,40 @@ class Header:
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
     instruction: str = ""  # of the episode, where it is not that of the spec
+    drawn: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
         """Return the header of an episode."""
-        ends = episode.success, episode.success_at_end
-        return cls(episode.seed, *ends, len(episode), spec, fingerprint, episode.instruction)
+        ends = bool(episode.success), bool(episode.success_at_end)
+        return cls(episode.seed, *ends, len(episode), spec, fingerprint, episode.instruction, episode.drawn)
+
+    def to_texts(self) -> dict[str, str]:
+        """Return it as JSON by name, as a journal has it."""
+        values = {name: getattr(self, name) for name in _NEEDED} | {"spec": self.spec.to_json()}
+        optional = {"instruction": self.instruction} | ({"drawn": dict(self.drawn)} if self.drawn else {})
+        return {name: json.dumps(value) for name, value in (values | optional).items()}
+
+    @classmethod
+    def from_texts(cls, data: Mapping[str, str]) -> Header:
+        """Return the inverse of `to_texts`; journals of older versions have neither instruction nor draws.
+
+        Raises `ValueError` or `ManipError` for anything else.
+        """
+        if missing := [key for key in _NEEDED if key not in data]:
+            raise ValueError(f"its header lacks {', '.join(missing)}")
+        given = {key: data[key] for key in _NEEDED} | {key: data.get(key, plain) for key, plain in _OPTIONAL.items()}
+        values = {key: checks.parse_json(f"its {key}", text) for key, text in given.items()}
+        return cls(
+            checks.whole("its seed", values["seed"], 0, checks.LARGEST_SEED),
+            checks.truth("its success", values["success"]),
+            checks.truth("its success_at_end", values["success_at_end"]),
+            checks.whole("its number of frames", values["frames"], 1, schema.MOST_FRAMES),
+            RobotTaskSpec.from_json(values["spec"]),
+            checks.mapping("its fingerprint", values["fingerprint"]),
+            checks.text("its instruction", values["instruction"]),
+            checks.mapping("what it drew", values["drawn"]),
+        )
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
@@ -221,7 +252,8 @@ class Selection:
 def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Episode:
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
-    return Episode(episode.seed, columns, bool(solved.any()), bool(solved[-1].any()), final, episode.instruction)
+    ends = {"success": bool(solved.any()), "success_at_end": bool(solved[-1].any())}
+    return replace(episode, columns=columns, final=final, **ends)
 
 
 def _column(values: list[Any], dtype: type) -> NDArray[Any]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import math
 import os
 import re
@@ -30,7 +29,7 @@ from manip_il import checks
 from manip_il.data import schema
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.episodes import Header, final_columns, take_final
-from manip_il.data.schema import IMAGES, MOST_FRAMES, RobotTaskSpec
+from manip_il.data.schema import IMAGES, RobotTaskSpec
 from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mcap import foxglove
 from manip_il.mcap.records import (
@@ -47,8 +46,6 @@ from manip_il.mdp import Episode
 
 _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
-_HEADER_KEYS = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")
-_INSTRUCTION = "instruction"  # of the header; journals of older versions lack it
 _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
@@ -115,7 +112,8 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
             pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
             columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
         final = take_final(columns)
-        episode = Episode(header.seed, columns, header.success, header.success_at_end, final, header.instruction)
+        ends = header.success, header.success_at_end
+        episode = Episode(header.seed, columns, *ends, final, header.instruction, header.drawn)
         if len(episode) != header.frames:
             raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
         return header, episode
@@ -180,19 +178,7 @@ def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str,
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="", library=_RECORD)
-    writer.add_metadata(
-        _RECORD,
-        {
-            "format": _FORMAT,
-            "seed": str(episode.seed),
-            "success": json.dumps(bool(episode.success)),
-            "success_at_end": json.dumps(bool(episode.success_at_end)),
-            "frames": str(len(episode)),
-            "spec": json.dumps(spec.to_json()),
-            "fingerprint": json.dumps(fingerprint),
-            _INSTRUCTION: json.dumps(episode.instruction),
-        },
-    )
+    writer.add_metadata(_RECORD, {"format": _FORMAT} | Header.of(episode, spec, fingerprint).to_texts())
     channels, times = foxglove.episode_channels(episode, spec), foxglove.frame_times(episode, spec)
     foxglove.add_channels(writer, list(channels), times)
     for key, column in (episode.columns | final_columns(episode.final)).items():
@@ -272,18 +258,7 @@ def _header(stream: BinaryIO) -> Header:
         if found == "1":
             raise OlderSchemaError("1", schema.VERSION)
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    if missing := [key for key in _HEADER_KEYS if key not in data]:
-        raise ValueError(f"its header lacks {', '.join(missing)}")
-    values = {key: checks.parse_json(f"its {key}", data[key]) for key in _HEADER_KEYS}
-    return Header(
-        checks.whole("its seed", values["seed"], 0, checks.LARGEST_SEED),
-        checks.truth("its success", values["success"]),
-        checks.truth("its success_at_end", values["success_at_end"]),
-        checks.whole("its number of frames", values["frames"], 1, MOST_FRAMES),
-        RobotTaskSpec.from_json(values["spec"]),
-        checks.mapping("its fingerprint", values["fingerprint"]),
-        checks.text("its instruction", checks.parse_json("its instruction", data.get(_INSTRUCTION, '""'))),
-    )
+    return Header.from_texts(data)
 
 
 @contextmanager

@@ -33,6 +33,7 @@ FRAME_INDEX = "frame_index"
 EPISODE_INDEX = "episode_index"
 INDEX = "index"
 TASK_INDEX = "task_index"
+DRAWN = "drawn"  # of meta/episodes, ours: what an episode drew, as JSON
 
 _INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
@@ -111,6 +112,7 @@ def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
     columns = {EPISODE_INDEX: pa.int64(), "tasks": pa.list_(pa.string())}
     for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
         columns[name] = pa.int64()
+    columns[DRAWN] = pa.string()
     for key in spec.image_keys:
         columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
     for key in all_features(spec):

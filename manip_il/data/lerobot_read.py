@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.draws import read_drawn
 from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.info import LARGEST_META, PICTURES, info_problems
 from manip_il.data.parquet_files import UNREADABLE, check_files, read_column, read_file, read_tasks
@@ -86,7 +87,7 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     An episode's success is what `next.success` has. One data file is held at a time. Raises what `read_table` and
     `read_frames` raise.
     """
-    spec, tasks = read_spec(root), read_instructions(root)
+    spec, tasks, drawn = read_spec(root), read_instructions(root), read_drawn(root)
     cameras = list(spec.image_keys) if pictures else []
     wanted = {key: one for key, one in s.features(spec).items() if pictures or key not in spec.image_keys}
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
@@ -105,7 +106,8 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
                 own |= {key: _decode(root, info, readers[key], clips[key], key, int(index[start])) for key in cameras}
-                yield _episode({key: own[key] for key in shapes}, _text(root, tasks, int(task[start])))
+                text, draws = _text(root, tasks, int(task[start])), drawn.get(int(index[start]), {})
+                yield _episode({key: own[key] for key in shapes}, text, draws)
 
 
 def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
@@ -157,8 +159,7 @@ def read_provenance(root: Path) -> dict[str, Any]:
 
 def dataset_info(root: Path) -> DatasetInfo:
     """Return counts and names. Raises `ManipError` for a folder that is no dataset."""
-    info = _read_info(root)
-    ours = _read_ours(root)
+    info, ours = _read_info(root), _read_ours(root)
     spec = _spec(root, ours) if ours else None
     success = at_end = None
     if s.SUCCESS in info["features"]:
@@ -220,9 +221,9 @@ def _decode(
     return reader.read(root / part.path, part.first, part.count, int(info["fps"]))
 
 
-def _episode(columns: dict[str, NDArray[Any]], instruction: str) -> Episode:
-    seed, success = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
-    return Episode(seed, columns, bool(success.any()), bool(success[-1]), instruction=instruction)
+def _episode(columns: dict[str, NDArray[Any]], text: str, drawn: dict[str, Any]) -> Episode:
+    seed, solved = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
+    return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), (), text, drawn)
 
 
 def _cameras(info: dict[str, Any]) -> dict[str, Any]:

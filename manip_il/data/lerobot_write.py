@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, writing
+from manip_il.data.draws import to_text
 from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
 from manip_il.data.parquet_files import ParquetFiles, to_table
@@ -138,6 +139,7 @@ class DatasetWriter:
         columns |= self._index_columns(len(episode), self._tasks.setdefault(task, len(self._tasks)))
         with _explained(self._root):
             row = self._write_data(columns, len(episode), task) | _flat(self._stats.add(columns))
+            row[layout.DRAWN] = to_text(episode.drawn)
             self._encoding.append((row, self._cameras.write(pictures)))
             self._settle()
         self._episodes += 1

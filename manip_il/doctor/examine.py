@@ -20,6 +20,7 @@ from manip_il.data.lerobot_stats import RunningStats
 from manip_il.data.parquet_files import to_array
 from manip_il.doctor.cameras import check_pictures, check_videos
 from manip_il.doctor.dataset import Dataset
+from manip_il.doctor.draws import check_draws
 from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
 from manip_il.doctor.leftovers import (
     BESIDE,
@@ -49,6 +50,7 @@ CHECKS: tuple[Check, ...] = (
     check_videos,
     check_pictures,
     check_spec,
+    check_draws,
     check_fingerprint,
     check_stale_files,
     check_leftovers,

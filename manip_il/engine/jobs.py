@@ -19,7 +19,7 @@ from manip_il.expert import Expert
 from manip_il.learn.pretrained import check_interface
 from manip_il.mdp import Actor, Episode, State, Transition
 from manip_il.rollout import Driver, Rules, rollout
-from manip_il.sim.conditions import Condition
+from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import build_scene
@@ -102,7 +102,8 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         transitions = map(_without_pictures, transitions)
     branch_env = _BranchEnv.of(job.env, job.cameras) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
-        yield _to_episode(job, frames, expert, branch_env)
+        drawn = draw(job.conditions, frames[0].seed).values
+        yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
 
 
 def lockstep(job: RolloutJob) -> int:

@@ -35,9 +35,10 @@ from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
-from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
+from manip_il.sim.conditions import NOMINAL_VALUES, PICTURED, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -79,12 +80,14 @@ def open_source(root: Path) -> Source:
             )
     env = EnvConfig(spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
-    if spec.sim_state_size != size:
+    older = size - WORLD_SIZE  # of states from before they held all draws
+    if spec.sim_state_size not in (size, older):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), read_fingerprint(root)
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
     differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
-    return Source(root, spec, differences, recorded_conditions(root, read_provenance(root)))
+    conditions = recorded_conditions(root, read_provenance(root)) if spec.sim_state_size == older else ()
+    return Source(root, spec, differences, conditions)
 
 
 def recorded_conditions(root: Path, provenance: Mapping[str, Any]) -> tuple[Condition, ...]:
@@ -172,15 +175,17 @@ def render_states(
 ) -> Pictures:
     """Return pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
 
-    drawn: what their episode draws. An environment with these cameras gives the same bytes in these states.
+    drawn: what their episode draws, for states that were recorded before they held it. An environment with these
+    cameras gives the same bytes in these states.
     """
     view = ManipEnv.of(env, cameras)
-    view.drawn = drawn
+    looks = {name: drawn.values[name] for name in PICTURED if name in drawn.values}
     pictures = {
         schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
     }
     for row, state in enumerate(states):
         view.set_state(State.from_vector(state))
+        view.world.vary(with_drawn(view.world.variation, looks))
         for name, picture in view.observe().images.items():
             pictures[schema.IMAGES + name][row] = picture
     return pictures

@@ -32,6 +32,9 @@ _BOUNDS: dict[str, Range] = {
     "mass": (0.001, 10),
     "size": (0.01, 0.09),
     "friction": (0.01, 10),
+    "joint_damping": (0.01, 100),
+    "actuator_gain": (0.1, 10),
+    "posture": (0, 0.5),
     "colour": (0, 1),
     "camera_shift": (0, 1),
     "camera_turn": (0, 90),
@@ -40,8 +43,9 @@ _BOUNDS: dict[str, Range] = {
 }
 _WHOLE = ("knock_step", "delay")
 _KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
-_MODEL = ("mass", "size", "friction")  # of the object, in physics
-_OBJECT = ("knock", "colour", *_MODEL)
+_BODY = ("mass", "size", "friction")  # of the object, in physics
+_MODEL = (*_BODY, "joint_damping", "actuator_gain")
+_OBJECT = ("knock", "colour", *_BODY)
 PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
@@ -54,8 +58,10 @@ class Condition:
     knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
     [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
     policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
-    of the cube; colour: each of its red, green and blue. camera_shift [m], camera_turn [deg]: of every camera, in a
-    drawn direction. brightness: factor on every lamp; light_turn: of the lamps about the vertical [deg].
+    of the cube; colour: each of its red, green and blue. joint_damping: factor on that of every joint of the arm;
+    actuator_gain: on kp of its actuators, and by its root on kv. posture: how far every joint begins from home, at most
+    [rad]. camera_shift [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp;
+    light_turn: of the lamps about the vertical [deg].
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
     """
@@ -88,7 +94,7 @@ class Condition:
         return Condition(self.name, **kept)
 
     def changes_model(self) -> bool:
-        """Return whether the object is another one than the compiled model's."""
+        """Return whether the object or the arm is another one than the compiled model's."""
         return not self.ranges.keys().isdisjoint(_MODEL)
 
     def draw(self, seed: int) -> Drawn:

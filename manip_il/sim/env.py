@@ -17,9 +17,10 @@ from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.events import Events
+from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import build_scene
-from manip_il.sim.variation import with_drawn
+from manip_il.sim.variation import drawn_in, with_drawn
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import instruction_in
@@ -117,6 +118,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         data.qpos[scene.arm_q] = data.ctrl[scene.arm_ctrl] = posture
         opening = rng.uniform(scene.gripper.least, scene.gripper.most)
         data.qpos[scene.gripper.q] = data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
+        if largest := self.drawn.number("posture"):
+            draw_posture(world, rng_for(seed, "posture"), largest)
         world.update()
         mujoco.mj_forward(world.model, data)
 
@@ -216,7 +219,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        return pictures(self.config.robot, self.config.task, self.data, cameras, self.drawn, self.config.object)
+        looks = Drawn(self.drawn.condition, drawn_in(self.world.variation, self.scene.nominal))
+        return pictures(self.config.robot, self.config.task, self.data, cameras, looks, self.config.object)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

@@ -1,6 +1,7 @@
-"""Parameters of the model that may differ from episode to episode, as numbers that a state holds.
+"""What may differ from episode to episode, as numbers that a state holds.
 
-Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction.
+Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then, for the
+whole world, what `Condition` names so: see `_WORLD`.
 """
 
 from __future__ import annotations
@@ -14,10 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError
+from manip_il.sim.config import CAMERAS
 
 F64 = NDArray[np.float64]
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
+_OWN = -1.0  # a colour that is not drawn: everything has its own
+_WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it is where nothing is drawn
+    "joint_damping": (1.0,),
+    "actuator_gain": (1.0,),
+    "posture": (0.0,),
+    "colour": (_OWN,) * 3,
+    "brightness": (1.0,),
+    "light_turn": (0.0,),
+    "camera_shift": (0.0,) * 3 * len(CAMERAS),
+    "camera_turn": (0.0,) * 3 * len(CAMERAS),
+}
+_STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
+_PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
+NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # of the world, (w,)
+WORLD_SIZE = len(NOTHING_DRAWN)
+_NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # how the episode began, and how it looks
 
 
 @dataclass(frozen=True)
@@ -37,20 +55,69 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
         np.concatenate([model.geom_size[one.geom], [model.body_mass[one.body], model.geom_friction[one.geom, 0]]])
         for one in objects.values()
     ]
-    return np.concatenate(parts) if parts else np.empty(0)
+    return np.concatenate([*parts, NOTHING_DRAWN])
+
+
+def completed(variation: F64, like: F64) -> F64:
+    """Return a variation (v,) as it is now. like: the scene's own, (v,).
+
+    States that were recorded before had the objects' numbers alone; nothing else was drawn, or only the data's
+    provenance says so. Raises `MismatchError` for a variation of another length.
+    """
+    if len(variation) == len(like) - WORLD_SIZE:
+        return np.concatenate([variation, NOTHING_DRAWN])
+    if variation.shape != like.shape:
+        raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
+    return variation
 
 
 def check(variation: F64, like: F64) -> None:
-    """Raise `MismatchError` for a variation of another length than the scene's (v,), `ManipError` for a wrong one."""
-    if variation.shape != like.shape:
-        raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
+    """Raise `ManipError` for a variation (v,) that no world can have. like: the scene's own, (v,)."""
     if (variation[like > 0] <= 0).any():
-        raise ManipError(f"a variation of {variation}; expected lengths, masses and frictions above 0")
+        raise ManipError(f"a variation of {variation}; expected lengths, masses, frictions and factors above 0")
+
+
+def same_physics(variation: F64, other: F64) -> bool:
+    """Return whether two variations (v,) of a scene differ in nothing that moves."""
+    return np.array_equal(variation[:-_NOT_PHYSICS], other[:-_NOT_PHYSICS])
 
 
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
-    """Return a variation (v,) with values by the names of `Condition`: size (edge [m]), mass [kg], friction."""
-    rows = base.copy().reshape(-1, PER_OBJECT)
+    """Return a variation (v,) with drawn values by the names of `Condition`, in its units; other names change nothing.
+
+    size is the edge [m]; camera_shift and camera_turn are there a camera.
+    """
+    split = len(base) - WORLD_SIZE
+    world = base[split:].copy()
+    for name, place in _PLACES.items():
+        if name in drawn:
+            value = drawn[name]
+            world[place] = np.concatenate([value[camera] for camera in CAMERAS]) if isinstance(value, dict) else value
+    return np.concatenate([_objects_with(base[:split], drawn), world])
+
+
+def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
+    """Return what was drawn of a variation (v,), by the names of `Condition`: the inverse of `with_drawn`.
+
+    Without masses and frictions, which the objects' own numbers have. like: the scene's own, (v,).
+    """
+    split, found = len(like) - WORLD_SIZE, dict[str, Any]()
+    sizes, own = (one[:split].reshape(-1, PER_OBJECT)[:, _SIZE] for one in (variation, like))
+    if not np.array_equal(sizes, own):
+        found["size"] = 2 * float(sizes[0].max())
+    for name, place in _PLACES.items():
+        value, nothing = variation[split:][place].tolist(), _WORLD[name]
+        if tuple(value) == nothing:
+            continue
+        if name.startswith("camera"):
+            found[name] = {camera: value[3 * at : 3 * at + 3] for at, camera in enumerate(CAMERAS)}
+        else:
+            found[name] = value if len(value) > 1 else value[0]
+    return found
+
+
+def _objects_with(objects: F64, drawn: Mapping[str, Any]) -> F64:
+    rows = objects.copy().reshape(-1, PER_OBJECT)
     if "size" in drawn:
         rows[:, _SIZE] *= (drawn["size"] / 2 / rows[:, _SIZE].max(axis=1))[:, None]
     if "mass" in drawn:
@@ -60,13 +127,39 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     return rows.reshape(-1)
 
 
-def apply(model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], variation: F64) -> None:
-    """Give the objects of a model that nobody else uses the lengths, masses and frictions of `variation` (v,).
+def apply(
+    model: mujoco.MjModel,
+    plain: mujoco.MjModel,
+    objects: Mapping[str, Object],
+    motors: NDArray[np.int64],
+    variation: F64,
+) -> None:
+    """Give a model that nobody else uses the objects and the arm of `variation` (v,).
 
-    plain: the model as compiled. Call `mj_setConst` afterwards, for what follows from masses.
+    plain: the model as compiled. motors: actuators of the arm's joints, (arm,). Call `mj_setConst` afterwards, for what
+    follows from masses.
     """
+    split = len(variation) - WORLD_SIZE
+    _apply_dynamics(model, plain, motors, variation[split:])
+    _apply_objects(model, plain, objects, variation[:split].reshape(-1, PER_OBJECT))
+
+
+def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArray[np.int64], world: F64) -> None:
+    """Multiply the arm's damping and gains: kv with the root of kp's factor, which keeps the damping ratio."""
     changed: Any = model
-    for one, row in zip(objects.values(), variation.reshape(-1, PER_OBJECT), strict=True):
+    damping, gain = (float(world[_PLACES[name]][0]) for name in ("joint_damping", "actuator_gain"))
+    dofs = plain.jnt_dofadr[plain.actuator_trnid[motors, 0]]
+    changed.dof_damping[dofs] = plain.dof_damping[dofs] * damping
+    changed.actuator_gainprm[motors, 0] = plain.actuator_gainprm[motors, 0] * gain  # kp
+    changed.actuator_biasprm[motors, 1] = plain.actuator_biasprm[motors, 1] * gain  # -kp
+    changed.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
+
+
+def _apply_objects(
+    model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], rows: NDArray[np.float64]
+) -> None:
+    changed: Any = model
+    for one, row in zip(objects.values(), rows, strict=True):
         size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
         before = plain.geom_size[one.geom]
         changed.geom_size[one.geom] = size

@@ -95,21 +95,25 @@ class World:
     # Physics
 
     def vary(self, variation: F64) -> None:
-        """Give the model the sizes, masses and frictions of `variation` (v,). Raises what `variation.check` raises."""
+        """Give the model what of `variation` (v,) is physics.
+
+        Raises what `variation.completed` and `variation.check` raise.
+        """
+        variation = variations.completed(variation, self.scene.nominal)
         if variation.tobytes() == self.variation.tobytes():
             return
         variations.check(variation, self.scene.nominal)
         self._cache.clear()
         self._extents.clear()
         self.variation = variation.copy()
-        if np.array_equal(variation, self.scene.nominal):
+        if variations.same_physics(variation, self.scene.nominal):
             self.model, self.data = self._plain
             return
         if self._own is None:
             model = copy.copy(self.scene.model)  # physics reads masses and sizes from there
             self._own = model, mujoco.MjData(model)
         self.model, self.data = self._own
-        variations.apply(self.model, self.scene.model, self.scene.objects, variation)
+        variations.apply(self.model, self.scene.model, self.scene.objects, self.scene.arm_ctrl, variation)
         mujoco.mj_setConst(self.model, self.data)  # what follows from masses
 
     def physics(self) -> F64:

@@ -45,9 +45,10 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
     [knocked] = suite_conditions("knocked", "pick_place", sees=False)
     assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
     names = [one.name for one in suite_conditions("all", "pick_place", sees=True)]
-    assert names == ["nominal", "knocked", "sensing", "object", "view"]
-    assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == names[:-1]
-    assert [one.name for one in suite_conditions("all", "reach", sees=False)] == names[:-2]
+    assert names == ["nominal", "knocked", "sensing", "object", "view", "dynamics"]
+    blind = ["nominal", "knocked", "sensing", "object", "dynamics"]
+    assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == blind
+    assert [one.name for one in suite_conditions("all", "reach", sees=False)] == [*blind[:3], "dynamics"]
     with pytest.raises(UsageError, match="changes nothing for reach"):
         suite_conditions("object", "reach", sees=True)
 
@@ -66,7 +67,7 @@ def test_suites_are_found_where_an_installation_puts_them(tmp_path, monkeypatch)
 
 
 def test_a_suite_deals_its_episodes_and_says_how_each_condition_went(act, here, capsys):
-    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=8", *SMALL) == 0
+    assert evaluate("e", f"--policy.path={act}", "--suite=all", "--eval.n_episodes=10", *SMALL) == 0
     data = json.loads(Path("e/eval.json").read_text())
     conditions = suite_conditions("all", "pick_place", sees=False)
     counts = {name: one["n_episodes"] for name, one in data["by_condition"].items()}

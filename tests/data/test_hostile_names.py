@@ -147,7 +147,7 @@ def test_a_folder_of_any_name_gives_a_repository_id(folder, wanted, tmp_path):
 def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, field, monkeypatch):
     real = json.dumps
     wrong = {"fingerprint": {"mark": 1}, "spec": spec.to_json()}[field]
-    monkeypatch.setattr(journal.json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
+    monkeypatch.setattr(json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
     monkeypatch.setattr(journal, "_check_limits", lambda stream, seed: None)
     path = journal.write_episode(tmp_path, episodes[0], spec, {"mark": 1})
     for read in (journal.read_header, journal.read_journal):

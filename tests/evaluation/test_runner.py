@@ -75,7 +75,7 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
         env.start(episode.seed)
         assert episode.detail["drawn"] == dict(env.drawn.values)
         assert episode.detail["condition"] == env.drawn.condition
-    assert {episode.detail["condition"] for episode in result.episodes} == {"nominal", "knocked", "sensing", "object"}
+    assert {episode.detail["condition"] for episode in result.episodes} == {one.name for one in ALL}
     assert result.settings.suite == "all"
     assert result.settings.conditions == ALL
 

@@ -164,7 +164,7 @@ TARGETS = (
         Target(
             f"suite {name}", _copy_of(f"suites/{name}.yaml", "suite.yaml"), "suite.yaml", mutate_yaml, (_read_suite,)
         )
-        for name in ("knocked", "sensing", "object", "view")
+        for name in ("knocked", "sensing", "object", "view", "dynamics")
     ),
     Target("eval.json", make_evals, "left/eval.json", mutate_json, (_MERGE, _COMPARE, _replay), share=1.5),
     Target("episodes.jsonl", make_kept, "episodes.jsonl", mutate_json_lines, (_read_kept,)),

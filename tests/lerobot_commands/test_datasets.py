@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
+from manip_il.data.draws import read_drawn
 from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder, has_errors
 
@@ -65,3 +66,23 @@ def test_lerobot_info_names_the_version_that_we_build_on(command):
     said = command("lerobot-info")
     assert "LeRobot version: 0.6.1" in said
     assert "lerobot-eval" in said
+
+
+def test_lerobot_edit_dataset_merges_varied_worlds_with_plain_ones_and_takes_episodes_out(command, record, tmp_path):
+    varied, plain = record("varied", 2, "--vary=dynamics"), record("plain", 2)
+    both, rest = tmp_path / "both", tmp_path / "rest"
+    sources = ["--operation.repo_ids=['someone/varied','someone/plain']", f"--operation.roots=['{varied}','{plain}']"]
+    command(
+        "lerobot-edit-dataset", "--new_repo_id=someone/both", f"--new_root={both}", "--operation.type=merge", *sources
+    )
+    assert not has_errors(examine_folder(both))
+    drawn = read_drawn(varied)
+    assert read_drawn(both) == {**drawn, 2: {}, 3: {}}
+    assert all(drawn.values())
+    taken = ["--operation.type=delete_episodes", "--operation.episode_indices=[0]"]
+    words = ["--repo_id=someone/both", f"--root={both}", "--new_repo_id=someone/rest", f"--new_root={rest}", *taken]
+    command("lerobot-edit-dataset", *words)
+    assert not has_errors(examine_folder(rest))
+    assert read_drawn(rest) == {}  # its rows have LeRobot's own columns alone
+    kept = len(read_table(rest, ["sim_state"])["sim_state"])
+    np.testing.assert_array_equal(read_table(rest)["sim_state"], read_table(both, ["sim_state"])["sim_state"][-kept:])

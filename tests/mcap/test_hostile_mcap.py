@@ -375,7 +375,7 @@ def test_what_could_not_be_read_is_not_written(
     value: int,
     words: str,
 ) -> None:
-    module, episode = journal, make_episode(7)
+    module, episode = journal if hasattr(journal, name) else s, make_episode(7)
     if hasattr(mcap_records, name):  # limits of messages, which only pictures are read from
         module, spec = mcap_records, with_cameras(spec, "front")
         episode = numbered_episodes(make_episode, spec)[0]

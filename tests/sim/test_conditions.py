@@ -61,9 +61,11 @@ def test_a_camera_moves_by_a_drawn_length_in_any_direction():
     assert set(draw([VIEW], 0).values["camera_shift"]) == set(CAMERAS)
 
 
-def test_only_mass_size_and_friction_change_the_model():
+def test_only_what_is_physics_changes_the_model():
     assert OBJECT.changes_model()
+    assert Condition("soft", actuator_gain=(0.7, 1.3)).changes_model()
     assert not VIEW.changes_model()
+    assert not Condition("elsewhere", posture=(0.1, 0.1)).changes_model()
 
 
 def test_what_nobody_notices_is_left_out():

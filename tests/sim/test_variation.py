@@ -1,4 +1,4 @@
-"""A variation is five numbers an object: half its lengths, its mass, its friction."""
+"""A variation is five numbers an object (half its lengths, its mass, its friction), and what the world draws."""
 
 from __future__ import annotations
 
@@ -10,14 +10,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, MismatchError
+from manip_il.sim.conditions import Condition
 from manip_il.sim.scene import build_scene
-from manip_il.sim.variation import Object, apply, check, extents, nominal, with_drawn
+from manip_il.sim.variation import (
+    NOTHING_DRAWN,
+    Object,
+    apply,
+    check,
+    completed,
+    drawn_in,
+    extents,
+    nominal,
+    same_physics,
+    with_drawn,
+)
 from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS, FRICTION
 
 from ..tables import every_scene_with_a_cube
 
 lengths = st.floats(0.005, 0.1)
+NO_MOTORS = np.array([], dtype=np.int64)
 SHAPES = {
     "box": ("0.01 0.02 0.03", (0.02, 0.04, 0.06)),
     "sphere": ("0.02", (0.04, 0.04, 0.04)),
@@ -42,7 +55,8 @@ def inertia_tensor(model: mujoco.MjModel) -> np.ndarray:
 
 @every_scene_with_a_cube
 def test_a_scenes_nominal_variation_is_its_models(robot: str, task: str):
-    np.testing.assert_array_equal(build_scene(robot, task).nominal, [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION])
+    objects = [CUBE_HALF] * 3 + [CUBE_MASS, FRICTION]
+    np.testing.assert_array_equal(build_scene(robot, task).nominal, [*objects, *NOTHING_DRAWN])
 
 
 CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
@@ -61,9 +75,41 @@ CUBE, TALL = [0.025, 0.025, 0.025, 0.1, 1.0], [0.01, 0.02, 0.04, 0.1, 1.0]
     ],
 )
 def test_what_is_drawn_stands_at_its_place_and_the_rest_as_it_was(before: list[float], drawn, after: list[float]):
-    base = np.array(before)
-    np.testing.assert_allclose(with_drawn(base, drawn), after)
-    assert base.tolist() == before
+    base = np.array([*before, *NOTHING_DRAWN])
+    np.testing.assert_allclose(with_drawn(base, drawn)[: len(after)], after)
+    assert base.tolist() == [*before, *NOTHING_DRAWN]
+
+
+EVERYTHING = Condition(
+    "everything",
+    **dict.fromkeys(("joint_damping", "actuator_gain", "brightness"), (0.5, 2.0)),
+    **dict.fromkeys(("size", "posture", "camera_shift", "camera_turn", "light_turn"), (0.03, 0.07)),
+    colour=(0, 1),
+)
+
+
+@every_scene_with_a_cube
+def test_what_is_drawn_of_the_world_can_be_read_off_its_variation(robot: str, task: str):
+    base, drawn = build_scene(robot, task).nominal, dict(EVERYTHING.draw(3).values)
+    assert drawn_in(base, base) == {}
+    found = drawn_in(with_drawn(base, drawn), base)
+    assert found.pop("size") == pytest.approx(drawn.pop("size"))
+    assert found == drawn
+
+
+def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
+    base = np.array([*CUBE, *NOTHING_DRAWN])
+    np.testing.assert_array_equal(completed(np.array(CUBE), base), base)
+    assert completed(base, base) is base
+    with pytest.raises(MismatchError, match="size of the variation"):
+        completed(base[:-1], base)
+
+
+def test_how_the_world_looks_and_began_is_no_physics():
+    base = np.array([*CUBE, *NOTHING_DRAWN])
+    assert same_physics(base, with_drawn(base, {"colour": [1, 0, 0], "posture": 0.1, "brightness": 0.5}))
+    for name in ("size", "mass", "friction", "joint_damping", "actuator_gain"):
+        assert not same_physics(base, with_drawn(base, {name: 0.7})), name
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -86,7 +132,7 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
     plain, objects = free_body(shape, SHAPES[shape][0])
     compiled, _ = free_body(shape, " ".join(map(repr, size)), mass)
     changed = copy.copy(plain)
-    apply(changed, plain, objects, np.array([*size, *[0.0] * (3 - len(size)), mass, 1.0]))
+    apply(changed, plain, objects, NO_MOTORS, np.array([*size, *[0.0] * (3 - len(size)), mass, 1.0, *NOTHING_DRAWN]))
     mujoco.mj_setConst(changed, mujoco.MjData(changed))
     np.testing.assert_allclose(inertia_tensor(changed), inertia_tensor(compiled), rtol=1e-6, atol=1e-12)
     for name in ("body_mass", "body_subtreemass", "geom_rbound", "geom_aabb"):
@@ -96,7 +142,7 @@ def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: 
 def test_a_nominal_variation_changes_nothing():
     plain, objects = free_body("box", "0.02 0.02 0.02")
     changed = copy.copy(plain)
-    apply(changed, plain, objects, nominal(plain, objects))
+    apply(changed, plain, objects, NO_MOTORS, nominal(plain, objects))
     mujoco.mj_setConst(changed, mujoco.MjData(changed))
     for name in ("body_mass", "body_inertia", "geom_size", "geom_friction", "geom_priority", "geom_aabb", "bvh_aabb"):
         np.testing.assert_array_equal(getattr(changed, name), getattr(plain, name), err_msg=name)
@@ -106,7 +152,7 @@ def test_only_a_drawn_friction_has_priority():
     plain, objects = free_body("box", "0.02 0.02 0.02")
     for friction, priority in ((0.5, 1), (float(plain.geom_friction[0, 0]), 0)):
         changed = copy.copy(plain)
-        apply(changed, plain, objects, with_drawn(nominal(plain, objects), {"friction": friction}))
+        apply(changed, plain, objects, NO_MOTORS, with_drawn(nominal(plain, objects), {"friction": friction}))
         assert changed.geom_priority[0] == priority
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, MismatchError, UnknownName
 from manip_il.sim.scene import build_scene
-from manip_il.sim.variation import with_drawn
+from manip_il.sim.variation import WORLD_SIZE, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
@@ -122,12 +122,39 @@ def test_a_cube_of_another_size_rests_on_the_table_and_not_in_it(world: World, e
     assert world.pose(OBJECT).position[2] == pytest.approx(edge / 2, abs=5e-4)
 
 
+@every_scene
+def test_the_arm_is_damped_and_driven_as_the_variation_says_and_the_gripper_as_ever(robot: str, task: str):
+    world = World(build_scene(robot, task))
+    world.vary(with_drawn(world.scene.nominal, {"joint_damping": 3.0, "actuator_gain": 0.64}))
+    model, plain, arm = world.model, world.scene.model, world.scene.arm_ctrl
+    dofs = [model.joint(f"robot/{name}").dofadr[0] for name in world.scene.robot.joints]
+    np.testing.assert_allclose(model.dof_damping[dofs], 3.0 * plain.dof_damping[dofs])
+    np.testing.assert_allclose(model.actuator_gainprm[arm, 0], 0.64 * plain.actuator_gainprm[arm, 0])
+    np.testing.assert_allclose(model.actuator_biasprm[arm, 1:3], plain.actuator_biasprm[arm, 1:3] * [0.64, 0.8])
+    for name, own in (("dof_damping", dofs), ("actuator_gainprm", arm), ("actuator_biasprm", arm)):
+        others = np.delete(np.arange(len(getattr(plain, name))), own)
+        np.testing.assert_array_equal(getattr(model, name)[others], getattr(plain, name)[others], err_msg=name)
+
+
+def test_a_softer_arm_lags_farther_behind_its_command(world: World):
+    behind = []
+    for gain in (1.3, 1.0, 0.7):
+        world.vary(with_drawn(world.scene.nominal, {"actuator_gain": gain}))
+        mujoco.mj_resetData(world.model, world.data)
+        world.data.qpos[world.scene.arm_q] = world.scene.robot.home
+        world.data.ctrl[world.scene.arm_ctrl] = np.asarray(world.scene.robot.home) + 0.1
+        mujoco.mj_step(world.model, world.data, 25)
+        behind.append(np.abs(world.data.ctrl[world.scene.arm_ctrl] - world.data.qpos[world.scene.arm_q]).max())
+    assert behind == sorted(behind)
+    assert behind[2] > 1.1 * behind[0]
+
+
 @pytest.mark.parametrize("bad", [0.0, -0.01])
-@pytest.mark.parametrize("place", range(5))
+@pytest.mark.parametrize("place", range(7))
 def test_a_variation_that_no_body_can_have_is_refused_and_changes_nothing(world: World, place: int, bad: float):
     wrong = world.scene.nominal.copy()
     wrong[place] = bad
-    with pytest.raises(ManipError, match="expected lengths, masses and frictions above 0"):
+    with pytest.raises(ManipError, match="expected lengths, masses, frictions and factors above 0"):
         world.vary(wrong)
     assert world.model is world.scene.model
     np.testing.assert_array_equal(world.variation, world.scene.nominal)
@@ -155,9 +182,9 @@ def test_a_restored_world_is_the_one_that_was_saved(world: World):
 def test_numbers_of_another_scene_are_refused_with_both_sizes(world: World):
     with pytest.raises(MismatchError, match=rf"has 3, {world.scene.name} has {world.scene.state_size}"):
         world.restore(np.zeros(3), world.scene.nominal)
-    with pytest.raises(MismatchError, match=r"size of the variation.*has 3, .*has 5"):
+    with pytest.raises(MismatchError, match=rf"size of the variation.*has 3, .*has {5 + WORLD_SIZE}"):
         world.vary(np.ones(3))
-    with pytest.raises(MismatchError, match=r"has 5, .*has 0"):
+    with pytest.raises(MismatchError, match=rf"has 5, .*has {WORLD_SIZE}"):
         World(build_scene("fetch", "reach")).vary(np.ones(5))
 
 

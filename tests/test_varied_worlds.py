@@ -1,0 +1,192 @@
+"""Worlds that vary: every draw is in the state and in the episode, labels and steps of a restored state are its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.cli.trials import varied
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema
+from manip_il.data.build import build, merge_datasets
+from manip_il.data.draws import read_drawn
+from manip_il.data.journal import read_episode, write_episode
+from manip_il.data.lerobot_read import read_episodes
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.doctor.examine import examine_folder
+from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.render import open_source, render_states
+from manip_il.errors import MismatchError
+from manip_il.expert import Expert
+from manip_il.mdp import Episode, State
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CameraConfig
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.variation import WORLD_SIZE, drawn_in
+
+from .damage import digests
+from .tables import every_scene
+
+KINDS = ("object", "view", "dynamics")
+REACH = EnvConfig("panda", "reach", horizon=6, success_steps=1)
+NOT_IN_THE_WORLDS_NUMBERS = {"mass", "friction"}  # but in the objects'
+
+
+def condition(env: EnvConfig, *kinds: str) -> Condition:
+    [found] = varied([kind for kind in kinds if kind != "object" or env.task != "reach"], env, sees=True)
+    return found
+
+
+def path_of(env: ManipEnv, state: State, steps: int) -> list[bytes]:
+    """States and labels from a state on, under the expert."""
+    expert, path = Expert(env.scene), []
+    env.set_state(state)
+    for _ in range(steps):
+        label = expert.label(env.get_state())
+        path += [env.get_state().to_vector().tobytes(), label.action.tobytes()]
+        env.advance(label.action)
+    return path
+
+
+@every_scene
+def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str):
+    config = EnvConfig(robot, task)
+    env = ManipEnv.of(config, None, [condition(config, *KINDS)])
+    env.start(7)
+    for _ in range(3):
+        env.advance(Expert(env.scene).label(env.get_state()).action)
+    vector = env.get_state().to_vector()
+    plain = ManipEnv.of(config)
+    plain.start(8)
+    restored = State.from_vector(vector)
+    assert path_of(plain, restored, 4) == path_of(env, State.from_vector(vector), 4)
+    drawn = {name: value for name, value in env.drawn.values.items() if name not in NOT_IN_THE_WORLDS_NUMBERS}
+    found = drawn_in(plain.get_state().variation, plain.scene.nominal)
+    assert found.pop("size", 0) == pytest.approx(drawn.pop("size", 0))
+    assert found == drawn
+
+
+@pytest.mark.gl
+def test_pictures_of_restored_states_are_those_of_their_own_world():
+    config, cameras = EnvConfig("panda", "pick_place"), CameraConfig(("front", "wrist"), 32, 32)
+    env = ManipEnv.of(config, cameras, [condition(config, *KINDS)])
+    for seed in (1, 2):
+        env.start(seed)
+        seen, state = env.observe().images, env.get_state().to_vector()
+        made = render_states(config, cameras, state[None])
+        for name, picture in seen.items():
+            np.testing.assert_array_equal(made[schema.IMAGES + name][0], picture)
+    plain = ManipEnv.of(config, cameras)
+    plain.set_state(State.from_vector(state))
+    np.testing.assert_array_equal(plain.observe().images["front"], seen["front"])
+    plain.start(2)
+    assert not np.array_equal(plain.observe().images["front"], seen["front"])
+
+
+@every_scene
+def test_a_state_from_before_worlds_had_numbers_of_their_own_is_read_as_it_was(robot: str, task: str):
+    env = ManipEnv(robot, task)
+    env.start(3)
+    state = env.get_state()
+    older = State(state.physics, state.variation[:-WORLD_SIZE], state.step)
+    label = Expert(env.scene).label(older)
+    assert label.action.tobytes() == Expert(env.scene).label(state).action.tobytes()
+    env.set_state(State.from_vector(older.to_vector()))
+    assert env.get_state().to_vector().tobytes() == state.to_vector().tobytes()
+
+
+@pytest.fixture(scope="module", params=[KINDS, ("object",), ("dynamics",), ("view", "dynamics")], ids="+".join)
+def episodes(request) -> list[Episode]:
+    config = EnvConfig("panda", "pick_place", horizon=12)
+    job = RolloutJob(config, "expert", conditions=(condition(config, *request.param),))
+    return list(run_job(job, [3, 4]))
+
+
+def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(episodes: list[Episode], tmp_path: Path):
+    config = EnvConfig("panda", "pick_place", horizon=12)
+    spec, fingerprint = env_spec(config), env_fingerprint(config)
+    for episode in episodes:
+        path = write_episode(tmp_path / "varied.journals", episode, spec, fingerprint)
+        assert read_episode(path).drawn == episode.drawn != {}
+        state = State.from_vector(episode.columns[schema.SIM_STATE][0])
+        found = drawn_in(state.variation, ManipEnv.of(config).scene.nominal)
+        assert found.keys() == episode.drawn.keys() - NOT_IN_THE_WORLDS_NUMBERS
+    build(tmp_path / "varied.journals", tmp_path / "varied")
+    assert read_drawn(tmp_path / "varied") == {at: episode.drawn for at, episode in enumerate(episodes)}
+    assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [one.drawn for one in episodes]
+    assert examine_folder(tmp_path / "varied") == []
+
+
+def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(episodes: list[Episode], tmp_path: Path):
+    config = EnvConfig("panda", "pick_place", horizon=12)
+    about = {"fingerprint": env_fingerprint(config)}
+    plain = list(run_job(RolloutJob(config, "expert"), [5]))
+    for name, ones in (("varied", episodes), ("plain", plain)):
+        write_dataset(ones, tmp_path / name, env_spec(config), repo_id=f"local/{name}", **about)
+    merge_datasets([tmp_path / "varied", tmp_path / "plain"], tmp_path / "both", repo_id="local/both")
+    assert list(read_drawn(tmp_path / "both").values()) == [*(one.drawn for one in episodes), {}]
+    assert open_source(tmp_path / "both").conditions == ()  # its states say how each frame looks
+    assert examine_folder(tmp_path / "both") == []
+
+
+def test_a_dataset_from_before_is_read_and_has_the_looks_that_its_provenance_says(tmp_path: Path):
+    varied, root = Condition("dim", brightness=(0.5, 0.7)), tmp_path / "older"
+    [episode] = run_job(RolloutJob(REACH, "expert", conditions=(varied,)), [1])
+    states = np.delete(episode.columns[schema.SIM_STATE].astype(np.float64), range(-4 - WORLD_SIZE, -4), axis=1)
+    states[:, -4] -= WORLD_SIZE
+    spec = replace(env_spec(REACH), sim_state_size=states.shape[1])
+    older = replace(episode, columns={**episode.columns, schema.SIM_STATE: states}, drawn={})
+    about = {"fingerprint": env_fingerprint(REACH), "provenance": {"vary": [varied.to_json()]}}
+    write_dataset([older], root, spec, repo_id="local/older", **about)
+    assert open_source(root).conditions == (varied,)
+    assert main(["doctor", str(root)]) == 0
+    write_dataset([episode], tmp_path / "newer", env_spec(REACH), repo_id="local/newer", fingerprint={})
+    with pytest.raises(MismatchError, match="sim_state_size differs"):
+        merge_datasets([root, tmp_path / "newer"], tmp_path / "both", repo_id="local/both")
+
+
+def test_the_doctor_tells_what_was_drawn_and_what_is_no_draw(tmp_path: Path, capsys):
+    job = RolloutJob(REACH, "expert", conditions=(Condition("soft", actuator_gain=(0.7, 0.7), posture=(0.1, 0.1)),))
+    root, about = tmp_path / "soft", {"fingerprint": env_fingerprint(REACH)}
+    write_dataset(run_job(job, [1, 2]), root, env_spec(REACH), repo_id="local/soft", **about)
+    assert main(["doctor", str(root)]) == 0
+    assert "its episodes draw actuator_gain 0.7, posture 0.1\n" in capsys.readouterr().out
+    [path] = root.glob(layout.EPISODES_FILES)
+    table = pq.read_table(path)
+    wrong = table.set_column(table.column_names.index(layout.DRAWN), layout.DRAWN, [["[1]", "{}"]])
+    pq.write_table(wrong, path, write_page_checksum=True)
+    assert [str(one) for one in examine_folder(root) if "drawn" in one.place] != []
+    assert main(["doctor", str(root)]) == 1
+    assert "drawn" in capsys.readouterr().out
+
+
+def test_the_same_seeds_give_the_same_bytes_with_one_worker_or_two(tmp_path: Path):
+    words = ["record", "--robot.type=fetch", "--task.type=reach", "--dataset.num_episodes=3", "--dataset.repo_id=a/b"]
+    words += ["--vary=dynamics"]
+    assert main([*words, "--workers=1", f"--dataset.root={tmp_path / 'one'}"]) == 0
+    assert main([*words, "--workers=2", f"--dataset.root={tmp_path / 'two'}"]) == 0
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    assert len({str(drawn) for drawn in read_drawn(tmp_path / "one").values()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "message"),
+    [
+        ("record", ["--vary=object,dynamic"], "did you mean 'dynamics'?"),
+        ("dagger", ["--vary=veiw"], "did you mean 'view'?"),
+        ("record", ["--vary=view"], "--vary=view changes nothing for pick_place without cameras"),
+        ("record", ["--vary=mine.yaml"], "mine.yaml"),
+    ],
+)
+def test_a_wrong_kind_is_one_line(command: str, words: list[str], message: str, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, *words]) == 2
+    said = capsys.readouterr().err.strip()
+    assert message in said
+    assert len(said.splitlines()) == 1
