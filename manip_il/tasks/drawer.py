@@ -283,5 +283,5 @@ class Drawer:
         if held(world, OBJECT) and _is_open(world):
             return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
-            return 0.3 + 0.2 * grasp_progress(world, OBJECT)
+            return 0.3 + 0.15 * grasp_progress(world, OBJECT)
         return 0.1 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.2 * opened
