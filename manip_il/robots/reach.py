@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 _CELL = 0.05  # of the grid [m]
-_BEYOND = 0.2  # the map goes on around the workspace by this much [m]
+_BEYOND = 0.3  # the map goes on around the workspace by this much [m]
 _ABOVE = 0.05  # and above it [m]
 _VERSION = 1  # of how the map is computed
 _STEPS = 80  # of inverse kinematics, at most

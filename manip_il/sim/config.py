@@ -61,7 +61,7 @@ class EnvConfig:
             return
         from manip_il.tasks.table import get_task  # here, as help needs no simulator
 
-        limits = get_task(self.task).limits
+        limits = get_task(self.task, self.object).limits
         for name in ("tolerance", "success_steps", "horizon"):
             object.__setattr__(self, name, getattr(self, name) or getattr(limits, name))
 

@@ -164,9 +164,12 @@ class World:
 
     def pose(self, name: str) -> Pose:
         """Return the pose of a body. Raises `UnknownName`."""
-        one = self.scene.objects.get(name)
-        body = one.body if one is not None else self._body_id(name)
-        return Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
+        key = "pose", name
+        if key not in self._cache:
+            one = self.scene.objects.get(name)
+            body = one.body if one is not None else self._body_id(name)
+            self._cache[key] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
+        return self._cache[key]
 
     @property
     def goal(self) -> F64:

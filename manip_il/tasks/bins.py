@@ -52,11 +52,12 @@ def drop_rungs(
     """
 
     def nearest(world: World) -> str:
-        return min(names, key=lambda name: math.dist(world.pose(name).position, world.ee.position))
+        ee = world.ee.position.tolist()
+        return min(names, key=lambda name: math.dist(world.pose(name).position.tolist(), ee))
 
     def at_done(world: World) -> bool:
         name = nearest(world)
-        return is_done(world, name) and _hand_is_at(world, name)
+        return _hand_is_at(world, name) and is_done(world, name)
 
     return (
         Rung(

@@ -19,7 +19,7 @@ WALL, FLOOR, PANEL, THIN = 0.035, 0.010, 0.090, 0.004  # of the drawer: height o
 ROOF = 0.080  # of the cabinet, over the table, on the inside [m]
 MIDDLE = GAP + 2 * THIN + INSIDE[0]  # of the drawer's inside from its handle [m]
 BAR_Z, BAR_HALF, BAR_LENGTH = 0.080, 0.006, 0.05  # of the handle: height, half its thickness, half its length [m]
-OPEN = 0.125  # how far the drawer is pulled [m]
+OPEN = 0.12  # how far the drawer is pulled [m]
 HAND_Z = BAR_Z - 0.005  # of the hand at the handle [m]
 
 
@@ -38,14 +38,15 @@ def add_cabinet(spec: mujoco.MjSpec) -> None:
     add_part(cabinet, "cabinet top", (deep + THIN, wide + 2 * THIN, THIN), (front + deep + THIN, 0, ROOF + THIN), WOOD)
     tray = cabinet.add_body(name=TRAY)
     tray.add_joint(
-        name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN + 0.01],
+        name=TRAY, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[-1, 0, 0], limited=True, range=[0, OPEN],
         damping=[5.0, 0, 0], frictionloss=0.5, armature=0.05,
     )  # fmt: skip
     middle = front + length
     add_part(tray, "drawer floor", (length, width, THIN), (middle, 0, FLOOR - THIN), WOOD)
     for side, sign in (("left", 1), ("right", -1)):
         add_part(tray, f"drawer {side}", (length, THIN, WALL / 2), (middle, sign * (width + THIN), WALL / 2), WOOD)
-    add_part(tray, "drawer back", (THIN, width, WALL / 2), (front + 2 * length + THIN, 0, WALL / 2), WOOD)
+    back_z, back_half = (ROOF - THIN + FLOOR) / 2, (ROOF - THIN - FLOOR) / 2  # so high that nothing gets behind it
+    add_part(tray, "drawer back", (THIN, width, back_half), (front + 2 * length + THIN, 0, back_z), WOOD)
     add_part(tray, "drawer front", (THIN, wide + 2 * THIN, PANEL / 2), (GAP + THIN, 0, PANEL / 2), WOOD)
     add_part(tray, BAR, (BAR_HALF, BAR_LENGTH, BAR_HALF), (0, 0, BAR_Z), GREY)
     for side, sign in (("left", 1), ("right", -1)):

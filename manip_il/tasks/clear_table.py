@@ -26,7 +26,7 @@ BOX = "box"
 INSIDE = (0.075, 0.075)  # half the box's inner length and width [m]
 HALF = 0.018  # of a cube's edge [m]
 SLOT = 0.032  # of where a cube is let go from the box's middle, along each side [m]
-SIDE = 0.235  # of the box's middle from the workspace's, left or right [m]
+SIDE = 0.225  # of the box's middle from the workspace's, left or right [m]
 APART = 0.08  # of the cubes at the start [m]
 ROOM = 0.03  # within reach around a cube at the start [m]
 FROM_BOX = 0.15  # of a cube from the box's middle at the start, sideways [m]
@@ -47,8 +47,8 @@ def current(world: World) -> str:
 
 
 def _current(world: World) -> str:
-    left, ee = _left(world), world.ee.position
-    nearest = min(left, key=lambda name: math.dist(world.pose(name).position, ee), default="")
+    left, ee = _left(world), world.ee.position.tolist()
+    nearest = min(left, key=lambda name: math.dist(world.pose(name).position.tolist(), ee), default="")
     if nearest and held(world, nearest):
         return nearest
     return left[0] if left else list(COLOURS)[-1]
@@ -85,7 +85,7 @@ class ClearTable:
 
     name: str = "clear_table"
     instruction: str = "Put all cubes into the box."
-    limits: Limits = Limits(tolerance=0.005, horizon=800)
+    limits: Limits = Limits(tolerance=0.005, horizon=900)
     objects: tuple[str, ...] = tuple(COLOURS)
     grasped: tuple[str, ...] = tuple(COLOURS)
     sizes: tuple[float, float] | None = (0.03, 0.04)

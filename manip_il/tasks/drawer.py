@@ -39,7 +39,7 @@ FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
 AROUND = (0.024, 0.03, 0.018, 0.25)  # of the hand off the handle while it moves it: x, y, z [m], angle [rad]
 HOVER, SLOPE = 0.08, 2.0  # of the hand over the handle on its way there [m]; height gained per distance from it
-BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.055  # of the object from the closed drawer's handle at the start [m]
+BESIDE_X, BESIDE_Y = 0.01, INSIDE[1] + 0.08  # of the object from the closed drawer's handle at the start [m]
 DROP = 0.018  # of the object over the drawer's floor where it is let go [m]
 OVER = 0.13  # of the hand over the object on its way to it [m]
 OVER_FRONT = Lift(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way into the drawer
@@ -47,7 +47,7 @@ OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.
 LEFT = (0.03, 0.06, 0.03)  # of the hand off the handle where it need not rise from it any more: x, y, z [m]
 # In the cabinet's frame: where an object is in the handle's way, x and y; where it lies before the handle of the shut
 # drawer, x; and where it is put aside [m].
-WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.10, -0.06, (-0.04, 0.15)
+WAY_X, WAY_Y, BEFORE, ASIDE = (-0.20, 0.07), 0.12, -0.06, (-0.04, 0.17)
 _STEP = 0.04  # how far ahead of the hand its target runs while it moves the drawer [m]
 
 
@@ -231,7 +231,7 @@ class Drawer:
 
     name: str = "drawer"
     instruction: str = "Put the red cube in the drawer and close it."
-    limits: Limits = Limits(tolerance=SHUT, horizon=400)
+    limits: Limits = Limits(tolerance=SHUT, horizon=500)
     objects: tuple[str, ...] = (OBJECT,)
     grasped: tuple[str, ...] = (OBJECT,)
     sizes: tuple[float, float] | None = (0.03, 0.045)
@@ -246,7 +246,7 @@ class Drawer:
         """Draw where the cabinet stands, left or right, and the cube beside its drawer, at any yaw."""
         x, y = world.scene.robot.workspace.centre
         side = rng.choice([-1.0, 1.0])
-        cabinet = np.array([x + rng.uniform(0.01, 0.05), y + side * rng.uniform(0.05, 0.10), 0.0])
+        cabinet = np.array([x + rng.uniform(0.03, 0.07), y + side * rng.uniform(0.05, 0.10), 0.0])
 
         def fits(at: F64) -> bool:
             return at[0] < cabinet[0] + BESIDE_X and abs(at[1] - cabinet[1]) > BESIDE_Y
@@ -287,5 +287,5 @@ class Drawer:
         if held(world, OBJECT) and _is_open(world):
             return 0.5 + 0.25 * carry_progress(world, OBJECT, _place(world), OVER_FRONT)
         if _is_open(world):
-            return 0.3 + 0.2 * grasp_progress(world, OBJECT)
+            return 0.3 + 0.15 * grasp_progress(world, OBJECT)
         return 0.1 * nearness(math.dist(world.ee.position, hand_at_handle(world))) + 0.2 * opened

@@ -60,8 +60,11 @@ CARRY = Lift()  # to a goal that nothing stands around
 
 def held(world: World, name: str) -> bool:
     """Return whether the object is between the fingers and each of them touches it."""
-    g = grasp_of(world, name)
     x, y, z = IN_HAND
+    half = max(world.extents(name)) / 2
+    if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
+        return False  # without the work of how it could be grasped
+    g = grasp_of(world, name)
     return _inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
 
 

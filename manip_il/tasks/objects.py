@@ -13,6 +13,7 @@ from manip_il.sim.world import GOAL
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
 FRICTION = 1.0  # sliding, against anything
+ROLLING = 0.005  # of what is round, as on a cloth: what falls from the hand stays within reach [m]
 RED = (0.86, 0.24, 0.16)
 BLUE = (0.16, 0.40, 0.80)
 YELLOW = (0.93, 0.72, 0.16)
@@ -49,7 +50,7 @@ def add_object(
         mass=mass,
         material=material.name,
         condim=6 if rolls else 4,
-        friction=[FRICTION, 0.02, 0.001 if rolls else 0.0001],
+        friction=[FRICTION, 0.02, ROLLING if rolls else 0.0001],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
         solref=[0.01, 1],
     )

@@ -22,6 +22,7 @@ from manip_il.tasks.task import CUBE_SIZES, Limits, Observed, Rung, Start
 F64 = NDArray[np.float64]
 
 OBJECT = "object"
+ANY_SHAPE = Limits(horizon=200)  # what is small or rolls away takes more attempts than a cube
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class PickPlace:
     def with_shape(self, shape: Shape) -> Self:
         """Return the task with another object, in its instruction too."""
         instruction = self.instruction.replace(self.shape.word, shape.word)
-        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction)
+        limits = Limits() if shape == CUBE else ANY_SHAPE
+        return replace(self, shape=shape, sizes=shape.sizes, instruction=instruction, limits=limits)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Add the object and the goal."""

@@ -111,7 +111,7 @@ class Push:
 
     name: str = "push"
     instruction: str = "Push the puck to the green goal."
-    limits: Limits = Limits(horizon=150)
+    limits: Limits = Limits(horizon=200)
     objects: tuple[str, ...] = (PUCK,)
     grasped: tuple[str, ...] = ()
     sizes: tuple[float, float] | None = (0.055, 0.07)

@@ -73,7 +73,7 @@ class Stack:
 
     name: str = "stack"
     instruction: str = "Stack the red cube on the blue cube."
-    limits: Limits = Limits(success_steps=20, horizon=300)
+    limits: Limits = Limits(success_steps=20, horizon=400)
     objects: tuple[str, ...] = (TOP, BASE)
     grasped: tuple[str, ...] = (TOP,)
     sizes: tuple[float, float] | None = (0.03, 0.07)

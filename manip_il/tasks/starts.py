@@ -94,7 +94,10 @@ def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: Worl
         drawn = draw()
         if fits(drawn):
             return drawn
-    raise UsageError(f"task {world.scene.task}: no place for {what} in reach of {world.scene.robot.name} was found")
+    raise UsageError(
+        f"task {world.scene.task}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
+        f" {world.scene.robot.name}; choose another task or robot"
+    )
 
 
 def resting_height(world: World, name: str) -> float:

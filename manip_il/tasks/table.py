@@ -46,5 +46,5 @@ def get_task(name: str, shape: str = "") -> Task:
     task = TASKS[name]
     if not isinstance(task, TakesShape):
         takers = ", ".join(one for one in TASKS if isinstance(TASKS[one], TakesShape))
-        raise UsageError(f"task.object is {shape!r}, but {name} has objects of its own; it is for {takers}")
+        raise UsageError(f"object is {shape!r}, but {name} has objects of its own; it is for {takers}")
     return task.with_shape(Shape.parse(shape))
