@@ -25,12 +25,15 @@ OPEN, CLOSE = 1.0, -1.0
 HALF = 0.025  # of the cube's edge [m]
 
 # Pick and place; heights are of the gripper over the cube's middle
-GRASP_HEIGHT = 0.015  # [m]
-CLEAR = 0.055  # height at which the fingers pass over the cube [m]
-BESIDE = 0.022  # off the cube in y, where open fingers still go around it [m]
-NEAR = 0.07  # way in x and z that the gripper goes while the fingers close [m]
-GRASPED = np.array([0.022, 0.026, 0.026])  # off the cube in x, y, z at most when the fingers hold it [m]
-HELD = 0.056  # opening below which they hold it [m]
+GRASP_HEIGHT = 0.0145  # [m]
+CLEAR = 0.053  # height at which the fingers pass over the cube [m]
+STRADDLE = 0.042  # off the cube in y, from where the gripper comes to be over it while it goes down [m]
+NEAR = np.array([0.082, 0.04, 0.082])  # way that the gripper still goes while the fingers close [m]
+OPENING = 0.25  # how much wider the fingers must be for a cube that is farther off in x, a ratio
+LEAD = 0.04  # way in y towards the goal on which the gripper sets out while they close, at most [m]
+CLOSED_ON = 0.03  # way to the grasp at which it begins to set out [m]
+GRASPED = np.array([0.03, 0.026, 0.04])  # off the cube in x, y, z at most when the fingers hold it [m]
+HELD = 0.054  # opening below which they hold it [m]
 
 # Push
 BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half the sides of where the gripper's middle cannot be [m]
@@ -89,17 +92,22 @@ def _carry(scene: Scene) -> tuple[F64, float]:
 
 def _between(scene: Scene) -> bool:
     """The cube is between the fingers, or will be before they have closed."""
-    return bool((np.abs(scene.to_grasp) < [NEAR, BESIDE, NEAR]).all())
+    wide = scene.opening > 2 * HALF + OPENING * max(0.0, abs(scene.to_grasp[0]) - 0.02)
+    return wide and bool((np.abs(scene.to_grasp) < NEAR).all())
 
 
 def _grasp(scene: Scene) -> tuple[F64, float]:
-    return scene.to_grasp, CLOSE
+    """To the cube, and the nearer it is, the more already on the way to the goal: a finger takes it along."""
+    way = scene.to_grasp.copy()
+    share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
+    way[1] += share * np.clip(scene.goal[1] - scene.cube[1], -LEAD, LEAD)
+    return way, CLOSE
 
 
 def _over(scene: Scene) -> tuple[F64, float]:
     """To the cube, and not below its top before the fingers are on both sides of it."""
     way = scene.to_grasp.copy()
-    if abs(way[1]) > BESIDE or scene.opening < 2 * HALF + 0.01:
+    if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
         way[2] = max(way[2], scene.to_cube[2] + CLEAR)
     return way, OPEN
 
