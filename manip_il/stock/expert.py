@@ -37,13 +37,16 @@ HELD = 0.054  # opening below which they hold it [m]
 
 # Push
 BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half the sides of where the gripper's middle cannot be [m]
-CORNERS = [np.array([x, y]) * (BOX + 0.008) for x in (-1, 1) for y in (-1, 1)]  # on the way around it [m]
-LOW = 0.008  # height of the gripper over the cube's middle [m]
+CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # on the way around it [m]
+LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
 AHEAD = 0.004  # room between gripper and cube when it arrives behind it [m]
-ALONG, ACROSS = 0.02, 0.02  # off the place behind the cube, where the gripper pushes [m]
-LOOK = 0.04  # time by which the cube's way is foreseen where it is pushed on [s]
+ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # off the place behind the cube, from where the gripper pushes [m]
+LOOK = 0.003  # time by which the cube's way is foreseen where it is pushed on [s]
 DECELERATION = 9.0  # of a cube that slides on the table [m/s^2]
 AT_GOAL = 0.05  # [m]
+CENTRING = 0.35  # share of the way to the line through cube and goal that the gripper makes good in a step
+DETOUR = 0.03  # way around the cube beyond the straight one, from which on the gripper goes over it [m]
+DOWN = 0.5  # share of a step after which a gripper that goes down as it passes over the cube has to be beside it
 LEG = 0.005  # cost of every leg of a way around the cube beside its length [m]
 
 
@@ -137,21 +140,53 @@ def _touching(direction: F64) -> float:
 def _is_behind(scene: Scene) -> bool:
     direction, way = _direction(scene), scene.to_cube[:2]
     along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
-    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS)
+    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -scene.to_cube[2] < BELOW)
 
 
 def _push(scene: Scene) -> tuple[F64, float]:
+    """As fast as can be where the cube is to go, and towards the line through cube and goal."""
     direction = _direction(scene)
-    way = scene.to_cube[:2] + direction * (REACH - _touching(direction))
-    way = way / max(1.0, np.abs(way).max() / REACH)
+    across = np.array([-direction[1], direction[0]])
+    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (scene.to_cube[:2] @ across)
     return np.append(way, scene.to_cube[2] + LOW), CLOSE
+
+
+def _ends(scene: Scene) -> tuple[F64, F64]:
+    """Where the gripper is and where it is to be behind the cube, both relative to the cube, (2,) [m]."""
+    direction = _direction(scene)
+    return -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
 
 
 def _around(scene: Scene) -> tuple[F64, float]:
     """To behind the cube, past its corners, as far as one step goes."""
-    direction = _direction(scene)
-    start, end = -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
+    start, end = _ends(scene)
     return np.append(_walk(start, _path(start, end)), scene.to_cube[2] + LOW), CLOSE
+
+
+def _is_better_over(scene: Scene) -> bool:
+    """The cube is in the way, and the way around it is long or the gripper is high already."""
+    start, end = _ends(scene)
+    height = -scene.to_cube[2]
+    if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
+        return False
+    around = sum(float(np.abs(two - one).max()) for one, two in itertools.pairwise([start, *_path(start, end)]))
+    return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
+
+
+def _over_cube(scene: Scene) -> tuple[F64, float]:
+    """Straight over the cube to behind it: not into it before the gripper is high, and down as soon as it is past."""
+    start, end = _ends(scene)
+    way = _walk(start, [end])
+    if not _is_inside(start) and REACH - scene.to_cube[2] < HIGH:
+        share = next((one for one in (1, 0.75, 0.5, 0.25) if not _is_inside(start + one * way)), 0)
+        return np.append(share * way, scene.to_cube[2] + HIGH), CLOSE
+    soon = start + DOWN * way
+    height = LOW if not _is_inside(soon) and _is_free(soon, end) else HIGH
+    return np.append(way, scene.to_cube[2] + height), CLOSE
+
+
+def _is_inside(place: F64) -> bool:
+    return bool((np.abs(place) < BOX).all())
 
 
 def _path(start: F64, end: F64) -> list[F64]:
@@ -197,6 +232,7 @@ LADDERS: dict[str, tuple[Rung, ...]] = {
     "FetchPush-v4": (
         Rung("hold", _rests_at_goal, _stay),
         Rung("push", _is_behind, _push),
+        Rung("approach", _is_better_over, _over_cube),
         Rung("approach", _always, _around),
     ),
     "FetchPickAndPlace-v4": (
