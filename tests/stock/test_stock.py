@@ -9,6 +9,8 @@ import pytest
 from manip_il.engine.environments import env_actions, env_spec, positions
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
@@ -16,7 +18,7 @@ from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.events import STANDARD
 from manip_il.stock.environment import StockEnv
 from manip_il.stock.expert import StockExpert
-from manip_il.stock.table import CONTROL_HZ, HORIZON, ROBOT, STOCK
+from manip_il.stock.table import ACTION_MEANING, CONTROL_HZ, HORIZON, ROBOT, STOCK
 
 every_stock = pytest.mark.parametrize("task", list(STOCK))
 
@@ -148,3 +150,20 @@ def test_branches_begin_in_the_states_of_the_path(driver: str):
     states = episode.columns["sim_state"]
     assert np.array_equal(states[path::3], states[:path])
     assert np.array_equal(np.diff(done), np.full(path, 3))
+
+
+def test_actions_that_are_no_joint_targets_are_learnt_as_they_are():
+    fit = FitConfig(policy={"type": "mlp"})
+    assert LeRobotFit(fit, ACTION_MEANING).action_space == "joint_target"
+    assert LeRobotFit(fit).action_space == "joint_delta"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "least", "failures"),
+    [("FetchReach-v4", -2, 0), ("FetchPush-v4", -12, 2), ("FetchPickAndPlace-v4", -10, 0)],
+)
+def test_the_expert_is_fast(task: str, least: float, failures: int):
+    episodes = list(run_job(RolloutJob(config(task), "expert", label="last"), stream_seeds("training", 40)))
+    assert sum(not episode.success_at_end for episode in episodes) <= failures
+    assert np.mean([episode.columns["next.reward"].sum() for episode in episodes]) > least
