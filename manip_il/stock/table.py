@@ -74,6 +74,8 @@ def get_stock(name: str) -> StockTask:
 def take_limits(config: Any) -> None:
     """Give an `EnvConfig` the settings of the stock environments; `UsageError` where it has others, but for 0."""
     get_stock(config.task)
+    if config.object:
+        raise UsageError(f"object is {config.object}; {ROBOT} is unmodified, leave --task.object out")
     own = {"control_hz": CONTROL_HZ, "tolerance": TOLERANCE, "success_steps": 1, "horizon": HORIZON}
     for name, value in own.items():
         given = getattr(config, name)

@@ -116,6 +116,7 @@ def test_positions_are_those_of_the_observation(task: str):
     [
         ({"control_hz": 20}, "control_hz is 20; fetch_stock is unmodified, expected 25"),
         ({"horizon": 100}, "horizon is 100; fetch_stock is unmodified, expected 50"),
+        ({"object": "sphere:0.04"}, "object is sphere:0.04; fetch_stock is unmodified"),
         ({"task": "pick_place"}, "unknown task of fetch_stock 'pick_place'"),
     ],
 )
