@@ -30,6 +30,11 @@ class Environment(Protocol):
         ...
 
     @property
+    def reward(self) -> float:
+        """Reward of the last control step."""
+        ...
+
+    @property
     def progress(self) -> float:
         """Share of the task that is done, 0 to 1."""
         ...
@@ -189,7 +194,7 @@ def _advance(slot: _Slot, action: F64, actor: Actor, rules: Rules) -> Transition
         label=slot.turn.label,
         executed_action=executed,
         actor=actor,
-        reward=float(solved),
+        reward=slot.env.reward,
         success=solved,
         done=done,
         progress=slot.turn.progress,

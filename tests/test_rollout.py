@@ -25,6 +25,10 @@ class Counter:
         return self.x >= GOAL
 
     @property
+    def reward(self) -> float:
+        return float(self.solved)
+
+    @property
     def progress(self) -> float:
         return min(1.0, max(0.0, self.x / GOAL))
 

@@ -12,6 +12,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     import numpy as np
@@ -192,6 +193,8 @@ class RunConfig:
                 raise UsageError(f"{name} is {value}; expected at least 1")
         if not 0 <= self.disturbed_share <= 1:
             raise UsageError(f"disturbed_share is {self.disturbed_share}; expected 0 to 1")
+        if self.disturbed_share and self.env.robot == STOCK:
+            raise UsageError(f"disturbed_share is {self.disturbed_share}; {STOCK} is unmodified, expected 0")
         if self.rounds < 0:
             raise UsageError(f"rounds is {self.rounds}; expected at least 0")
         if self.rounds >= MAX_ROUNDS:

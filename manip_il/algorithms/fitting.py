@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from manip_il.algorithms.config import RunConfig
 from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.environments import env_actions, env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import FitConfig
 from manip_il.seeding import stream_base
-from manip_il.sim.scene import build_scene
 
 F64 = NDArray[np.float64]
 COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)  # what `Sampling.weights` reads
@@ -94,5 +93,5 @@ def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
     """Return how often each frame of the datasets is drawn, (N,); None where all are alike."""
     if config.sampling.is_even:
         return None
-    scale = build_scene(config.env.robot, config.env.task, config.env.object).actions.scale
+    scale = env_actions(config.env).scale
     return config.sampling.weights(read_tables(roots, COLUMNS), scale)

@@ -11,6 +11,7 @@ from manip_il.option import option, option_of
 from manip_il.robots import ROBOTS
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.shape import SHAPE_HELP
+from manip_il.stock import table as stock
 from manip_il.tasks import NAMES
 
 if TYPE_CHECKING:
@@ -42,6 +43,12 @@ def trust_option() -> Any:
     return option(False, _TRUST, command_line_only=True)
 
 
+def require_pictures(robot: str, cameras: Sequence[str]) -> None:
+    """Raise `UsageError` for cameras of a robot whose environments have none."""
+    if cameras and robot == stock.ROBOT:
+        raise UsageError(f"--cameras is {','.join(cameras)}; {robot} has no cameras here, leave it out")
+
+
 def require_workers(workers: int | None) -> None:
     """Raise `UsageError` for less than one process."""
     if workers is not None and workers < 1:
@@ -67,7 +74,9 @@ class TaskGroup:
 class MaybeRobotGroup:
     """`--robot.*` where a checkpoint may say it."""
 
-    type: str | None = option(None, f"{' or '.join(ROBOTS)}; by default the policy's, else {EnvConfig.robot}")
+    type: str | None = option(
+        None, f"{' or '.join([*ROBOTS, stock.ROBOT])}; by default the policy's, else {EnvConfig.robot}"
+    )
 
 
 @dataclass
@@ -105,9 +114,14 @@ class EnvGroup:
         task = task or (meta.task if meta else EnvConfig.task)
         if shape is None:
             shape = meta.object if meta and meta.task == task else ""
-        get_robot(robot)
-        get_task(task)
-        hz = (meta.fps if meta else EnvConfig.control_hz) if self.control_hz is None else self.control_hz
+        is_stock = robot == stock.ROBOT
+        if not is_stock:
+            if task in stock.STOCK:
+                raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
+            get_robot(robot)
+            get_task(task)
+        usual = stock.CONTROL_HZ if is_stock else EnvConfig.control_hz
+        hz = (meta.fps if meta else usual) if self.control_hz is None else self.control_hz
         env = EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon, shape)
         if env.object:
             build_scene(robot, task, env.object)  # which finds an object that is too wide

@@ -85,12 +85,11 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     except (OSError, ValueError, TypeError, RecursionError, ManipError):
         return  # named by the check of the spec
     from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.robots import ROBOTS
+    from manip_il.engine.simulations import is_known
     from manip_il.sim.env import EnvConfig
     from manip_il.sim.variation import WORLD_SIZE
-    from manip_il.tasks.table import TASKS
 
-    if spec.robot not in ROBOTS or spec.task not in TASKS:
+    if not is_known(spec.robot, spec.task):
         yield warning(OURS, f"is for {spec.robot} {spec.task}, which is not known here")
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)

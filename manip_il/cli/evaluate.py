@@ -14,9 +14,10 @@ from manip_il.cli.inputs import check_policy, find_policy, observation_text
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, atomic_write, open_output, require_output
 from manip_il.cli.progress import Stages, say
-from manip_il.cli.trials import SUITE_HELP, Pictures, Shot, film_shots, require_suite, suite_conditions
+from manip_il.cli.trials import SUITE_HELP, Pictures, Shot, episode_hold, film_shots, require_suite, suite_conditions
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
+from manip_il.stock.table import ROBOT
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -146,7 +147,7 @@ class EvalOptions:
                 say(observation_text(cameras, path))
         conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
         job = RolloutJob(env, self.policy.type or "policy", policy=path, label="last", conditions=conditions)
-        return replace(job, hold=self.eval.hold, batch=self.eval.batch_size, trust=self.trust)
+        return replace(job, hold=episode_hold(env, self.eval.hold), batch=self.eval.batch_size, trust=self.trust)
 
     def _check_space(self, path: Path) -> None:
         """Raise `MismatchError` for a checkpoint of another action space than the one asked for."""
@@ -226,11 +227,13 @@ class EvalOptions:
         return str(self.policy.type or self.policy.path)
 
     def _say(self, result: EvalResult) -> None:
-        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table
+        from manip_il.evaluation.tables import evaluation_lines, evaluation_table, print_table, return_line
 
         print_table(evaluation_table(result))
         for line in evaluation_lines(result):
             say(line)
+        if result.robot == ROBOT:
+            say(return_line(result))
         if self.until_width is not None:
             low, high = result.success.interval
             reached = high - low <= self.until_width

@@ -135,11 +135,10 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
     from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.robots import ROBOTS
+    from manip_il.engine.simulations import is_known
     from manip_il.sim.env import EnvConfig
-    from manip_il.tasks.table import TASKS
 
-    if spec.robot not in ROBOTS or spec.task not in TASKS:
+    if not is_known(spec.robot, spec.task):
         warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
@@ -196,9 +195,9 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
 def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
     import numpy as np
 
-    from manip_il.sim.env import ManipEnv
+    from manip_il.engine.simulations import simulation_of
 
-    world = ManipEnv.of(env, cameras if draw else None)
+    world = simulation_of(env.robot).make(env, cameras if draw else None)
     world.start(0)
     observation = world.observe()
     if cameras is None or draw:

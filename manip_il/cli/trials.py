@@ -13,6 +13,7 @@ import manip_il
 from manip_il.cli.progress import Stages, warn
 from manip_il.errors import ManipError, MismatchError, NoEffect, RenderError, UnknownName, UsageError
 from manip_il.option import option
+from manip_il.stock.table import ROBOT, STOCK
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -69,7 +70,7 @@ class Trial:
         from manip_il.evaluation.runner import HOLD
 
         job = RolloutJob(self.env, "expert" if policy is None else "policy", policy=policy, conditions=self.conditions)
-        return replace(job, hold=HOLD, label="last", trust=self.trust)
+        return replace(job, hold=episode_hold(self.env, HOLD), label="last", trust=self.trust)
 
     def file(self, folder: Path, policy: Path | None) -> Path:
         """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
@@ -174,8 +175,15 @@ def for_task(condition: Condition, task: str, shape: str = "", *, sees: bool) ->
     """Return what of a condition has an effect on a task with an object of a shape, see `Condition.for_world`."""
     from manip_il.tasks.table import get_task
 
+    if task in STOCK:  # which takes none
+        return None if condition.ranges else condition
     the_task = get_task(task, shape)
     return condition.for_world(has_object=bool(the_task.objects), sees=sees, sizes=the_task.sizes)
+
+
+def episode_hold(env: EnvConfig, hold: int | None) -> int | None:
+    """Return how long after success an evaluation's episodes end; stock environments run to their own end."""
+    return None if env.robot == ROBOT else hold
 
 
 def require_suite(suite: str) -> None:

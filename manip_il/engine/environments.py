@@ -13,16 +13,13 @@ from numpy.typing import NDArray
 
 from manip_il.data.fingerprint import canonical_json, environment_fingerprint
 from manip_il.data.schema import RobotTaskSpec
+from manip_il.engine.simulations import simulation_of
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.checkpoint import META_FILE, read_meta
 from manip_il.learn.pretrained import read_interface
-from manip_il.mdp import STATE_EXTRAS, State
-from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.sim.env import EnvConfig, environment_state_names
-from manip_il.sim.scene import build_scene
-from manip_il.sim.world import World
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import objects_in, phases
+from manip_il.mdp import State
+from manip_il.robots.action_space import ActionSpace
+from manip_il.sim.config import CAMERAS, CameraConfig, EnvConfig, Look
 
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 
@@ -30,21 +27,12 @@ _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part
 @cache
 def env_spec(config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
     """Return names, sizes and rate that a dataset or policy for this environment must share."""
-    scene = build_scene(config.robot, config.task, config.object)
-    task = get_task(config.task, config.object)
-    return RobotTaskSpec(
-        robot=scene.robot.name,
-        task=config.task,
-        fps=config.control_hz,
-        joint_names=scene.robot.joint_names,
-        environment_state_names=environment_state_names(scene),
-        sim_state_size=scene.state_size + len(scene.nominal) + STATE_EXTRAS,
-        instruction=task.instruction,
-        phases=phases(task),
-        object=config.object,
-        cameras=cameras.names if cameras else (),
-        image_size=(cameras.height, cameras.width) if cameras else (0, 0),
-    )
+    return simulation_of(config.robot).spec(config, cameras)
+
+
+def env_actions(config: EnvConfig) -> ActionSpace:
+    """Return names, bounds and scale of an environment's actions, (n,)."""
+    return simulation_of(config.robot).actions(config)
 
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
@@ -58,8 +46,7 @@ def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings = asdict(config)
     if not config.object:  # as before there were any
         del settings["object"]
-    model = build_scene(config.robot, config.task, config.object, config.physics_step).model_bytes()
-    return environment_fingerprint(model, settings)
+    return environment_fingerprint(simulation_of(config.robot).model_bytes(config), settings)
 
 
 def policy_sha256(policy: Path) -> str:
@@ -99,15 +86,5 @@ def positions(env: EnvConfig, sim_state: NDArray[np.float64]) -> dict[str, list[
 
     The first object that the episode is about is called `object`; `goal` is where it, or the hand, is to go.
     """
-    world, state = _world(env.robot, env.task, env.object), State.from_vector(sim_state)
-    world.restore(state.physics, state.variation)
-    task = get_task(env.task, env.object)
-    found = {"hand": world.ee.position, "goal": task.destination(world)}
-    for name in world.scene.objects:
-        found["object" if name in objects_in(task, world)[:1] else name] = world.pose(name).position
+    found = simulation_of(env.robot).positions(env, State.from_vector(sim_state))
     return {name: [round(float(value), 4) for value in at] for name, at in found.items()}
-
-
-@cache
-def _world(robot: str, task: str, shape: str) -> World:
-    return World(build_scene(robot, task, shape))

@@ -13,16 +13,14 @@ import numpy as np
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.engine import drivers
 from manip_il.engine.drivers import LabelMode, QueryRule, drawn_step
-from manip_il.engine.environments import env_spec, policy_cameras
+from manip_il.engine.environments import env_actions, env_spec, policy_cameras
+from manip_il.engine.simulations import RestorableEnvironment, simulation_of
 from manip_il.errors import MismatchError, UsageError
-from manip_il.expert import Expert
 from manip_il.learn.pretrained import check_interface
 from manip_il.mdp import Actor, Episode, State, Transition
-from manip_il.rollout import Driver, Rules, rollout
+from manip_il.rollout import Driver, Labeller, Rules, rollout
 from manip_il.sim.conditions import Condition, draw
-from manip_il.sim.config import CameraConfig
-from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.sim.config import CameraConfig, EnvConfig
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -95,12 +93,13 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     if not seeds:
         return
     cameras = observed_cameras(job)
-    envs = [ManipEnv.of(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
-    expert = _expert(job.env.robot, job.env.task, job.env.object)
+    make = simulation_of(job.env.robot).make
+    envs = [make(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
+    expert = _expert(job.env)
     transitions = rollout(envs, seeds, _make_driver(job, envs[0]), _rules(job), expert)
     if job.cameras is None and cameras is not None:
         transitions = map(_without_pictures, transitions)
-    branch_env = _BranchEnv.of(job.env, job.cameras) if job.label == "branch" else None
+    branch_env = _BranchEnv(make(job.env, job.cameras)) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
         drawn = draw(job.conditions, frames[0].seed).values
         yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
@@ -110,7 +109,8 @@ def lockstep(job: RolloutJob) -> int:
     """Return how many environments of a job run in lockstep in one process."""
     if job.policy is None:
         return 1  # alone, an environment has the processor's cache
-    return min(job.batch, OWN_MODELS) if any(one.changes_model() for one in job.conditions) else job.batch
+    shared = simulation_of(job.env.robot).shares_models and not any(one.changes_model() for one in job.conditions)
+    return job.batch if shared else min(job.batch, OWN_MODELS)
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:
@@ -128,14 +128,14 @@ def observed_cameras(job: RolloutJob) -> CameraConfig | None:
     return job.cameras
 
 
-def _make_driver(job: RolloutJob, env: ManipEnv) -> Driver:
+def _make_driver(job: RolloutJob, env: RestorableEnvironment) -> Driver:
     """The driver of a job, with its gate. Raises what loading a policy raises."""
     if job.driver == "expert":
         return drivers.ExpertDriver()
     if job.driver == "noisy_expert":
         return drivers.NoisyExpertDriver(np.asarray(job.noise))
     if job.driver == "random":
-        return drivers.RandomDriver(env.scene.actions)
+        return drivers.RandomDriver(env_actions(job.env))
     assert job.policy is not None
     policy = _load(job, job.policy, env)
     driver = drivers.LearnerDriver(policy) if job.driver == "policy" else drivers.MixtureDriver(policy, job.beta)
@@ -146,8 +146,8 @@ def _make_driver(job: RolloutJob, env: ManipEnv) -> Driver:
     return drivers.QueryingDriver(driver, _gate(job, policy, env))
 
 
-def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> drivers.Gate:
-    kind, bound, scale = job.query.kind, job.query.bound, env.scene.actions.scale
+def _gate(job: RolloutJob, policy: LearnedPolicy, env: RestorableEnvironment) -> drivers.Gate:
+    kind, bound, scale = job.query.kind, job.query.bound, env_actions(job.env).scale
     if kind == "one":
         return drivers.at_drawn_step(job.env.horizon)
     if kind == "probability":
@@ -162,7 +162,7 @@ def _gate(job: RolloutJob, policy: LearnedPolicy, env: ManipEnv) -> drivers.Gate
     return drivers.at_every_step()
 
 
-def _load(job: RolloutJob, path: Path, env: ManipEnv) -> LearnedPolicy:
+def _load(job: RolloutJob, path: Path, env: RestorableEnvironment) -> LearnedPolicy:
     from manip_il.learn.policy import LearnedPolicy
 
     policy = LearnedPolicy.load(path, task=env.task_description, trust=job.trust)
@@ -177,7 +177,7 @@ def _rules(job: RolloutJob) -> Rules:
     return Rules(twice * job.env.horizon, job.hold, job.patience, "every" if job.labels_all else "driver")
 
 
-def _to_episode(job: RolloutJob, frames: list[Transition], expert: Expert, branch_env: _BranchEnv | None) -> Episode:
+def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: _BranchEnv | None) -> Episode:
     if job.label == "last":
         return to_episode(frames, job.round, job.beta, labelled=False)
     if job.label == "takeover":
@@ -201,17 +201,38 @@ def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]
     return [*frames[:last], replace(frames[last], done=True), *rest]
 
 
-class _BranchEnv(ManipEnv):
-    """Begins every episode in `first`."""
+class _BranchEnv:
+    """An environment of which every episode begins in `first`."""
 
     first: State
 
+    def __init__(self, env: RestorableEnvironment):
+        self._env = env
+        self.begin_step, self.advance, self.observe, self.get_state = (
+            *(env.begin_step, env.advance, env.observe, env.get_state),
+        )
+
     def start(self, seed: int) -> None:
         """Begin the episode."""
-        self.set_state(self.first)
+        self._env.set_state(self.first)
+
+    @property
+    def solved(self) -> bool:
+        """State of the task."""
+        return self._env.solved
+
+    @property
+    def reward(self) -> float:
+        """Reward of the last control step."""
+        return self._env.reward
+
+    @property
+    def progress(self) -> float:
+        """Share of the task that is done."""
+        return self._env.progress
 
 
-def _branches(job: RolloutJob, frames: Iterable[Transition], expert: Expert, env: _BranchEnv) -> Iterator[Transition]:
+def _branches(job: RolloutJob, frames: Iterable[Transition], expert: Labeller, env: _BranchEnv) -> Iterator[Transition]:
     """From every frame that has a sound label, the expert's next steps; each branch ends with `done`."""
     for frame in frames:
         if frame.label is not None and frame.label.valid:
@@ -225,5 +246,5 @@ def _without_pictures(transition: Transition) -> Transition:
 
 
 @cache
-def _expert(robot: str, task: str, shape: str) -> Expert:
-    return Expert(build_scene(robot, task, shape))
+def _expert(config: EnvConfig) -> Labeller:
+    return simulation_of(config.robot).expert(config)

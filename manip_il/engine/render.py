@@ -32,7 +32,8 @@ from manip_il.data.lerobot_read import (
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.errors import ManipError, MismatchError
+from manip_il.engine.simulations import SIMULATIONS
+from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import Episode, State
 from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import NOMINAL_VALUES, PICTURED, Condition, Drawn, draw
@@ -178,6 +179,8 @@ def render_states(
     drawn: what their episode draws, for states that were recorded before they held it. An environment with these
     cameras gives the same bytes in these states.
     """
+    if env.robot in SIMULATIONS:
+        raise RenderError(f"{env.robot} has no cameras here")
     view = ManipEnv.of(env, cameras)
     looks = {name: drawn.values[name] for name in PICTURED if name in drawn.values}
     pictures = {

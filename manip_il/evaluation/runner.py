@@ -10,7 +10,7 @@ import numpy as np
 
 from manip_il.data import schema
 from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, policy_sha256, positions
+from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256, positions
 from manip_il.engine.jobs import RolloutJob, observed_cameras
 from manip_il.errors import UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
@@ -18,8 +18,6 @@ from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.results import EvalResult
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
-from manip_il.tasks.table import get_task
-from manip_il.tasks.task import phases
 
 _LOG = logging.getLogger(__name__)
 HOLD = 10  # control steps after success at which an evaluation's episodes end: to see whether it lasts
@@ -89,7 +87,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
         success_at_end=episode.success_at_end,
         steps=len(episode),
         ret=float(episode.columns[schema.REWARD].sum()),
-        phase_at_end=phases(get_task(job.env.task))[phase],
+        phase_at_end=env_spec(job.env).phases[phase],
         detail={
             "steps_to_success": first,
             "condition": drawn.condition,

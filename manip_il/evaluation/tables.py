@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import mean, pstdev
 
 from rich import box
 from rich.console import Console
@@ -117,3 +118,9 @@ def evaluation_lines(result: EvalResult) -> list[str]:
         return []
     phases = ", ".join(f"{phase} {count}" for phase, count in result.failures.items())
     return [f"failures by the phase that they ended in: {phases}"]
+
+
+def return_line(result: EvalResult) -> str:
+    """Return mean and standard deviation of the returns in words."""
+    returns = [episode.ret for episode in result.episodes]
+    return f"return: {mean(returns):.2f}, standard deviation {pstdev(returns):.2f}"

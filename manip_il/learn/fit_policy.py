@@ -80,7 +80,7 @@ class PolicyTrainer:
         weights: F64 | None = None,
         sources: Sources | None = None,
     ):
-        self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config)
+        self.config, self.output_dir, self.lerobot = config, output_dir, LeRobotFit(config, spec.action_meaning)
         options, observation = self.lerobot.resume_options(), self.lerobot.observation
         datasets = sources.to_json() if sources is not None else ()
         conversion = conversion_for(self.lerobot.action_space, spec)

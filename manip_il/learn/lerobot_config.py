@@ -22,7 +22,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.batches import Augment
 from manip_il.learn.fit_config import JOINT_TARGET, MLP, NOT_OURS, OWN_SPACE, FitConfig, check_convertible
@@ -215,18 +215,19 @@ def policy_features(
 class LeRobotFit:
     """The options of a fit as LeRobot's configurations: policy, optimiser, schedule, logger.
 
+    action_meaning: of the data's numbers; where they are no joint targets, they are learnt as they are by default.
     observation: what the policy sees. action_space: in which it learns. augment: of pictures, None for none. Raises
     what `policy_config` raises, `UnknownName` or `UsageError` for an optimiser, a schedule or a logger that LeRobot
     does not know, `MismatchError` for a checkpoint to start from that has learnt in another action space.
     """
 
-    def __init__(self, config: FitConfig):
+    def __init__(self, config: FitConfig, action_meaning: str = RobotTaskSpec.action_meaning):
         self.config = config
         self.policy = policy_config(config.policy, trust=config.trust)
         if config.init_from is not None and not config.is_mlp:
             self.policy.pretrained_path = config.init_from
         self.observation = config.observation or ("images" if self.policy.type == "cnn" else "state")
-        self.action_space = _action_space(self.policy, config)
+        self.action_space = _action_space(self.policy, config, action_meaning)
         self.augment = Augment() if config.image_augment else None
         self.wandb: WandBConfig = _decode(WandBConfig, config.wandb, "--wandb")
         self._optimizer = choice(OptimizerConfig, config.optimizer, "optimizer") if config.optimizer else None
@@ -280,9 +281,11 @@ class LeRobotFit:
         }
 
 
-def _action_space(policy: PreTrainedConfig, config: FitConfig) -> str:
+def _action_space(policy: PreTrainedConfig, config: FitConfig, meaning: str) -> str:
     """The action space of a fit, also put into the configuration of a policy that has it there."""
     wanted, start = config.action_space, config.init_from or config.policy.get("path")
+    if wanted is None and "action_space" not in config.policy and meaning != RobotTaskSpec.action_meaning:
+        wanted = JOINT_TARGET
     known = start is not None and (Path(start) / CONFIG).is_file()  # else the weights are missing, too, which is said
     before = read_interface(Path(start)).space if start is not None and known else None
     if policy.type in OWN_SPACE:

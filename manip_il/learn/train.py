@@ -85,7 +85,7 @@ def fit(
     output_dir = Path(output_dir)
     checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
-    lerobot = LeRobotFit(config)
+    lerobot = LeRobotFit(config, spec.action_meaning)
     conversion = conversion_for(lerobot.action_space, spec)
     rows = learning_rows(table, conversion)
     drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)

@@ -8,6 +8,7 @@ from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
 from manip_il.robots import ROBOTS
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
+from manip_il.stock import table as stock
 from manip_il.tasks import NAMES
 
 DT_SIM = 0.002  # longest step of physics [s]
@@ -21,7 +22,7 @@ class EnvConfig:
     object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own.
     """
 
-    robot: str = option("panda", " or ".join(ROBOTS))
+    robot: str = option("panda", " or ".join([*ROBOTS, stock.ROBOT]))
     task: str = option("pick_place", ", ".join(NAMES))
     control_hz: int = option(20, "control steps a second")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
@@ -34,6 +35,8 @@ class EnvConfig:
     def __post_init__(self) -> None:
         from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
 
+        if self.robot == stock.ROBOT:
+            stock.take_limits(self)
         self._take_object()
         self._take_limits()
         if not 1 <= self.control_hz <= MOST_HZ:

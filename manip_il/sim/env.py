@@ -167,6 +167,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """State of the task: within the tolerance for the required steps in a row, now."""
         return self._streak >= self.config.success_steps
 
+    @property
+    def reward(self) -> float:
+        """Reward of the last control step: 1 where the task is solved, else 0."""
+        return float(self.solved)
+
     def distance(self) -> float:
         """Return how far the task is from being solved [m]."""
         return self._task.error(self.world)

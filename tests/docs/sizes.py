@@ -10,6 +10,7 @@ import yaml
 
 from manip_il.cli.main import load
 from manip_il.cli.options import options_of
+from manip_il.stock.table import ROBOT as STOCK
 
 from .pages import command_of
 
@@ -57,7 +58,8 @@ def small_words(words: Sequence[str]) -> list[str]:
         return list(words)
     known = {option.name for option in options_of(load(name)) if not option.positional}
     given = option_names(own)
-    sizes = {option: size for option, size in (SMALL | OF_COMMAND.get(name, {})).items() if option in known}
+    small = {option: size for option, size in SMALL.items() if option != "env.horizon" or not _is_stock(own)}
+    sizes = {option: size for option, size in (small | OF_COMMAND.get(name, {})).items() if option in known}
     sizes |= {option: size for option, size in GIVEN.items() if option in given}
     if {"policy", "policy.width"} & known:
         kind = _value("policy.type", own) or _policy_in_config(own) or "mlp"
@@ -100,6 +102,11 @@ def option_names(words: Iterable[str]) -> set[str]:
 
 def _value(option: str, words: Iterable[str]) -> str:
     return next((word.partition("=")[2] for word in words if word.startswith(f"--{option}=")), "")
+
+
+def _is_stock(words: Iterable[str]) -> bool:
+    """Whether the environment is a stock one, whose horizon is fixed."""
+    return _value("robot.type", words) == STOCK
 
 
 def _policy_in_config(words: Iterable[str]) -> str:

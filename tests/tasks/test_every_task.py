@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from manip_il.data.schema import EXPERT_PHASE
-from manip_il.engine import environments
+from manip_il.engine import environments, simulations
 from manip_il.engine.environments import env_fingerprint, env_spec, positions
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName
@@ -192,7 +192,7 @@ def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: s
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
-    monkeypatch.setattr(environments, "build_scene", lambda *_: replace(scene, model=model))
+    monkeypatch.setattr(simulations, "build_scene", lambda *_: replace(scene, model=model))
     after = environments._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 

@@ -1,0 +1,159 @@
+"""One stock environment under this program's interface; nothing of it is changed."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+# First: it chooses the OpenGL that mujoco takes on import.
+import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
+from manip_il.errors import MismatchError
+from manip_il.mdp import Observation, State
+from manip_il.robots.action_space import ActionSpace
+from manip_il.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
+
+F64 = NDArray[np.float64]
+_WHOLE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class StockActions(ActionSpace):
+    """Actions [dx, dy, dz, fingers] in [-1, 1]; what is near a state does not depend on the state."""
+
+    def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
+        """Draw any action, (4,), whatever the state (4,) is."""
+        return rng.uniform(self.low, self.high)
+
+
+_ONES = np.ones(len(STATE_NAMES))
+ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]), np.array([True, True, True, False]))
+
+
+class StockEnv:
+    """An environment of gymnasium-robotics whose state is saved and restored bit for bit. task: its name."""
+
+    def __init__(self, task: str):
+        self.task = get_stock(task)
+        self.task_description = self.task.instruction
+        self._env = _make(self.task)
+        self.model: mujoco.MjModel = self._env.model
+        self.data: mujoco.MjData = self._env.data
+        self._size = mujoco.mj_stateSize(self.model, _WHOLE)
+        self._env._mujoco_step = self._run_physics
+        self.start(0)
+
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""
+        self._env.reset(seed=seed)
+        self._step, self._streak, self._ever, self.reward = 0, 0, False, 0.0
+        self._remember()
+
+    def begin_step(self) -> None:
+        """Leave the world as it is: nothing disturbs it."""
+
+    def advance(self, action: NDArray[Any]) -> NDArray[Any]:
+        """Apply one action (4,) for one control step; returns it.
+
+        Raises `NotFiniteError`, `MismatchError`.
+        """
+        _, reward, _, _, info = self._env.step(ACTIONS.clip(action, self._step))
+        if self.task.blocked:  # it has computed all poses again
+            self._remember()
+        self.reward = float(reward)
+        self._step += 1
+        self._streak = self._streak + 1 if info["is_success"] else 0
+        self._ever = self._ever or self.solved
+        return action
+
+    @property
+    def solved(self) -> bool:
+        """State of the task: within 5 cm of the goal after the last step."""
+        return self._streak > 0
+
+    @property
+    def progress(self) -> float:
+        """Share of the task that is done: 1 within the tolerance, 0.5 at twice as far."""
+        return TOLERANCE / max(TOLERANCE, self.distance())
+
+    def distance(self) -> float:
+        """Return how far cube, or gripper, and goal are apart [m]."""
+        return float(np.linalg.norm((self.object if self.task.has_object else self.gripper) - self.goal))
+
+    @property
+    def gripper(self) -> F64:
+        """Position between the fingers, (3,) [m]."""
+        return self.data.site("robot0:grip").xpos
+
+    @property
+    def object(self) -> F64:
+        """Position of the cube, (3,) [m]."""
+        return self.data.site("object0").xpos
+
+    @property
+    def object_velocity(self) -> F64:
+        """Velocity of the cube, (3,) [m/s]."""
+        return self._env._utils.get_site_xvelp(self.model, self.data, "object0")
+
+    @property
+    def opening(self) -> float:
+        """Distance of the fingers [m]."""
+        return sum(float(self.data.joint(f"robot0:{side}_gripper_finger_joint").qpos[0]) for side in "rl")
+
+    @property
+    def goal(self) -> F64:
+        """Desired goal, (3,) [m]."""
+        return self._env.goal
+
+    def observe(self) -> Observation:
+        """Return gripper and opening, (4,), and the environment's own observation with the goal, (k,)."""
+        own = self._env._get_obs()
+        state = np.append(own["observation"][:3], self.opening).astype(np.float32)
+        return Observation(state, np.append(own["observation"], own["desired_goal"]).astype(np.float32))
+
+    def get_state(self) -> State:
+        """Return everything that the future depends on; `set_state` restores it bit for bit."""
+        physics = np.empty(self._size)
+        mujoco.mj_getState(self.model, self.data, physics, _WHOLE)
+        return State(np.concatenate([physics, *self._begun]), self.goal.copy(), self._step, self._streak, self._ever)
+
+    def set_state(self, state: State) -> None:
+        """Restore a state of the same task. Raises `MismatchError` for another one's."""
+        size, nq = self._size, self.model.nq
+        if len(state.physics) != (expected := size + nq + self.model.nv) or len(state.variation) != 3:
+            raise MismatchError("size of the state", "the state", len(state.physics), self.task.name, expected)
+        physics = state.physics[:size].copy()
+        self._begun = (state.physics[size : size + nq].copy(), state.physics[size + nq :].copy())
+        mujoco.mj_setState(self.model, self.data, physics, _WHOLE)
+        self.data.qpos[:], self.data.qvel[:] = self._begun
+        mujoco.mj_fwdPosition(self.model, self.data)
+        mujoco.mj_fwdVelocity(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, physics, _WHOLE)
+        self._env.goal = state.variation.copy()
+        self._step, self._streak, self._ever, self.reward = state.step, state.streak, state.ever, 0.0
+
+    @property
+    def state_size(self) -> int:
+        """Length of `State.to_vector`."""
+        return len(self.get_state().to_vector())
+
+    def _remember(self) -> None:
+        """Poses are those of positions and velocities as they are now."""
+        self._begun = (self.data.qpos.copy(), self.data.qvel.copy())
+
+    def _run_physics(self, action: NDArray[Any]) -> None:
+        """Run the environment's physics steps in two calls, between which the last one's beginning is remembered."""
+        mujoco.mj_step(self.model, self.data, nstep=self._env.n_substeps - 1)
+        self._remember()
+        mujoco.mj_step(self.model, self.data, nstep=1)
+
+
+def _make(task: StockTask) -> Any:
+    """The environment without gymnasium's wrappers, whose time limit is the rollout's horizon."""
+    with contextlib.redirect_stderr(io.StringIO()):  # gymnasium-robotics announces its versions there
+        module = import_module(f"gymnasium_robotics.envs.fetch.{task.module}")
+    return getattr(module, task.cls)(reward_type="sparse")

@@ -1,0 +1,259 @@
+"""Experts of the stock environments: ladders over gripper, cube and goal, latest rung first.
+
+All are functions of the state alone. An action of 1 moves the gripper by about `REACH` in a control step along each
+axis by itself, so that the longest of x, y and z says how long a way takes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.mdp import Label, State
+from manip_il.stock.environment import StockEnv
+from manip_il.stock.table import PHASES
+
+F64 = NDArray[np.float64]
+
+REACH = 0.032  # way of the gripper in one control step at an action of 1 [m]
+OPEN, CLOSE = 1.0, -1.0
+HALF = 0.025  # of the cube's edge [m]
+
+# Pick and place; heights are of the gripper over the cube's middle
+GRASP_HEIGHT = 0.0145  # [m]
+CLEAR = 0.053  # height at which the fingers pass over the cube [m]
+STRADDLE = 0.042  # off the cube in y, from where the gripper comes to be over it while it goes down [m]
+NEAR = np.array([0.082, 0.04, 0.082])  # way that the gripper still goes while the fingers close [m]
+OPENING = 0.25  # how much wider the fingers must be for a cube that is farther off in x, a ratio
+LEAD = 0.04  # way in y towards the goal on which the gripper sets out while they close, at most [m]
+CLOSED_ON = 0.03  # way to the grasp at which it begins to set out [m]
+GRASPED = np.array([0.03, 0.026, 0.04])  # off the cube in x, y, z at most when the fingers hold it [m]
+HELD = 0.054  # opening below which they hold it [m]
+
+# Push
+BOX = np.array([HALF + 0.0135, HALF + 0.0155])  # half the sides of where the gripper's middle cannot be [m]
+CORNERS = [np.array([x, y]) * (BOX + 0.01) for x in (-1, 1) for y in (-1, 1)]  # on the way around it [m]
+LOW, HIGH = 0.012, 0.05  # heights of the gripper over the cube's middle, to push it and to pass over it [m]
+AHEAD = 0.004  # room between gripper and cube when it arrives behind it [m]
+ALONG, ACROSS, BELOW = 0.028, 0.021, 0.03  # off the place behind the cube, from where the gripper pushes [m]
+LOOK = 0.003  # time by which the cube's way is foreseen where it is pushed on [s]
+DECELERATION = 9.0  # of a cube that slides on the table [m/s^2]
+AT_GOAL = 0.05  # [m]
+CENTRING = 0.35  # share of the way to the line through cube and goal that the gripper makes good in a step
+DETOUR = 0.03  # way around the cube beyond the straight one, from which on the gripper goes over it [m]
+DOWN = 0.5  # share of a step after which a gripper that goes down as it passes over the cube has to be beside it
+LEG = 0.005  # cost of every leg of a way around the cube beside its length [m]
+
+
+class Scene:
+    """Positions (3,) [m] of gripper, cube and goal in one state, and the opening of the fingers [m]."""
+
+    def __init__(self, env: StockEnv):
+        self.gripper, self.goal, self.opening = env.gripper.copy(), env.goal, env.opening
+        if env.task.has_object:
+            self.cube, self.velocity = env.object.copy(), env.object_velocity
+
+    @cached_property
+    def to_cube(self) -> F64:
+        """Way from gripper to cube, (3,) [m]."""
+        return self.cube - self.gripper
+
+    @cached_property
+    def to_grasp(self) -> F64:
+        """Way from gripper to where it grasps the cube, (3,) [m]."""
+        return self.to_cube + [0, 0, GRASP_HEIGHT]
+
+
+class Rung(NamedTuple):
+    """A phase, whether it holds, and its command: the gripper's way (3,) [m], and the fingers', -1 to 1."""
+
+    name: str
+    holds: Callable[[Scene], bool]
+    command: Callable[[Scene], tuple[F64, float]]
+
+
+def _always(scene: Scene) -> bool:
+    return True
+
+
+def _reach(scene: Scene) -> tuple[F64, float]:
+    return scene.goal - scene.gripper, CLOSE
+
+
+def _holds(scene: Scene) -> bool:
+    return bool((np.abs(scene.to_grasp) < GRASPED).all() and scene.opening < HELD)
+
+
+def _carry(scene: Scene) -> tuple[F64, float]:
+    return scene.goal - scene.cube, CLOSE
+
+
+def _between(scene: Scene) -> bool:
+    """The cube is between the fingers, or will be before they have closed."""
+    wide = scene.opening > 2 * HALF + OPENING * max(0.0, abs(scene.to_grasp[0]) - 0.02)
+    return wide and bool((np.abs(scene.to_grasp) < NEAR).all())
+
+
+def _grasp(scene: Scene) -> tuple[F64, float]:
+    """To the cube, and the nearer it is, the more already on the way to the goal: a finger takes it along."""
+    way = scene.to_grasp.copy()
+    share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
+    way[1] += share * np.clip(scene.goal[1] - scene.cube[1], -LEAD, LEAD)
+    return way, CLOSE
+
+
+def _over(scene: Scene) -> tuple[F64, float]:
+    """To the cube, and not below its top before the fingers are on both sides of it."""
+    way = scene.to_grasp.copy()
+    if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
+        way[2] = max(way[2], scene.to_cube[2] + CLEAR)
+    return way, OPEN
+
+
+def _rests_at_goal(scene: Scene) -> bool:
+    """The cube is at the goal, or will slide there by itself."""
+    velocity = scene.velocity[:2]
+    left = (scene.goal - scene.cube)[:2] - velocity * np.hypot(*velocity) / (2 * DECELERATION)
+    return bool(np.hypot(*left) < AT_GOAL)
+
+
+def _stay(scene: Scene) -> tuple[F64, float]:
+    return np.zeros(3), CLOSE
+
+
+def _direction(scene: Scene) -> F64:
+    """Where the cube is to go, a unit vector in the plane, (2,)."""
+    way = (scene.goal - scene.cube)[:2] - LOOK * scene.velocity[:2]
+    return way / max(float(np.hypot(*way)), 1e-6)
+
+
+def _touching(direction: F64) -> float:
+    """Distance of gripper and cube when they touch, the gripper behind the cube [m]."""
+    return float(min(BOX / np.maximum(np.abs(direction), 1e-6)))
+
+
+def _is_behind(scene: Scene) -> bool:
+    direction, way = _direction(scene), scene.to_cube[:2]
+    along, off = way @ direction, abs(way[0] * direction[1] - way[1] * direction[0])
+    return bool(0 < along < _touching(direction) + ALONG and off < ACROSS and -scene.to_cube[2] < BELOW)
+
+
+def _push(scene: Scene) -> tuple[F64, float]:
+    """As fast as can be where the cube is to go, and towards the line through cube and goal."""
+    direction = _direction(scene)
+    across = np.array([-direction[1], direction[0]])
+    way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (scene.to_cube[:2] @ across)
+    return np.append(way, scene.to_cube[2] + LOW), CLOSE
+
+
+def _ends(scene: Scene) -> tuple[F64, F64]:
+    """Where the gripper is and where it is to be behind the cube, both relative to the cube, (2,) [m]."""
+    direction = _direction(scene)
+    return -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
+
+
+def _around(scene: Scene) -> tuple[F64, float]:
+    """To behind the cube, past its corners, as far as one step goes."""
+    start, end = _ends(scene)
+    return np.append(_walk(start, _path(start, end)), scene.to_cube[2] + LOW), CLOSE
+
+
+def _is_better_over(scene: Scene) -> bool:
+    """The cube is in the way, and the way around it is long or the gripper is high already."""
+    start, end = _ends(scene)
+    height = -scene.to_cube[2]
+    if _is_free(start, end) or (_is_inside(start) and height < HIGH - 0.02):
+        return False
+    around = sum(float(np.abs(two - one).max()) for one, two in itertools.pairwise([start, *_path(start, end)]))
+    return height >= HIGH - 0.015 or around - np.abs(end - start).max() >= DETOUR
+
+
+def _over_cube(scene: Scene) -> tuple[F64, float]:
+    """Straight over the cube to behind it: not into it before the gripper is high, and down as soon as it is past."""
+    start, end = _ends(scene)
+    way = _walk(start, [end])
+    if not _is_inside(start) and REACH - scene.to_cube[2] < HIGH:
+        share = next((one for one in (1, 0.75, 0.5, 0.25) if not _is_inside(start + one * way)), 0)
+        return np.append(share * way, scene.to_cube[2] + HIGH), CLOSE
+    soon = start + DOWN * way
+    height = LOW if not _is_inside(soon) and _is_free(soon, end) else HIGH
+    return np.append(way, scene.to_cube[2] + height), CLOSE
+
+
+def _is_inside(place: F64) -> bool:
+    return bool((np.abs(place) < BOX).all())
+
+
+def _path(start: F64, end: F64) -> list[F64]:
+    """Points (2,) of the fastest way around the cube, relative to it; the last is the end [m]."""
+    if _is_free(start, end):
+        return [end]
+    ways = [[one, end] for one in CORNERS if _is_free(one, end)]
+    ways += [[one, two, end] for one in CORNERS for two in CORNERS if _is_free(one, two) and _is_free(two, end)]
+    seen = [way for way in ways if _is_free(start, way[0])]
+    return min(seen or ways or [[end]], key=lambda way: _length([start, *way]))
+
+
+def _length(points: list[F64]) -> float:
+    return sum(float(np.abs(two - one).max()) + LEG for one, two in itertools.pairwise(points))
+
+
+def _walk(start: F64, points: list[F64]) -> F64:
+    """Displacement (2,) after one step along the points [m]."""
+    at, rest = start, REACH
+    for point in points:
+        way = point - at
+        length = float(np.abs(way).max())
+        if length > rest:
+            return at + way * (rest / length) - start
+        at, rest = point, rest - length
+    return at - start
+
+
+def _is_free(start: F64, end: F64) -> bool:
+    """Whether the gripper's straight way misses the cube; both relative to the cube, (2,) [m]."""
+    way, box = end - start, BOX - 0.001
+    flat = np.abs(way) < 1e-9
+    if (flat & (np.abs(start) >= box)).any():
+        return True
+    near, far = (np.divide(side - start, way, out=np.zeros(2), where=~flat) for side in (-box, box))
+    enters = np.where(flat, -np.inf, np.minimum(near, far)).max()
+    leaves = np.where(flat, np.inf, np.maximum(near, far)).min()
+    return bool(enters >= leaves or leaves <= 0 or enters >= 1)
+
+
+LADDERS: dict[str, tuple[Rung, ...]] = {
+    "FetchReach-v4": (Rung("approach", _always, _reach),),
+    "FetchPush-v4": (
+        Rung("hold", _rests_at_goal, _stay),
+        Rung("push", _is_behind, _push),
+        Rung("approach", _is_better_over, _over_cube),
+        Rung("approach", _always, _around),
+    ),
+    "FetchPickAndPlace-v4": (
+        Rung("carry", _holds, _carry),
+        Rung("grasp", _between, _grasp),
+        Rung("approach", _always, _over),
+    ),
+}
+
+
+class StockExpert:
+    """Labels any state of one stock task. The same state gives bit-equal labels in any order and process."""
+
+    def __init__(self, task: str):
+        self._env = StockEnv(task)
+        self._ladder = LADDERS[task]
+
+    def label(self, state: State) -> Label:
+        """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's."""
+        self._env.set_state(state)
+        scene = Scene(self._env)
+        rung = next(rung for rung in self._ladder if rung.holds(scene))
+        way, fingers = rung.command(scene)
+        return Label(np.append(np.clip(way / REACH, -1, 1), fingers), PHASES.index(rung.name), True, 0.0)
