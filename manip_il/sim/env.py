@@ -23,7 +23,7 @@ from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import drawn_in, with_drawn
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import instruction_in
+from manip_il.tasks.task import ask, instruction_in
 
 F32, F64 = NDArray[np.float32], NDArray[np.float64]
 _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
@@ -85,9 +85,15 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Draw a start. The same seed gives the same start, bit for bit."""
+        """Draw a start. The same seed gives the same start, bit for bit.
+
+        options: `instruction` in place of the drawn one. Raises `UsageError` for one that the task has not.
+        """
         super().reset(seed=seed)
         self.start(int(self.np_random.integers(2**62)) if seed is None else seed)
+        if options and "instruction" in options:
+            ask(self._task, self.world, str(options["instruction"]))
+            self.world.update()
         return self._observation(), self._info()
 
     @property

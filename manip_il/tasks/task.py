@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.errors import UsageError, nearest, shorten
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
 
@@ -134,14 +135,34 @@ class Instructing(Protocol):
         """Return the objects that the text of a world's episode is about, which the arm must reach."""
         ...
 
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """Every text that an episode may have."""
+        ...
+
     def instruction_in(self, world: World) -> str:
         """Return the text of a world's episode."""
+        ...
+
+    def ask(self, world: World, instruction: str) -> None:
+        """Make a world's episode one of another of the texts."""
         ...
 
 
 def instruction_in(task: Task, world: World) -> str:
     """Return the text of a world's episode: the task's own sentence, unless it has another for each."""
     return task.instruction_in(world) if isinstance(task, Instructing) else task.instruction
+
+
+def ask(task: Task, world: World, instruction: str) -> None:
+    """Make a world's episode one of a text. Raises `UsageError` for a text that the task has not."""
+    known = task.instructions if isinstance(task, Instructing) else (task.instruction,)
+    if instruction not in known:
+        others = f" and {len(known) - 1} others" if len(known) > 1 else ""
+        near = nearest(instruction, known)
+        raise UsageError(f"instruction is {shorten(instruction)}; {task.name} has {known[0]!r}{others}{near}")
+    if isinstance(task, Instructing):
+        task.ask(world, instruction)
 
 
 def objects_in(task: Task, world: World) -> tuple[str, ...]:

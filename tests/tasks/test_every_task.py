@@ -17,7 +17,7 @@ from manip_il.data.schema import EXPERT_PHASE
 from manip_il.engine import environments, simulations
 from manip_il.engine.environments import env_fingerprint, env_spec, positions
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.expert import Expert
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -215,6 +215,16 @@ def test_a_datasets_words_fit_the_scene(robot: str, task: str):
     assert spec.phases == phases(TASKS[task])
     assert seen.instruction == env.task_description
     assert isinstance(TASKS[task], Instructing) or spec.instruction == env.task_description
+
+
+@every_task
+def test_an_episode_is_about_any_text_that_the_task_has_and_about_no_other(task: str):
+    env, the_task = ManipEnv("panda", task), TASKS[task]
+    for text in the_task.instructions if isinstance(the_task, Instructing) else [the_task.instruction]:
+        env.reset(seed=SEEDS[0], options={"instruction": text})
+        assert env.task_description == env.observe().instruction == text
+    with pytest.raises(UsageError, match=f"instruction is 'Boil an egg.'; {task} has '"):
+        env.reset(seed=SEEDS[0], options={"instruction": "Boil an egg."})
 
 
 def test_a_task_that_is_none_gets_the_nearest():
