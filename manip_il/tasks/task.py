@@ -156,7 +156,7 @@ def instruction_in(task: Task, world: World) -> str:
 
 def ask(task: Task, world: World, instruction: str) -> None:
     """Make a world's episode one of a text. Raises `UsageError` for a text that the task has not."""
-    known = task.instructions if isinstance(task, Instructing) else (task.instruction,)
+    known = list(task.instructions) if isinstance(task, Instructing) else [task.instruction]
     if instruction not in known:
         others = f" and {len(known) - 1} others" if len(known) > 1 else ""
         near = nearest(instruction, known)
