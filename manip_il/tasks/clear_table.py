@@ -115,18 +115,15 @@ class ClearTable:
         return Start(poses)
 
     def observe(self, world: World) -> Observed:
-        """Return hand, box, every cube and whether it is in the box, and the ways of the next one."""
-        cubes: dict[str, F64 | float] = {}
-        for name in COLOURS:
-            cubes |= observe_object(world, name)
-            cubes[f"{name}.in_box"] = float(_inside(world, name))
-        at = world.pose(current(world)).position
+        """Return hand and box, the next cube and the way to its place, and where every cube is, in the box or not."""
+        name = current(world)
         return {
             **observe_hand(world),
             BOX: world.pose(BOX).position,
-            **cubes,
-            "next_from_ee": at - world.ee.position,
-            "place_from_next": _to(world) - at,
+            **{key.replace(name, "next", 1): value for key, value in observe_object(world, name).items()},
+            "place_from_next": _to(world) - world.pose(name).position,
+            **{one: world.pose(one).position for one in COLOURS},
+            **{f"{one}.in_box": float(_inside(world, one)) for one in COLOURS},
         }
 
     def destination(self, world: World) -> F64:
