@@ -29,7 +29,6 @@ from manip_il.evaluation.results import write_json
 from manip_il.evaluation.study import FILE_NAME, TABLE_FILE, Study, table_markdown
 from manip_il.evaluation.tables import print_table
 from manip_il.option import option
-from manip_il.robots.robot import get_robot
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
@@ -184,6 +183,8 @@ def expert_trials(plan: Plan) -> dict[str, dict[str, Trial]]:
 
 def expert_trial(env: EnvConfig, test: ExpertTest) -> Trial | None:
     """Return a test in an arm's environment; None where it would change nothing."""
+    from manip_il.robots.robot import get_robot  # here, as help needs no simulator
+
     env = replace(env, robot=test.robot or env.robot)
     get_robot(env.robot)
     seeds = stream_seeds("test", test.n_episodes, 0)
