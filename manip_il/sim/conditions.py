@@ -35,6 +35,7 @@ _BOUNDS: dict[str, Range] = {
     "actuator_gain": (0.1, 10),
     "posture": (0, 0.5),
     "colour": (0, 1),
+    "table": (0, 1),
     "camera_shift": (0, 1),
     "camera_turn": (0, 90),
     "brightness": (0.1, 3),
@@ -45,7 +46,7 @@ _KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
 _BODY = ("mass", "size", "friction")  # of the object, in physics
 _MODEL = (*_BODY, "joint_damping", "actuator_gain")
 _OBJECT = ("knock", "colour", *_BODY)
-PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
+PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
 @dataclass(frozen=True, init=False)
@@ -56,9 +57,9 @@ class Condition:
     knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
     [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
     policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
-    of the cube; colour: each of its red, green and blue. joint_damping: factor on that of every joint of the arm;
-    actuator_gain: on kp of its actuators, and by its root on kv. posture: how far every joint begins from home, at most
-    [rad]. camera_shift [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp;
+    of the cube; colour: each of its red, green and blue; table: of the table's. joint_damping: factor on that of every
+    joint of the arm; actuator_gain: on kp of its actuators, and by its root on kv. posture: how far every joint begins
+    from home, at most [rad]. camera_shift [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp;
     light_turn: of the lamps about the vertical [deg].
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
@@ -148,7 +149,7 @@ def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
 def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
     if name in _WHOLE:
         return int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
-    if name == "colour":
+    if name in ("colour", "table"):
         return [float(value) for value in rng.uniform(*range_, 3)]
     if name in ("camera_shift", "camera_turn"):
         return {camera: _vector(rng, range_) for camera in CAMERAS}

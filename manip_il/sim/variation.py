@@ -26,6 +26,7 @@ _WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it
     "actuator_gain": (1.0,),
     "posture": (0.0,),
     "colour": (_OWN,) * 3,
+    "table": (_OWN,) * 3,
     "brightness": (1.0,),
     "light_turn": (0.0,),
     "camera_shift": (0.0,) * 3 * len(CAMERAS),

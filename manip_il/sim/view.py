@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import build_scene, camera_id
+from manip_il.sim.scene import TABLE, build_scene, camera_id
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -39,7 +39,8 @@ class ViewModel:
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
             self.model.vis.quality.shadowsize = 0
-        self._geoms = [one.geom for one in build_scene(robot, task, shape).objects.values()]
+        self._objects = [one.geom for one in build_scene(robot, task, shape).objects.values()]
+        self._table = [self.model.geom(TABLE).id]
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
         self._headlight = [colour.copy() for colour in self._headlight_colours()]
@@ -54,7 +55,10 @@ class ViewModel:
             getattr(self.model, name)[:] = plain
         for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
             colour[:] = plain
-        self._change_objects(values.get("size"), values.get("colour"))
+        if "size" in values:
+            self._resize(values["size"])
+        self._paint(self._objects, values.get("colour"))
+        self._paint(self._table, values.get("table"))
         for camera in CAMERAS:
             self._move_camera(camera, values.get("camera_shift", {}), values.get("camera_turn", {}))
         self._light(drawn.number("brightness", 1.0), drawn.number("light_turn"))
@@ -64,13 +68,14 @@ class ViewModel:
         lamp = self.model.vis.headlight
         return [lamp.ambient, lamp.diffuse, lamp.specular]
 
-    def _change_objects(self, edge: float | None, colour: Sequence[float] | None) -> None:
-        for geom in self._geoms:
-            if edge is not None:
-                self.model.geom_size[geom] *= edge / 2 / self.model.geom_size[geom].max()
-            if colour is not None:
-                self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
-                self.model.geom_rgba[geom] = [*colour, 1.0]
+    def _resize(self, edge: float) -> None:
+        for geom in self._objects:
+            self.model.geom_size[geom] *= edge / 2 / self.model.geom_size[geom].max()
+
+    def _paint(self, geoms: Sequence[int], colour: Sequence[float] | None) -> None:
+        for geom in geoms if colour is not None else []:
+            self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
+            self.model.geom_rgba[geom] = [*colour, 1.0]
 
     def _move_camera(self, name: str, shifts: Mapping[str, Any], turns: Mapping[str, Any]) -> None:
         camera = camera_id(self.model, name)

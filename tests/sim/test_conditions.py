@@ -13,7 +13,9 @@ from manip_il.sim.config import CAMERAS
 
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 OBJECT = Condition("object", mass=(0.05, 0.3), size=(0.04, 0.06), colour=(0.1, 0.9))
-VIEW = Condition("view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightness=(0.6, 1.4), light_turn=(-60, 60))
+VIEW = Condition(
+    "view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightness=(0.6, 1.4), light_turn=(-60, 60), table=(0.2, 0.9)
+)
 
 
 def test_a_seed_draws_the_same_in_whatever_order():

@@ -85,6 +85,7 @@ EVERYTHING = Condition(
     **dict.fromkeys(("joint_damping", "actuator_gain", "brightness"), (0.5, 2.0)),
     **dict.fromkeys(("size", "posture", "camera_shift", "camera_turn", "light_turn"), (0.03, 0.07)),
     colour=(0, 1),
+    table=(0, 1),
 )
 
 
@@ -107,7 +108,9 @@ def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
 
 def test_how_the_world_looks_and_began_is_no_physics():
     base = np.array([*CUBE, *NOTHING_DRAWN])
-    assert same_physics(base, with_drawn(base, {"colour": [1, 0, 0], "posture": 0.1, "brightness": 0.5}))
+    assert same_physics(
+        base, with_drawn(base, {"colour": [1, 0, 0], "table": [0, 1, 0], "posture": 0.1, "brightness": 0.5})
+    )
     for name in ("size", "mass", "friction", "joint_damping", "actuator_gain"):
         assert not same_physics(base, with_drawn(base, {name: 0.7})), name
 
