@@ -23,6 +23,7 @@ from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import build_scene
+from manip_il.sim.shape import draws_shape
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -101,7 +102,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         transitions = map(_without_pictures, transitions)
     branch_env = _BranchEnv.of(job.env, job.cameras) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
-        drawn = draw(job.conditions, frames[0].seed).values
+        drawn = draw(job.conditions, frames[0].seed, job.env.object).values
         yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
 
 
@@ -109,7 +110,8 @@ def lockstep(job: RolloutJob) -> int:
     """Return how many environments of a job run in lockstep in one process."""
     if job.policy is None:
         return 1  # alone, an environment has the processor's cache
-    return min(job.batch, OWN_MODELS) if any(one.changes_model() for one in job.conditions) else job.batch
+    varies = draws_shape(job.env.object) or any(one.changes_model() for one in job.conditions)
+    return min(job.batch, OWN_MODELS) if varies else job.batch
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:
