@@ -22,8 +22,8 @@ KINDS = tuple(_SIZES)
 ANY = "any"  # of those kinds, one for each episode
 _SIZES[ANY] = "WIDTH"
 SHAPE_HELP = (
-    "box, cylinder, sphere, capsule, or any of these in each episode, with lengths [m] as in cylinder:0.04x0.08, "
-    "box:0.06x0.03x0.03"
+    "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
+    "cylinder:0.04x0.08, box:0.06x0.03x0.03"
 )
 
 
