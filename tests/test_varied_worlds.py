@@ -28,10 +28,11 @@ from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.shape import KINDS as SHAPES
 from manip_il.sim.variation import WORLD_SIZE, drawn_in
 
 from .damage import digests
-from .tables import every_scene
+from .tables import SCENES, every_scene
 
 KINDS = ("object", "view", "dynamics")
 REACH = EnvConfig("panda", "reach", horizon=6, success_steps=1)
@@ -54,9 +55,9 @@ def path_of(env: ManipEnv, state: State, steps: int) -> list[bytes]:
     return path
 
 
-@every_scene
-def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str):
-    config = EnvConfig(robot, task)
+@pytest.mark.parametrize(("robot", "task", "shape"), [*((*scene, "") for scene in SCENES), ("panda", "lift", "any")])
+def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, task: str, shape: str):
+    config = EnvConfig(robot, task, object=shape)
     env = ManipEnv.of(config, None, [condition(config, *KINDS)])
     env.start(7)
     for _ in range(3):
@@ -73,8 +74,9 @@ def test_a_restored_state_is_the_same_world_with_the_same_labels(robot: str, tas
 
 
 @pytest.mark.gl
-def test_pictures_of_restored_states_are_those_of_their_own_world():
-    config, cameras = EnvConfig("panda", "pick_place"), CameraConfig(("front", "wrist"), 32, 32)
+@pytest.mark.parametrize("shape", ["", "any"])
+def test_pictures_of_restored_states_are_those_of_their_own_world(shape: str):
+    config, cameras = EnvConfig("panda", "pick_place", object=shape), CameraConfig(("front", "wrist"), 32, 32)
     env = ManipEnv.of(config, cameras, [condition(config, *KINDS)])
     for seed in (1, 2):
         env.start(seed)
@@ -101,15 +103,21 @@ def test_a_state_from_before_worlds_had_numbers_of_their_own_is_read_as_it_was(r
     assert env.get_state().to_vector().tobytes() == state.to_vector().tobytes()
 
 
-@pytest.fixture(scope="module", params=[KINDS, ("object",), ("dynamics",), ("view", "dynamics")], ids="+".join)
-def episodes(request) -> list[Episode]:
-    config = EnvConfig("panda", "pick_place", horizon=12)
-    job = RolloutJob(config, "expert", conditions=(condition(config, *request.param),))
-    return list(run_job(job, [3, 4]))
+WORLDS = [("", KINDS), ("", ("object",)), ("", ("dynamics",)), ("", ("view", "dynamics")), ("any", ("object",))]
 
 
-def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(episodes: list[Episode], tmp_path: Path):
-    config = EnvConfig("panda", "pick_place", horizon=12)
+@pytest.fixture(scope="module", params=[*WORLDS, ("any", ())], ids=str)
+def world(request) -> tuple[EnvConfig, list[Episode]]:
+    shape, kinds = request.param
+    config = EnvConfig("panda", "pick_place", horizon=12, object=shape)
+    job = RolloutJob(config, "expert", conditions=(condition(config, *kinds),) if kinds else ())
+    return config, list(run_job(job, [3, 4]))
+
+
+def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
+    world: tuple[EnvConfig, list[Episode]], tmp_path: Path
+):
+    config, episodes = world
     spec, fingerprint = env_spec(config), env_fingerprint(config)
     for episode in episodes:
         path = write_episode(tmp_path / "varied.journals", episode, spec, fingerprint)
@@ -123,14 +131,16 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(episodes: 
     assert examine_folder(tmp_path / "varied") == []
 
 
-def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(episodes: list[Episode], tmp_path: Path):
-    config = EnvConfig("panda", "pick_place", horizon=12)
+def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(
+    world: tuple[EnvConfig, list[Episode]], tmp_path: Path
+):
+    config, episodes = world
     about = {"fingerprint": env_fingerprint(config)}
     plain = list(run_job(RolloutJob(config, "expert"), [5]))
     for name, ones in (("varied", episodes), ("plain", plain)):
         write_dataset(ones, tmp_path / name, env_spec(config), repo_id=f"local/{name}", **about)
     merge_datasets([tmp_path / "varied", tmp_path / "plain"], tmp_path / "both", repo_id="local/both")
-    assert list(read_drawn(tmp_path / "both").values()) == [*(one.drawn for one in episodes), {}]
+    assert list(read_drawn(tmp_path / "both").values()) == [one.drawn for one in [*episodes, *plain]]
     assert open_source(tmp_path / "both").conditions == ()  # its states say how each frame looks
     assert examine_folder(tmp_path / "both") == []
 
@@ -175,6 +185,24 @@ def test_the_same_seeds_give_the_same_bytes_with_one_worker_or_two(tmp_path: Pat
     assert len({str(drawn) for drawn in read_drawn(tmp_path / "one").values()}) == 3
 
 
+def test_episodes_of_any_shape_have_the_shapes_that_are_asked_for_and_say_so(tmp_path: Path, capsys):
+    (tmp_path / "round.yaml").write_text("shape: [sphere, cylinder]\nsize: [0.02, 0.06]\n")
+    words = [
+        "record",
+        "--task.object=any",
+        "--env.tolerance=0.9",
+        "--env.success_steps=1",
+        "--env.horizon=5",
+        "--dataset.num_episodes=8",
+        "--dataset.repo_id=a/b",
+    ]
+    assert main([*words, f"--vary={tmp_path / 'round.yaml'}", f"--dataset.root={tmp_path / 'round'}"]) == 0
+    assert main(["doctor", str(tmp_path / "round")]) == 0
+    assert "shape cylinder or sphere, size 0.0" in capsys.readouterr().out
+    assert main([*words, f"--dataset.root={tmp_path / 'any'}"]) == 0
+    assert {one["shape"] for one in read_drawn(tmp_path / "any").values()} == set(SHAPES)
+
+
 @pytest.mark.parametrize(
     ("command", "words", "message"),
     [
@@ -182,10 +210,14 @@ def test_the_same_seeds_give_the_same_bytes_with_one_worker_or_two(tmp_path: Pat
         ("dagger", ["--vary=veiw"], "did you mean 'view'?"),
         ("record", ["--vary=view"], "--vary=view changes nothing for pick_place without cameras"),
         ("record", ["--vary=mine.yaml"], "mine.yaml"),
+        ("record", ["--vary=round.yaml"], "round: shape is drawn where --task.object is any, not a cube"),
+        ("record", ["--vary=round.yaml", "--task.object=box:0.04"], "any, not box:0.04"),
+        ("dagger", ["--vary=round.yaml", "--task.type=stack"], "--vary=round.yaml changes nothing for stack"),
     ],
 )
 def test_a_wrong_kind_is_one_line(command: str, words: list[str], message: str, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    Path("round.yaml").write_text("shape: [sphere, cylinder]\n")
     assert main([command, *words]) == 2
     said = capsys.readouterr().err.strip()
     assert message in said

@@ -173,12 +173,18 @@ def varied(names: Sequence[str], env: EnvConfig, *, sees: bool) -> tuple[Conditi
 
 def for_task(condition: Condition, task: str, shape: str = "", *, sees: bool) -> Condition | None:
     """Return what of a condition has an effect on a task with an object of a shape, see `Condition.for_world`."""
+    from manip_il.sim.shape import draws_shape
     from manip_il.tasks.table import get_task
+    from manip_il.tasks.task import TakesShape
 
     if task in STOCK:  # which takes none
         return None if condition.ranges else condition
     the_task = get_task(task, shape)
-    return condition.for_world(has_object=bool(the_task.objects), sees=sees, sizes=the_task.sizes)
+    if "shape" in condition.ranges and isinstance(the_task, TakesShape) and not draws_shape(shape):
+        raise UsageError(
+            f"{condition.name}: shape is drawn where --task.object is any, not {shape or 'a cube'}; say so"
+        )
+    return condition.for_world(has_object=bool(the_task.objects), sees=sees, sizes=the_task.sizes, shape=shape)
 
 
 def episode_hold(env: EnvConfig, hold: int | None) -> int | None:

@@ -46,7 +46,7 @@ def read_drawn(root: Path) -> dict[int, dict[str, Any]]:
 
 
 def summary(drawn: Iterable[Mapping[str, Any]]) -> str:
-    """Return the ranges that numbers were drawn from, as episodes have them; the names alone of what is no number."""
+    """Return the ranges that numbers were drawn from, and what was drawn of words; the names alone of anything else."""
     values: dict[str, list[Any]] = {}
     for one in drawn:
         for name, value in one.items():
@@ -55,6 +55,8 @@ def summary(drawn: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _span(values: list[Any]) -> str:
+    if all(isinstance(value, str) for value in values):
+        return f" {' or '.join(sorted(set(values)))}"
     if not all(isinstance(value, int | float) for value in values):
         return ""
     low, high = min(values), max(values)

@@ -21,6 +21,7 @@ from manip_il.mdp import Actor, Episode, State, Transition
 from manip_il.rollout import Driver, Labeller, Rules, rollout
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.shape import draws_shape
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -101,7 +102,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
         transitions = map(_without_pictures, transitions)
     branch_env = _BranchEnv(make(job.env, job.cameras)) if job.label == "branch" else None
     for frames in group_rollouts(transitions):
-        drawn = draw(job.conditions, frames[0].seed).values
+        drawn = draw(job.conditions, frames[0].seed, job.env.object).values
         yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
 
 
@@ -109,7 +110,8 @@ def lockstep(job: RolloutJob) -> int:
     """Return how many environments of a job run in lockstep in one process."""
     if job.policy is None:
         return 1  # alone, an environment has the processor's cache
-    shared = simulation_of(job.env.robot).shares_models and not any(one.changes_model() for one in job.conditions)
+    varies = draws_shape(job.env.object) or any(one.changes_model() for one in job.conditions)
+    shared = simulation_of(job.env.robot).shares_models and not varies
     return job.batch if shared else min(job.batch, OWN_MODELS)
 
 

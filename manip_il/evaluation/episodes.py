@@ -37,7 +37,7 @@ _UNITS = {
     "camera_turn": "deg",
     "light_turn": "deg",
 }
-_COMPONENTS = {"colour": ("red", "green", "blue")}  # of other vectors, the length counts
+_COMPONENTS = {name: ("red", "green", "blue") for name in ("colour", "table")}  # of other vectors, the length counts
 
 
 @dataclass(frozen=True, slots=True)

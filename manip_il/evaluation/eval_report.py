@@ -21,6 +21,7 @@ from manip_il.evaluation.report import Bar, Report
 from manip_il.evaluation.report_data import Film, LearningCurve, Paths
 from manip_il.evaluation.results import EvalResult
 from manip_il.evaluation.tables import NO_CONDITION, Table, evaluation_table
+from manip_il.sim.conditions import words
 
 AXES_NOTE = "x leads away from the robot, y to its left"
 
@@ -100,7 +101,7 @@ class EvalReport(Report):
     def ranges(self) -> dict[str, str]:
         """Condition -> the numbers it draws and their ranges; empty where none draws any."""
         drawn = {
-            one.name: ", ".join(f"{name} {_range(*ends)}" for name, ends in one.ranges.items())
+            one.name: ", ".join(f"{name} {words(range_)}" for name, range_ in one.ranges.items())
             for one in self.result.settings.conditions
         }
         return {name: words or "nothing" for name, words in drawn.items()} if any(drawn.values()) else {}
@@ -171,7 +172,3 @@ class EvalReport(Report):
             f"three, corrected (Holm) for the {count}. An association with a number does not show that it causes the "
             "failures."
         )
-
-
-def _range(low: float, high: float) -> str:
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"

@@ -77,7 +77,7 @@ def episode_result(job: RolloutJob, episode: Episode) -> EpisodeResult:
     first = int(np.argmax(solved)) + 1 if solved.any() else None
     states = episode.columns[schema.SIM_STATE]
     start, end = (positions(job.env, states[row]) for row in (0, -1))
-    drawn = draw(job.conditions or (NOMINAL,), episode.seed)
+    drawn = draw(job.conditions or (NOMINAL,), episode.seed, job.env.object)
     phase = int(episode.columns[schema.EXPERT_PHASE].ravel()[-1])
     if phase == 0 and episode.success_at_end:  # nobody asks the expert about a state in which the task is solved
         phase = -1

@@ -17,6 +17,7 @@ from manip_il import checks
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.seeding import rng_for
 from manip_il.sim.config import CAMERAS
+from manip_il.sim.shape import KINDS, draws_shape
 
 F64 = NDArray[np.float64]
 Range = tuple[float, float]
@@ -36,17 +37,20 @@ _BOUNDS: dict[str, Range] = {
     "actuator_gain": (0.1, 10),
     "posture": (0, 0.5),
     "colour": (0, 1),
+    "table": (0, 1),
     "camera_shift": (0, 1),
     "camera_turn": (0, 90),
     "brightness": (0.1, 3),
     "light_turn": (-180, 180),
 }
+_NAMES = {"shape": KINDS}  # ranges that are lists of these names
+_KNOWN = (*_NAMES, *_BOUNDS)
 _WHOLE = ("knock_step", "delay")
 _KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
 _BODY = ("mass", "size", "friction")  # of the object, in physics
-_MODEL = (*_BODY, "joint_damping", "actuator_gain")
-_OBJECT = ("knock", "colour", *_BODY)
-PICTURED = ("colour", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
+_MODEL = ("shape", *_BODY, "joint_damping", "actuator_gain")
+_OBJECT = ("knock", "colour", "shape", *_BODY)
+PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
 
 
 @dataclass(frozen=True, init=False)
@@ -57,35 +61,37 @@ class Condition:
     random_actions: share of control steps at which a random action is executed, each joint within its longest step.
     knock: the object is moved by so much once [m], at a control step of knock_step, by default 5 to 24. joint_noise
     [rad], position_noise [m]: standard deviations of Gaussian noise on the joints and the object's position in a
-    policy's observations. delay: control steps by which those are late. mass [kg], size (edge [m]) and sliding friction
-    of the cube; colour: each of its red, green and blue. joint_damping: factor on that of every joint of the arm;
-    actuator_gain: on kp of its actuators, and by its root on kv. posture: how far every joint begins from home, at most
-    [rad]. camera_shift [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp;
-    light_turn: of the lamps about the vertical [deg].
+    policy's observations. delay: control steps by which those are late. shape: names of shapes, where the task has an
+    object of any; mass [kg], size (edge or width [m]) and sliding friction of the object; colour: each of its red,
+    green and blue; table: of the table's. joint_damping: factor on that of every joint of the arm; actuator_gain: on kp
+    of its actuators, and by its root on kv. posture: how far every joint begins from home, at most [rad]. camera_shift
+    [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp; light_turn: of the
+    lamps about the vertical [deg].
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
     """
 
     name: str
-    ranges: Mapping[str, Range] = field(hash=False)
+    ranges: Mapping[str, Any] = field(hash=False)
 
-    def __init__(self, name: str = "nominal", **ranges: Range):
+    def __init__(self, name: str = "nominal", **ranges: Range | Sequence[str]):
         _require_name("a condition's name", name)
         _require_known(name, ranges)
         if "knock" in ranges:
             ranges = {"knock_step": _KNOCK_STEP} | ranges
-        for one, range_ in ranges.items():
-            _require_range(f"{name}: {one}", range_, _BOUNDS[one], whole=one in _WHOLE)
-        kept = {one: ranges[one] for one in _BOUNDS if one in ranges and (one != "knock_step" or "knock" in ranges)}
+        ranges = {one: _checked(name, one, range_) for one, range_ in ranges.items()}
+        kept = {one: ranges[one] for one in _KNOWN if one in ranges and (one != "knock_step" or "knock" in ranges)}
         vars(self).update(name=name, ranges=kept)  # frozen from here on
 
-    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None) -> Condition | None:
+    def for_world(self, *, has_object: bool, sees: bool, sizes: Range | None, shape: str = "") -> Condition | None:
         """Return the condition without what has no effect on a task without an object, or a policy without cameras.
 
-        sizes: of its objects, that the task can take [m]; None: their own alone. None where nothing of it is left.
+        sizes: of its objects, that the task can take [m]; None: their own alone. shape: of the object, as
+        `EnvConfig.object`. None where nothing of it is left.
         Raises `UsageError` where the condition's sizes are all others.
         """
         dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED), *(() if sizes else ("size",))}
+        dropped |= set() if draws_shape(shape) else {"shape"}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if "size" in kept and sizes is not None:
             kept["size"] = _overlap(self.name, kept["size"], sizes)
@@ -111,12 +117,12 @@ class Condition:
 
     @classmethod
     def from_mapping(cls, name: str, tree: Mapping[str, Any]) -> Condition:
-        """Make a condition of ranges as YAML or JSON has them, `[low, high]` or one number; else `UsageError`."""
+        """Make a condition of ranges as YAML or JSON has them; else `UsageError`."""
         _require_known(name, tree)
-        return cls(name, **{key: _as_range(f"{name}: {key}", value) for key, value in tree.items()})
+        return cls(name, **{key: _read(f"{name}: {key}", key, value) for key, value in tree.items()})
 
     def __str__(self) -> str:
-        said = ", ".join(f"{name} {_words(range_)}" for name, range_ in self.ranges.items())
+        said = ", ".join(f"{name} {words(range_)}" for name, range_ in self.ranges.items())
         return f"{self.name} ({said})" if said else self.name
 
 
@@ -142,16 +148,35 @@ def merged(conditions: Sequence[Condition]) -> Condition:
     return Condition("_".join(condition.name for condition in conditions)[: checks.LONGEST_NAME], **ranges)
 
 
-def draw(conditions: Sequence[Condition], seed: int) -> Drawn:
-    """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal."""
-    return (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
+def draw(conditions: Sequence[Condition], seed: int, shape: str = "") -> Drawn:
+    """Return what the episode of a seed draws; conditions take turns by seed, and without any it is nominal.
+
+    shape: of the object, as `EnvConfig.object`; where it is any, all shapes are drawn from unless the condition says
+    which, and else none is.
+    """
+    drawn = (conditions[seed % len(conditions)] if conditions else NOMINAL).draw(seed)
+    if draws_shape(shape) and "shape" not in drawn.values:
+        return Drawn(drawn.condition, {**_ANY_SHAPE.draw(seed).values, **drawn.values})
+    if not draws_shape(shape) and "shape" in drawn.values:
+        return Drawn(drawn.condition, {name: value for name, value in drawn.values.items() if name != "shape"})
+    return drawn
 
 
-def _draw(name: str, range_: Range, rng: np.random.Generator) -> Any:
+def words(range_: Sequence[Any]) -> str:
+    """Return a range as people read it: `0.03 to 0.07`, `box or sphere`."""
+    if isinstance(range_[0], str):
+        return " or ".join(range_)
+    low, high = range_
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _draw(name: str, range_: Any, rng: np.random.Generator) -> Any:
+    if name in _NAMES:
+        return range_[int(rng.integers(len(range_)))]
     if name in _WHOLE:
         return int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
-    if name == "colour":
-        return [float(value) for value in rng.uniform(*range_, 3)]
+    if name in ("colour", "table"):
+        return [float(value) for value in rng.uniform(range_[0], range_[1], 3)]
     if name in ("camera_shift", "camera_turn"):
         return {camera: _vector(rng, range_) for camera in CAMERAS}
     return float(rng.uniform(*range_))
@@ -172,8 +197,21 @@ def _require_name(what: str, name: object) -> None:
 
 def _require_known(what: str, names: Iterable[object]) -> None:
     for name in names:
-        if name not in _BOUNDS:
-            raise UnknownName(f"key in {what}:", str(name)[: checks.LONGEST_NAME], _BOUNDS)
+        if name not in _KNOWN:
+            raise UnknownName(f"key in {what}:", str(name)[: checks.LONGEST_NAME], _KNOWN)
+
+
+def _checked(condition: str, name: str, given: Any) -> Any:
+    what = f"{condition}: {name}"
+    if name not in _NAMES:
+        _require_range(what, given, _BOUNDS[name], whole=name in _WHOLE)
+        return given
+    if not isinstance(given, Sequence) or isinstance(given, str) or not given or len(set(map(str, given))) < len(given):
+        raise UsageError(f"{what} is {checks.shorten(given)}; expected names, each once")
+    for one in given:
+        if one not in _NAMES[name]:
+            raise UnknownName(f"{name} in {condition}:", str(one)[: checks.LONGEST_NAME], _NAMES[name])
+    return tuple(given)
 
 
 def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> None:
@@ -191,8 +229,15 @@ def _overlap(name: str, asked: Range, sizes: Range) -> Range:
     low, high = max(asked[0], sizes[0]), min(asked[1], sizes[1])
     if low > high:
         takes = f"{sizes[0]:.3g} to {sizes[1]:.3g} m"
-        raise UsageError(f"{name}: size is {_words(asked)} m, and the task takes objects of {takes}; choose others")
+        raise UsageError(f"{name}: size is {words(asked)} m, and the task takes objects of {takes}; choose others")
     return low, high
+
+
+def _read(what: str, name: str, value: Any) -> Any:
+    """A range as YAML has it: a name or a list of names, a number or `[low, high]`."""
+    if name in _NAMES:
+        return value if isinstance(value, list) else [value]
+    return _as_range(what, value)
 
 
 def _as_range(what: str, value: Any) -> Range:
@@ -210,10 +255,6 @@ def _end(what: str, value: Any) -> float:
         raise UsageError(f"{what} is {checks.shorten(value)}; expected a number, or [low, high]") from None
 
 
-def _words(range_: Range) -> str:
-    low, high = range_
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
 NOMINAL = Condition()
 NOMINAL_VALUES = NOMINAL.draw(0)
+_ANY_SHAPE = Condition("any", shape=KINDS)

@@ -114,7 +114,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     def start(self, seed: int) -> None:
         """Start the episode of a seed: `reset` without making an observation."""
         world, scene, rng = self.world, self.scene, rng_for(seed, "reset")
-        self._begin(seed, draw(self._conditions, seed))
+        self._begin(seed, draw(self._conditions, seed, self.config.object))
         world.vary(with_drawn(scene.nominal, self.drawn.values))
         data, robot = world.data, scene.robot
         mujoco.mj_resetData(world.model, data)

@@ -22,6 +22,7 @@ from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Task
 
 PREFIX = "robot/"  # of everything of the robot's in a scene
+TABLE = "table"  # the name of its geom
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 _FLOOR = -0.4  # [m]
@@ -164,7 +165,7 @@ def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     half = np.array(_TABLE_HALF)
     middle = [x + _TABLE_BEYOND, y, -half[2]]
     spec.worldbody.add_geom(
-        name="table", type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
+        name=TABLE, type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
     )
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         leg = [middle[0] + sx * (half[0] - 0.05), y + sy * (half[1] - 0.05), -0.22]

@@ -18,13 +18,20 @@ _SIZES = {
     "sphere": "DIAMETER",
     "capsule": "DIAMETER or DIAMETERxLENGTH",
 }
-SHAPE_HELP = "box, cylinder, sphere or capsule, with lengths [m] as in cylinder:0.04x0.08, box:0.06x0.03x0.03"
+KINDS = tuple(_SIZES)
+ANY = "any"  # of those kinds, one for each episode
+_SIZES[ANY] = "WIDTH"
+SHAPE_HELP = (
+    "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
+    "cylinder:0.04x0.08, box:0.06x0.03x0.03"
+)
 
 
 @dataclass(frozen=True)
 class Shape:
     """A solid of wood. kind: box, cylinder, sphere or capsule; lengths: along its own axes x, y and z [m].
 
+    any: what a world draws of these, as wide; a cube where nothing is drawn.
     Cylinders and capsules have their axis along z, and a capsule's length is that between the tips of its round ends.
     Raises `UsageError` for a length out of `SHORTEST` to `LONGEST`, or a capsule no longer than wide.
     """
@@ -53,6 +60,11 @@ class Shape:
         except (ValueError, TypeError):
             raise UsageError(f"size of {shorten(text)}; expected {kind}:{_SIZES[kind]} [m]") from None
 
+    @classmethod
+    def of_width(cls, kind: str, width: float) -> Shape:
+        """Return a cube, a sphere, a cylinder as long as wide, or a capsule half as long again; raises `UsageError`."""
+        return cls(kind, _lengths(kind, width))
+
     def __str__(self) -> str:
         """Text that means it, as short as can be."""
         ways = ((self.lengths[0],), (self.lengths[0], self.lengths[2]), self.lengths)
@@ -69,7 +81,7 @@ class Shape:
     def size(self) -> tuple[float, ...]:
         """MuJoCo's `geom_size` of it [m]."""
         width, _, length = self.lengths
-        if self.kind == "box":
+        if self.kind in ("box", ANY):
             return tuple(one / 2 for one in self.lengths)
         if self.kind == "sphere":
             return (width / 2,)
@@ -81,7 +93,7 @@ class Shape:
         width, depth, length = self.lengths
         round_, ball = math.pi / 4 * width**2, math.pi / 6 * width**3
         volumes = {
-            "box": width * depth * length,
+            **dict.fromkeys(("box", ANY), width * depth * length),
             "cylinder": round_ * length,
             "sphere": ball,
             "capsule": round_ * (length - width) + ball,
@@ -91,6 +103,8 @@ class Shape:
     @property
     def word(self) -> str:
         """Name of it in an instruction."""
+        if self.kind == ANY:
+            return "object"
         return "cube" if self.kind == "box" and len(set(self.lengths)) == 1 else self.kind
 
     @property
@@ -105,10 +119,23 @@ def _lengths(kind: str, first: float, second: float | None = None, *rest: float)
     """Lengths along the axes of a shape given by as many numbers as it takes; raises `TypeError` for another count."""
     if kind == "box" and (second is None) != (len(rest) == 1):
         return first, first if second is None else second, rest[0] if rest else first
-    if rest or (second is not None and kind in ("box", "sphere")):
+    if rest or (second is not None and kind in ("box", "sphere", ANY)):
         raise TypeError(kind)
     longer = first * _CAPSULE if kind == "capsule" else first
     return first, first, longer if second is None else second
+
+
+def draws_shape(text: str) -> bool:
+    """Return whether each episode draws the shape of an object that a text means, as `Shape.parse` reads it."""
+    return text.partition(":")[0] == ANY
+
+
+ROLLING = 0.005  # of what is round, as on a cloth: what falls from the hand stays within reach [m]
+
+
+def contact(kind: str) -> tuple[int, float]:
+    """Return MuJoCo's `condim` of an object and its rolling friction [m]."""
+    return (4, 0.0001) if kind in ("box", ANY) else (6, ROLLING)
 
 
 _THINNEST, _WIDEST = 0.02, 0.07  # of a scaled object: its least length, and the one between the fingers at most [m]

@@ -6,7 +6,7 @@ whole world, what `Condition` names so: see `_WORLD`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,16 +16,26 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.config import CAMERAS
+from manip_il.sim.shape import Shape, contact
 
 F64 = NDArray[np.float64]
+GEOMS = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
+_KINDS = {float(geom): kind for kind, geom in GEOMS.items()}
 PER_OBJECT = 5
 _SIZE, _MASS, _FRICTION = slice(0, 3), 3, 4
-_OWN = -1.0  # a colour that is not drawn: everything has its own
+_OWN = -1.0  # a shape or colour that is not drawn: everything has its own
 _WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it is where nothing is drawn
+    "shape": (_OWN,),  # else MuJoCo's geom type
     "joint_damping": (1.0,),
     "actuator_gain": (1.0,),
     "posture": (0.0,),
     "colour": (_OWN,) * 3,
+    "table": (_OWN,) * 3,
     "brightness": (1.0,),
     "light_turn": (0.0,),
     "camera_shift": (0.0,) * 3 * len(CAMERAS),
@@ -73,6 +83,10 @@ def completed(variation: F64, like: F64) -> F64:
 
 def check(variation: F64, like: F64) -> None:
     """Raise `ManipError` for a variation (v,) that no world can have. like: the scene's own, (v,)."""
+    shape = float(variation[len(like) - WORLD_SIZE :][_PLACES["shape"]][0])
+    if shape not in (_OWN, *_KINDS):
+        raise ManipError(f"a variation whose shape is {shape}; expected a geom type of {', '.join(GEOMS)}, or {_OWN}")
+    like = like if shape == _OWN else with_drawn(like, {"shape": _KINDS[shape]})
     if (variation[like > 0] <= 0).any():
         raise ManipError(f"a variation of {variation}; expected lengths, masses, frictions and factors above 0")
 
@@ -85,14 +99,14 @@ def same_physics(variation: F64, other: F64) -> bool:
 def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     """Return a variation (v,) with drawn values by the names of `Condition`, in its units; other names change nothing.
 
-    size is the edge [m]; camera_shift and camera_turn are there a camera.
+    size is the edge or width [m]; an object of a drawn shape is of wood. camera_shift and camera_turn are there a
+    camera.
     """
     split = len(base) - WORLD_SIZE
     world = base[split:].copy()
     for name, place in _PLACES.items():
         if name in drawn:
-            value = drawn[name]
-            world[place] = np.concatenate([value[camera] for camera in CAMERAS]) if isinstance(value, dict) else value
+            world[place] = _numbers(drawn[name])
     return np.concatenate([_objects_with(base[:split], drawn), world])
 
 
@@ -102,12 +116,15 @@ def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
     Without masses and frictions, which the objects' own numbers have. like: the scene's own, (v,).
     """
     split, found = len(like) - WORLD_SIZE, dict[str, Any]()
+    shape = float(variation[split:][_PLACES["shape"]][0])
+    if shape != _OWN:
+        found["shape"], like = _KINDS[shape], with_drawn(like, {"shape": _KINDS[shape]})
     sizes, own = (one[:split].reshape(-1, PER_OBJECT)[:, _SIZE] for one in (variation, like))
     if not np.array_equal(sizes, own):
         found["size"] = 2 * float(sizes[0].max())
     for name, place in _PLACES.items():
         value, nothing = variation[split:][place].tolist(), _WORLD[name]
-        if tuple(value) == nothing:
+        if tuple(value) == nothing or name == "shape":
             continue
         if name.startswith("camera"):
             found[name] = {camera: value[3 * at : 3 * at + 3] for at, camera in enumerate(CAMERAS)}
@@ -116,10 +133,35 @@ def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
     return found
 
 
+def _numbers(value: Any) -> Any:
+    """What a state holds of a drawn value."""
+    if isinstance(value, str):
+        return float(GEOMS[value])
+    return np.concatenate([value[camera] for camera in CAMERAS]) if isinstance(value, Mapping) else value
+
+
+def resized(size: F64, drawn: Mapping[str, Any]) -> F64:
+    """Return a `geom_size` (3,) [m] with the shape and the size that are drawn, if any; see `Shape.of_width`."""
+    if "shape" in drawn:
+        return _padded(Shape.of_width(drawn["shape"], drawn.get("size", _width(size))).size)
+    return size * (drawn["size"] / 2 / size.max()) if "size" in drawn else size
+
+
+def _width(size: F64) -> float:
+    """The edge or width [m] of a thing of a drawn shape."""
+    return 2 * float(size.max())
+
+
+def _padded(size: Sequence[float]) -> F64:
+    return np.array([*size, *[0.0] * (3 - len(size))])
+
+
 def _objects_with(objects: F64, drawn: Mapping[str, Any]) -> F64:
     rows = objects.copy().reshape(-1, PER_OBJECT)
-    if "size" in drawn:
-        rows[:, _SIZE] *= (drawn["size"] / 2 / rows[:, _SIZE].max(axis=1))[:, None]
+    for row in rows:
+        row[_SIZE] = resized(row[_SIZE], drawn)
+        if "shape" in drawn:
+            row[_MASS] = Shape.of_width(drawn["shape"], _width(row[_SIZE])).mass
     if "mass" in drawn:
         rows[:, _MASS] = drawn["mass"]
     if "friction" in drawn:
@@ -141,6 +183,8 @@ def apply(
     """
     split = len(variation) - WORLD_SIZE
     _apply_dynamics(model, plain, motors, variation[split:])
+    shape = float(variation[split:][_PLACES["shape"]][0])
+    _apply_shape(model, plain, objects, None if shape == _OWN else _KINDS[shape])
     _apply_objects(model, plain, objects, variation[:split].reshape(-1, PER_OBJECT))
 
 
@@ -155,23 +199,33 @@ def _apply_dynamics(model: mujoco.MjModel, plain: mujoco.MjModel, motors: NDArra
     changed.actuator_biasprm[motors, 2] = plain.actuator_biasprm[motors, 2] * np.sqrt(gain)  # -kv
 
 
+def _apply_shape(
+    model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], shape: str | None
+) -> None:
+    changed: Any = model
+    for geom in (one.geom for one in objects.values()):
+        own = int(plain.geom_type[geom]), int(plain.geom_condim[geom]), float(plain.geom_friction[geom, 2])
+        kind, condim, rolling = own if shape is None else (int(GEOMS[shape]), *contact(shape))
+        changed.geom_type[geom], changed.geom_condim[geom], changed.geom_friction[geom, 2] = kind, condim, rolling
+
+
 def _apply_objects(
     model: mujoco.MjModel, plain: mujoco.MjModel, objects: Mapping[str, Object], rows: NDArray[np.float64]
 ) -> None:
     changed: Any = model
     for one, row in zip(objects.values(), rows, strict=True):
         size, mass, friction = row[_SIZE], float(row[_MASS]), float(row[_FRICTION])
-        before = plain.geom_size[one.geom]
+        kind, own = int(model.geom_type[one.geom]), int(plain.geom_type[one.geom])
         changed.geom_size[one.geom] = size
-        extent = extents(int(plain.geom_type[one.geom]), size)
-        changed.geom_rbound[one.geom] = _bound(int(plain.geom_type[one.geom]), size)
+        extent = extents(kind, size)
+        changed.geom_rbound[one.geom] = _bound(kind, size)
         changed.geom_aabb[one.geom, 3:] = extent / 2
         for node in range(plain.body_bvhadr[one.body], plain.body_bvhadr[one.body] + plain.body_bvhnum[one.body]):
             changed.bvh_aabb[node, 3:] = extent / 2
-        if np.array_equal(size, before):
+        if kind == own and np.array_equal(size, plain.geom_size[one.geom]):
             inertia = plain.body_inertia[one.body] * (mass / plain.body_mass[one.body])
         else:
-            inertia = _inertia(int(plain.geom_type[one.geom]), size, mass)
+            inertia = _inertia(kind, size, mass)
         changed.body_mass[one.body], changed.body_inertia[one.body] = mass, inertia
         # Of two geoms that touch, the larger friction counts unless one has priority: here the drawn one counts.
         drawn = friction != plain.geom_friction[one.geom, 0]
@@ -209,11 +263,23 @@ def _bound(kind: int, size: F64) -> float:
 
 
 def _inertia(kind: int, size: F64, mass: float) -> F64:
-    """Return the principal moments of a solid geom [kg m^2], (3,); a capsule's as a cylinder's of its length."""
+    """Return the principal moments of a solid geom [kg m^2], (3,)."""
     x, y, z = extents(kind, size)
     if kind == int(mujoco.mjtGeom.mjGEOM_BOX):
         return mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
     if kind == int(mujoco.mjtGeom.mjGEOM_SPHERE):
         return np.full(3, mass * x * x / 10)
+    if kind == int(mujoco.mjtGeom.mjGEOM_CAPSULE):
+        return _capsule_inertia(x / 2, z - x, mass)
     across = mass / 12 * (3 * x * x / 4 + z * z)
     return np.array([across, across, mass * x * x / 8])
+
+
+def _capsule_inertia(radius: float, height: float, mass: float) -> F64:
+    """Of a cylinder of a radius and height [m] with half a ball on both ends."""
+    round_, balls = height, 4 / 3 * radius  # volumes, in circles
+    cylinder, ball = mass * round_ / (round_ + balls), mass * balls / (round_ + balls)
+    along = cylinder * radius**2 / 2 + ball * 2 * radius**2 / 5
+    across = cylinder * (height**2 / 12 + radius**2 / 4)
+    across += ball * (2 * radius**2 / 5 + height**2 / 4 + 3 * height * radius / 8)
+    return np.array([across, across, along])

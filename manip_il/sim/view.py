@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import build_scene, camera_id
+from manip_il.sim.scene import TABLE, build_scene, camera_id
+from manip_il.sim.variation import GEOMS, resized
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
@@ -28,7 +29,17 @@ _PLAIN_FACES = 1_600  # meshes up to here stay as they are
 _PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
 _LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
 _LAMPS = ("light_ambient", "light_diffuse", "light_specular")
-_CHANGED = ("geom_size", "geom_matid", "geom_rgba", "cam_pos", "cam_quat", "light_pos", "light_dir", *_LAMPS)
+_CHANGED = (
+    "geom_type",
+    "geom_size",
+    "geom_matid",
+    "geom_rgba",
+    "cam_pos",
+    "cam_quat",
+    "light_pos",
+    "light_dir",
+    *_LAMPS,
+)
 
 
 class ViewModel:
@@ -39,7 +50,8 @@ class ViewModel:
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
             self.model.vis.quality.shadowsize = 0
-        self._geoms = [one.geom for one in build_scene(robot, task, shape).objects.values()]
+        self._objects = [one.geom for one in build_scene(robot, task, shape).objects.values()]
+        self._table = [self.model.geom(TABLE).id]
         self._light(look.brightness, look.light_turn)
         self._plain = {name: getattr(self.model, name).copy() for name in _CHANGED}
         self._headlight = [colour.copy() for colour in self._headlight_colours()]
@@ -47,14 +59,16 @@ class ViewModel:
 
     def apply(self, drawn: Drawn) -> None:
         """Apply what an episode draws to the next pictures. None of it lies on the graphics card."""
-        values = {name: drawn.values[name] for name in ("size", *PICTURED) if name in drawn.values}
+        values = {name: drawn.values[name] for name in ("shape", "size", *PICTURED) if name in drawn.values}
         if values == self._applied:
             return
         for name, plain in self._plain.items():
             getattr(self.model, name)[:] = plain
         for colour, plain in zip(self._headlight_colours(), self._headlight, strict=True):
             colour[:] = plain
-        self._change_objects(values.get("size"), values.get("colour"))
+        self._shape_objects(values)
+        self._paint(self._objects, values.get("colour"))
+        self._paint(self._table, values.get("table"))
         for camera in CAMERAS:
             self._move_camera(camera, values.get("camera_shift", {}), values.get("camera_turn", {}))
         self._light(drawn.number("brightness", 1.0), drawn.number("light_turn"))
@@ -64,13 +78,18 @@ class ViewModel:
         lamp = self.model.vis.headlight
         return [lamp.ambient, lamp.diffuse, lamp.specular]
 
-    def _change_objects(self, edge: float | None, colour: Sequence[float] | None) -> None:
-        for geom in self._geoms:
-            if edge is not None:
-                self.model.geom_size[geom] *= edge / 2 / self.model.geom_size[geom].max()
-            if colour is not None:
-                self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
-                self.model.geom_rgba[geom] = [*colour, 1.0]
+    def _shape_objects(self, drawn: Mapping[str, Any]) -> None:
+        for geom in self._objects:
+            self.model.geom_size[geom] = resized(self.model.geom_size[geom], drawn)
+            if "shape" in drawn:
+                self.model.geom_type[geom] = GEOMS[drawn["shape"]]
+
+    def _paint(self, geoms: Sequence[int], colour: Sequence[float] | None) -> None:
+        if colour is None:
+            return
+        for geom in geoms:
+            self.model.geom_matid[geom] = -1  # a material's colour would hide the geom's
+            self.model.geom_rgba[geom] = [*colour, 1.0]
 
     def _move_camera(self, name: str, shifts: Mapping[str, Any], turns: Mapping[str, Any]) -> None:
         camera = camera_id(self.model, name)

@@ -21,6 +21,7 @@ from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
 from manip_il.sim import variation as variations
+from manip_il.sim.shape import draws_shape
 from manip_il.sim.variation import Object
 
 F64 = NDArray[np.float64]
@@ -62,6 +63,11 @@ class Scene:
     def state_size(self) -> int:
         """Length of `State.physics`."""
         return mujoco.mj_stateSize(self.model, STATE_KIND)
+
+    @cached_property
+    def draws_shape(self) -> bool:
+        """Whether each episode draws the shape of the object; the model as compiled has a cube."""
+        return draws_shape(self.shape)
 
     @property
     def name(self) -> str:

@@ -8,24 +8,20 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from manip_il.sim.shape import ANY, contact
+from manip_il.sim.variation import GEOMS
 from manip_il.sim.world import GOAL
 
 CUBE_HALF = 0.025  # [m]
 CUBE_MASS = 0.1  # [kg]
 FRICTION = 1.0  # sliding, against anything
-ROLLING = 0.005  # of what is round, as on a cloth: what falls from the hand stays within reach [m]
 RED = (0.86, 0.24, 0.16)
 BLUE = (0.16, 0.40, 0.80)
 YELLOW = (0.93, 0.72, 0.16)
 WOOD = (0.52, 0.37, 0.25)
 GREY = (0.45, 0.47, 0.50)
 _GREEN = (0.12, 0.72, 0.35, 0.55)
-SHAPES = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-}
+SHAPES = {**GEOMS, ANY: GEOMS["box"]}
 
 
 def add_cube(
@@ -42,15 +38,15 @@ def add_object(
     material = spec.add_material(name=name, rgba=[*colour, 1], specular=0.3, shininess=0.5)
     body = spec.worldbody.add_body(name=name, pos=[0.5, 0, max(size)])
     body.add_freejoint(name=name)
-    rolls = shape != "box"
+    condim, rolling = contact(shape)
     body.add_geom(
         name=name,
         type=SHAPES[shape],
         size=[*size, *[0.0] * (3 - len(size))],
         mass=mass,
         material=material.name,
-        condim=6 if rolls else 4,
-        friction=[FRICTION, 0.02, ROLLING if rolls else 0.0001],
+        condim=condim,
+        friction=[FRICTION, 0.02, rolling],
         solimp=[0.95, 0.99, 0.001, 0.5, 2],
         solref=[0.01, 1],
     )

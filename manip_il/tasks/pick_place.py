@@ -88,7 +88,7 @@ def observe_cube(world: World, name: str) -> Observed:
 def observe_object(world: World, name: str) -> Observed:
     """Return an object's position, yaw modulo its symmetry, tilt and lengths, and the way to it from the hand."""
     position, lie = world.pose(name).position, lie_of(world, name)
-    if not is_cube(world, name):
+    if world.scene.draws_shape or not is_cube(world, name):
         return {name: position, **_observe_lie(name, lie), f"{name}_from_ee": position - world.ee.position}
     return {
         name: position,

@@ -10,10 +10,13 @@ import pytest
 from manip_il.errors import UsageError
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.config import CAMERAS
+from manip_il.sim.shape import KINDS
 
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), action_noise=(0.1, 0.1))
 OBJECT = Condition("object", mass=(0.05, 0.3), size=(0.04, 0.06), colour=(0.1, 0.9))
-VIEW = Condition("view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightness=(0.6, 1.4), light_turn=(-60, 60))
+VIEW = Condition(
+    "view", camera_shift=(0.01, 0.05), camera_turn=(0, 5), brightness=(0.6, 1.4), light_turn=(-60, 60), table=(0.2, 0.9)
+)
 
 
 def test_a_seed_draws_the_same_in_whatever_order():
@@ -80,6 +83,19 @@ def test_what_nobody_notices_is_left_out():
     assert VIEW.for_world(has_object=False, sees=True, sizes=(0.03, 0.07)) == VIEW
 
 
+ROUND = Condition("round", shape=("sphere", "cylinder"), size=(0.02, 0.06))
+
+
+def test_an_object_of_any_shape_has_one_of_the_conditions_shapes_or_of_all():
+    for conditions, shapes in (([ROUND], ROUND.ranges["shape"]), ([OBJECT], KINDS), ([], KINDS)):
+        assert {draw(conditions, seed, "any").values["shape"] for seed in range(40)} == set(shapes)
+    assert draw([OBJECT], 3, "any").values.items() >= draw([OBJECT], 3).values.items()
+    assert "shape" not in draw([ROUND], 3, "sphere:0.04").values
+    assert "shape" not in ROUND.for_world(has_object=True, sees=True, sizes=(0.02, 0.07)).ranges
+    assert ROUND.for_world(has_object=True, sees=True, sizes=(0.02, 0.07), shape="any:0.05") == ROUND
+    assert str(ROUND) == "round (shape sphere or cylinder, size 0.02 to 0.06)"
+
+
 def test_sizes_are_those_that_a_task_can_take():
     assert OBJECT.for_world(has_object=True, sees=False, sizes=(0.05, 0.08)).ranges["size"] == (0.05, 0.06)
     assert "size" not in OBJECT.for_world(has_object=True, sees=True, sizes=None).ranges
@@ -88,7 +104,7 @@ def test_sizes_are_those_that_a_task_can_take():
 
 
 def test_a_condition_is_its_json_again():
-    for condition in (NOMINAL, KNOCKED, OBJECT, VIEW):
+    for condition in (NOMINAL, KNOCKED, OBJECT, VIEW, ROUND):
         tree = json.loads(json.dumps(condition.to_json()))
         assert Condition.from_mapping(tree.pop("name"), tree) == condition
 
@@ -97,6 +113,10 @@ def test_a_condition_is_its_json_again():
     ("tree", "words"),
     [
         ({"mass": [0.3, 0.1]}, "expected low <= high"),
+        ({"shape": "ball"}, "unknown shape in mine: 'ball'"),
+        ({"shape": ["box", "box"]}, "expected names, each once"),
+        ({"shape": []}, "expected names, each once"),
+        ({"shape": [[1]]}, "unknown shape in mine:"),
         ({"frictoin": 1}, "did you mean 'friction'"),
         ({"mass": 0}, "within 0.001 to 10"),
         ({"mass": float("nan")}, "mass is"),

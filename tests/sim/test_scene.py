@@ -8,7 +8,7 @@ import pytest
 
 from manip_il.errors import UnknownName
 from manip_il.sim.scene import DT_SIM, _build, build_scene, camera_id
-from manip_il.sim.variation import WORLD_SIZE
+from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
 from manip_il.tasks.objects import CUBE_HALF
 
 from ..scenes import cube, drive_until, half_height, in_hand, started, still
@@ -66,7 +66,7 @@ def test_addresses_are_what_their_names_say(robot: str, task: str):
         assert scene.model.joint(name).qposadr[0] == one.q
         assert scene.model.joint(name).dofadr[0] == one.v
         assert scene.model.geom(one.geom).bodyid[0] == one.body == scene.model.body(name).id
-    assert len(scene.nominal) == 5 * len(scene.objects) + WORLD_SIZE
+    assert len(scene.nominal) == PER_OBJECT * len(scene.objects) + WORLD_SIZE
 
 
 @every_robot

@@ -22,6 +22,8 @@ lengths = st.integers(20, 120).map(lambda millimetres: millimetres / 1000)
     [
         ("box", (0.05, 0.05, 0.05)),
         ("box:0.03", (0.03, 0.03, 0.03)),
+        ("any", (0.05, 0.05, 0.05)),
+        ("any:0.03", (0.03, 0.03, 0.03)),
         ("box:0.06x0.03x0.02", (0.06, 0.03, 0.02)),
         ("cylinder:0.04", (0.04, 0.04, 0.04)),
         ("cylinder:0.04x0.08", (0.04, 0.04, 0.08)),
@@ -32,6 +34,7 @@ lengths = st.integers(20, 120).map(lambda millimetres: millimetres / 1000)
 )
 def test_a_text_means_lengths_along_the_shapes_own_axes(text: str, meant: tuple[float, float, float]):
     assert Shape.parse(text).lengths == pytest.approx(meant)
+    assert Shape.parse(str(Shape.parse(text))) == Shape.parse(text)
 
 
 @given(st.sampled_from(["box", "cylinder", "sphere"]), lengths, lengths, lengths)
@@ -48,6 +51,7 @@ def test_a_shapes_text_means_the_shape(kind: str, x: float, y: float, z: float):
         ("box:nan", "expected lengths from 0.02 to 0.12 m"),
         ("box:0.03x0.04", "expected box:EDGE or LENGTHxWIDTHxHEIGHT"),
         ("sphere:0.03x0.04", "expected sphere:DIAMETER"),
+        ("any:0.03x0.04", "expected any:WIDTH"),
         ("cylinder:wide", "expected cylinder:DIAMETER or DIAMETERxLENGTH"),
         ("capsule:0.05x0.04", "a capsule 0.04 m long and 0.05 m wide; expected it longer than wide"),
     ],
@@ -91,6 +95,7 @@ def test_a_task_with_objects_of_its_own_takes_no_other():
 
 def test_an_instruction_names_the_shape():
     assert get_task("lift", "capsule:0.03").instruction == "Lift the capsule to the green goal above it."
+    assert get_task("lift", "any").instruction == "Lift the object to the green goal above it."
     assert get_task("lift", "box:0.03").instruction == get_task("lift").instruction
 
 

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.conditions import Condition
 from manip_il.sim.scene import build_scene
+from manip_il.sim.shape import KINDS
 from manip_il.sim.variation import (
     NOTHING_DRAWN,
+    PER_OBJECT,
     Object,
     apply,
     check,
@@ -25,11 +27,13 @@ from manip_il.sim.variation import (
     same_physics,
     with_drawn,
 )
+from manip_il.sim.world import World
 from manip_il.tasks.objects import CUBE_HALF, CUBE_MASS, FRICTION
 
 from ..tables import every_scene_with_a_cube
 
 lengths = st.floats(0.005, 0.1)
+WHERE_IT_WAS_MADE = {"body_pos", "qpos0", "qpos_spring", "cam_poscom0", "light_poscom0"}  # which no start keeps
 NO_MOTORS = np.array([], dtype=np.int64)
 SHAPES = {
     "box": ("0.01 0.02 0.03", (0.02, 0.04, 0.06)),
@@ -85,6 +89,7 @@ EVERYTHING = Condition(
     **dict.fromkeys(("joint_damping", "actuator_gain", "brightness"), (0.5, 2.0)),
     **dict.fromkeys(("size", "posture", "camera_shift", "camera_turn", "light_turn"), (0.03, 0.07)),
     colour=(0, 1),
+    table=(0, 1),
 )
 
 
@@ -97,6 +102,29 @@ def test_what_is_drawn_of_the_world_can_be_read_off_its_variation(robot: str, ta
     assert found == drawn
 
 
+@pytest.mark.parametrize("task", ["pick_place", "lift"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_world_of_any_shape_has_the_one_that_is_drawn_as_mujoco_would_compile_it(task: str, kind: str):
+    world, own = World(build_scene("panda", task, "any")), build_scene("panda", task, f"{kind}:0.043")
+    for other, width in (("sphere", 0.02), ("box", 0.07), (kind, 0.043)):
+        world.vary(with_drawn(world.scene.nominal, {"shape": other, "size": width}))
+    assert drawn_in(world.variation, world.scene.nominal) == {"shape": kind, "size": pytest.approx(0.043)}
+    np.testing.assert_allclose(world.variation[:PER_OBJECT], own.nominal[:PER_OBJECT], rtol=1e-12)
+    arrays = {name for name in dir(own.model) if isinstance(getattr(own.model, name), np.ndarray)}
+    for name in arrays - WHERE_IT_WAS_MADE:
+        ours, compiled = getattr(world.model, name), getattr(own.model, name)
+        np.testing.assert_allclose(ours, compiled, rtol=1e-9, atol=1e-15, err_msg=name)
+
+
+def test_a_shape_that_cannot_be_drawn_is_no_variation():
+    base = np.array([*CUBE, *NOTHING_DRAWN])
+    wrong = with_drawn(base, {"shape": "sphere"})
+    check(wrong, base)
+    wrong[PER_OBJECT] = float(mujoco.mjtGeom.mjGEOM_MESH)
+    with pytest.raises(ManipError, match=r"a variation whose shape is 7[.]0; expected a geom type of box, cylinder"):
+        check(wrong, base)
+
+
 def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
     base = np.array([*CUBE, *NOTHING_DRAWN])
     np.testing.assert_array_equal(completed(np.array(CUBE), base), base)
@@ -107,7 +135,9 @@ def test_a_variation_of_objects_alone_is_one_in_which_nothing_else_is_drawn():
 
 def test_how_the_world_looks_and_began_is_no_physics():
     base = np.array([*CUBE, *NOTHING_DRAWN])
-    assert same_physics(base, with_drawn(base, {"colour": [1, 0, 0], "posture": 0.1, "brightness": 0.5}))
+    assert same_physics(
+        base, with_drawn(base, {"colour": [1, 0, 0], "table": [0, 1, 0], "posture": 0.1, "brightness": 0.5})
+    )
     for name in ("size", "mass", "friction", "joint_damping", "actuator_gain"):
         assert not same_physics(base, with_drawn(base, {name: 0.7})), name
 
@@ -125,10 +155,10 @@ def test_a_shape_that_nobody_grasps_is_refused():
         extents(int(mujoco.mjtGeom.mjGEOM_MESH), np.ones(3))
 
 
-@pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
+@pytest.mark.parametrize("shape", SHAPES)
 @given(x=lengths, y=lengths, z=lengths, mass=st.floats(0.01, 2))
 def test_a_changed_thing_is_as_mujoco_would_compile_it(shape: str, x: float, y: float, z: float, mass: float):
-    size = {"box": (x, y, z), "sphere": (x,), "cylinder": (x, y)}[shape]
+    size = {"box": (x, y, z), "sphere": (x,), "cylinder": (x, y), "capsule": (x, y)}[shape]
     plain, objects = free_body(shape, SHAPES[shape][0])
     compiled, _ = free_body(shape, " ".join(map(repr, size)), mass)
     changed = copy.copy(plain)
@@ -157,5 +187,5 @@ def test_only_a_drawn_friction_has_priority():
 
 
 def test_a_spheres_second_and_third_sizes_are_zero():
-    sphere = np.array([0.02, 0.0, 0.0, 0.1, 1.0])
+    sphere = np.array([0.02, 0.0, 0.0, 0.1, 1.0, *NOTHING_DRAWN])
     check(sphere, sphere)

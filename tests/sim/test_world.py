@@ -150,7 +150,7 @@ def test_a_softer_arm_lags_farther_behind_its_command(world: World):
 
 
 @pytest.mark.parametrize("bad", [0.0, -0.01])
-@pytest.mark.parametrize("place", range(7))
+@pytest.mark.parametrize("place", [*range(5), 6, 7])  # 5 is the shape
 def test_a_variation_that_no_body_can_have_is_refused_and_changes_nothing(world: World, place: int, bad: float):
     wrong = world.scene.nominal.copy()
     wrong[place] = bad

@@ -12,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.shape import KINDS
 from manip_il.sim.world import World
 from manip_il.tasks.grasp import Lie, hand_down, lie_of
 from manip_il.tasks.pick_place import OBJECT, observe_object
@@ -97,6 +99,22 @@ def test_a_cube_is_observed_as_ever_and_other_shapes_with_their_lengths():
     )
 
 
+def test_objects_of_any_shape_are_observed_by_the_same_numbers():
+    env = ManipEnv(object="any")
+    drawn = set[str]()
+    for seed in range(20):
+        env.start(seed)
+        drawn.add(env.drawn.values["shape"])
+        alike = f"{env.drawn.values['shape']}:0.05"
+        other = ManipEnv(object=alike)
+        other.set_state(State(env.world.physics(), other.scene.nominal, 0))
+        ours = dict(zip(environment_state_names(env.scene), env.observe().environment_state, strict=True))
+        theirs = dict(zip(environment_state_names(other.scene), other.observe().environment_state, strict=True))
+        assert {name: ours[name] for name in ours if name in theirs} == {n: theirs[n] for n in theirs if n in ours}
+        assert tuple(ours) == environment_state_names(world_of("sphere:0.04").scene)
+    assert drawn == set(KINDS)
+
+
 @pytest.mark.parametrize(
     ("shape", "heights"),
     [
@@ -122,7 +140,7 @@ def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, 
 
 
 @pytest.mark.parametrize(
-    "shape", ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06"]
+    "shape", ["box:0.06x0.04x0.02", "cylinder:0.02", "cylinder:0.06", "sphere:0.02", "capsule:0.06", "any"]
 )
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 def test_the_expert_brings_any_shape_to_its_goal(task: str, shape: str):
