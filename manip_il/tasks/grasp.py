@@ -62,9 +62,9 @@ class Grasp(NamedTuple):
     offset: its centre in the `ee` frame [m]. width, length, half: of it between the fingers, across them, and half its
     height [m]. tilt: off the nearest face [rad]. yaw: of a hand that points down to grasp it; angle: how far the hand
     is from that [rad].
-    at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: the fingers pass on both sides of it. off: how far the hand is from being
-    over it, with its angle [m]. funnel: how high over the object it must be for that [m]; height: the same, but no
-    higher than to clear its top.
+    at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
+    sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
+    must be for that [m]; height: the same, but no higher than to clear its top.
     """
 
     offset: tuple[float, float, float]
