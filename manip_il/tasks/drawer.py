@@ -34,7 +34,7 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 F64 = NDArray[np.float64]
 
 HALF = 0.02  # of the cube's edge [m]
-OPEN_ENOUGH, SHUT = 0.105, 0.008  # how far the drawer is pulled for the object to go in, and is shut at most [m]
+OPEN_ENOUGH, SHUT = 0.09, 0.008  # how far the drawer is pulled for the object to go in, and is shut at most [m]
 FINGERS = 0.045  # opening of the fingers around the handle [m]
 SLACK = FINGERS / 2 - BAR_HALF  # of the hand along the pull before a finger meets the handle [m]
 AROUND = (0.024, 0.03, 0.018, 0.25)  # of the hand off the handle while it moves it: x, y, z [m], angle [rad]

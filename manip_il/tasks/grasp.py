@@ -30,6 +30,7 @@ WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a m
 FUNNEL_STEEP = 4.0  # the same where something stands around the object
 FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
 SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
+NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
@@ -61,9 +62,9 @@ class Grasp(NamedTuple):
     offset: its centre in the `ee` frame [m]. width, length, half: of it between the fingers, across them, and half its
     height [m]. tilt: off the nearest face [rad]. yaw: of a hand that points down to grasp it; angle: how far the hand
     is from that [rad].
-    at: where `ee` grasps it [m]. open_enough: the fingers pass on both sides of it. off: how far the hand is from being
-    over it, with its angle [m]. funnel: how high over the object it must be for that [m]; height: the same, but no
-    higher than to clear its top.
+    at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
+    sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
+    must be for that [m]; height: the same, but no higher than to clear its top.
     """
 
     offset: tuple[float, float, float]
@@ -74,6 +75,7 @@ class Grasp(NamedTuple):
     yaw: float
     angle: float
     at: tuple[float, float, float]
+    wide: float
     open_enough: bool
     off: float
     height: float
@@ -109,6 +111,7 @@ def _grasp(world: World, name: str) -> Grasp:
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
     funnel = slope * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
     half = lie.tall / 2
+    narrower = max(0.0, room - NARROW) * _crowding(yaw, world.most_opening, neighbours)
     return Grasp(
         offset=tuple(a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()),
         width=width,
@@ -118,6 +121,7 @@ def _grasp(world: World, name: str) -> Grasp:
         yaw=yaw,
         angle=angle,
         at=(x, y, max(z, LOWEST_EE, z + half - DEEPEST)),
+        wide=world.most_opening - narrower,
         open_enough=world.opening >= width + min(OPEN_SLACK, OPEN_SHARE * room),
         off=off,
         height=min(half + HOVER, funnel),

@@ -87,7 +87,7 @@ def approach(world: World, name: str, hover: float = 0.0) -> Target:
     too_low = z + height - ee_z
     sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
     position = np.array([ee_x + sideways * (x - ee_x), ee_y + sideways * (y - ee_y), z + height])
-    return Target(position, hand_down(g.yaw), world.most_opening)
+    return Target(position, hand_down(g.yaw), g.wide)
 
 
 def close_on(world: World, name: str) -> Target:
