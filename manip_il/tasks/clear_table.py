@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -101,18 +102,16 @@ class ClearTable:
         """Draw on which side the box stands, and the cubes on the table, apart, at any yaw."""
         x, y = world.scene.robot.workspace.centre
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
-        poses: dict[str, tuple[F64, F64]] = {BOX: (box, UPRIGHT)}
-        for name in COLOURS:
-            others = [poses[other][0] for other in COLOURS if other in poses]
 
-            def fits(at: F64, others: list[F64] = others) -> bool:
-                return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
+        def fits(places: F64) -> bool:
+            apart = all(math.dist(one, other) > APART for one, other in itertools.combinations(places, 2))
+            return apart and bool(np.all(np.abs(places[:, 1] - box[1]) > FROM_BOX))
 
-            poses[name] = (
-                draw_until(lambda name=name: draw_resting(rng, world, name, ROOM), fits, world, name),
-                draw_yaw(rng),
-            )
-        return Start(poses)
+        places = draw_until(
+            lambda: np.array([draw_resting(rng, world, name, ROOM) for name in COLOURS]), fits, world, "the cubes"
+        )
+        cubes = {name: (at, draw_yaw(rng)) for name, at in zip(COLOURS, places, strict=True)}
+        return Start({BOX: (box, UPRIGHT), **cubes})
 
     def observe(self, world: World) -> Observed:
         """Return hand and box, the next cube and the way to its place, and where every cube is, in the box or not."""

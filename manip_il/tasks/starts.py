@@ -89,7 +89,7 @@ def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
 
 
 def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
-    """Draw until it fits, (3,). Raises `UsageError` after a thousand draws."""
+    """Draw a place (3,), or several (n, 3), until it fits. Raises `UsageError` after a thousand draws."""
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):
