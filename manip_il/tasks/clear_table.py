@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -17,7 +17,7 @@ from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
 from manip_il.tasks.reach import observe_hand
-from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_until, draw_yaw
+from manip_il.tasks.starts import UPRIGHT, draw_resting, draw_together, draw_yaw
 from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
@@ -103,13 +103,10 @@ class ClearTable:
         x, y = world.scene.robot.workspace.centre
         box = np.array([x + rng.uniform(-0.03, 0.03), y + rng.choice([-1.0, 1.0]) * SIDE, 0.0])
 
-        def fits(places: F64) -> bool:
-            apart = all(math.dist(one, other) > APART for one, other in itertools.combinations(places, 2))
-            return apart and bool(np.all(np.abs(places[:, 1] - box[1]) > FROM_BOX))
+        def fits(at: F64, others: Sequence[F64]) -> bool:
+            return abs(at[1] - box[1]) > FROM_BOX and all(math.dist(at, other) > APART for other in others)
 
-        places = draw_until(
-            lambda: np.array([draw_resting(rng, world, name, ROOM) for name in COLOURS]), fits, world, "the cubes"
-        )
+        places = draw_together(lambda name: draw_resting(rng, world, name, ROOM), COLOURS, fits, world)
         cubes = {name: (at, draw_yaw(rng)) for name, at in zip(COLOURS, places, strict=True)}
         return Start({BOX: (box, UPRIGHT), **cubes})
 

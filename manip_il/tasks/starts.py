@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import mujoco
 import numpy as np
@@ -18,6 +18,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 FROM_HAND = 0.1  # of an object from the hand at the start, x and y, as in gymnasium-robotics' FetchPickAndPlace [m]
 IN_AIR = 0.5  # share of goals that are off the table, as in the same environment
 LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
+_FEW_DRAWS = 50  # beside others, before they are drawn anew
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
 _HALF = np.sqrt(0.5)
@@ -89,12 +90,36 @@ def draw_yaw(rng: np.random.Generator, widest: float = np.pi / 4) -> F64:
 
 
 def draw_until(draw: Callable[[], F64], fits: Callable[[F64], bool], world: World, what: str) -> F64:
-    """Draw a place (3,), or several (n, 3), until it fits. Raises `UsageError` after a thousand draws."""
+    """Draw until it fits, (3,). Raises `UsageError` after a thousand draws."""
     for _ in range(_MOST_DRAWS):
         drawn = draw()
         if fits(drawn):
             return drawn
-    raise UsageError(
+    raise _no_place(world, what)
+
+
+def draw_together(
+    draw: Callable[[str], F64], names: Iterable[str], fits: Callable[[F64, Sequence[F64]], bool], world: World
+) -> list[F64]:
+    """Draw a place (3,) for each name that fits beside those before it, anew from the first where there is none.
+
+    Raises `UsageError` after a thousand beginnings.
+    """
+    for _ in range(_MOST_DRAWS):
+        places: list[F64] = []
+        for name in names:
+            drawn = (draw(name) for _ in range(_FEW_DRAWS))
+            at = next((at for at in drawn if fits(at, places)), None)
+            if at is None:
+                break
+            places.append(at)
+        else:
+            return places
+    raise _no_place(world, ", ".join(names))
+
+
+def _no_place(world: World, what: str) -> UsageError:
+    return UsageError(
         f"task {world.scene.task}: none of {_MOST_DRAWS} places drawn for {what} fits within reach of"
         f" {world.scene.robot.name}; choose another task or robot"
     )
