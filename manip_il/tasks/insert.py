@@ -21,8 +21,8 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 
-SIDE, LENGTH, MASS = 0.03, 0.10, 0.08  # of the peg [m], [m], [kg]
-DEPTH, WALL = 0.04, 0.018  # of the hole, and thickness of the walls around it [m]
+SIDE, LENGTH, MASS = 0.05, 0.10, 0.15  # of the peg [m], [m], [kg]
+DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
 FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
@@ -30,6 +30,8 @@ IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
 _QUARTER = math.pi / 2
+ASIDE_AT = 0.9
+AHEAD = 1.0  # weight of a hand's yaw against how far it turns
 
 
 def is_in(world: World) -> bool:
@@ -48,8 +50,14 @@ def _to_hole(world: World) -> Way:
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
     turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
-    best = min(turns, key=lambda turn: angle_between(hand, turn) + abs(azimuth(turn)))
+    best = min(turns, key=lambda turn: angle_between(hand, turn) + AHEAD * _off_side(turn))
     return way_to(world, best, lambda world, end: hole.position)
+
+
+def _off_side(hand: F64) -> float:
+    """How far a hand is from straight ahead, or where it does not point down from pointing to a side [rad]."""
+    tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
+    return abs(abs(azimuth(hand)) - ASIDE_AT * min(1.0, tilt / 0.5))
 
 
 def _quarter(hole: F64, k: int, flip: float) -> F64:

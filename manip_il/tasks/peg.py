@@ -16,7 +16,7 @@ from manip_il.tasks.grasp import OPEN_SLACK, angle_between, lie_of
 F64 = NDArray[np.float64]
 
 PEG, HOLE = "peg", "hole"
-FROM_END = 0.03  # of the grip from the peg's upper end [m]
+FROM_END = 0.04  # of the grip from the peg's upper end [m]
 LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
 STANDS = 0.4  # tilt under which the peg is grasped as it stands, from above [rad]
 LEAN = math.radians(60)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
@@ -25,7 +25,7 @@ AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand o
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.075, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
 BARE = 0.012  # of the hand beside a held peg's faces and beyond its ends [m]
-ASLANT = 0.40  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
+ASLANT = 1.7  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
 
 
 class Grip(NamedTuple):

@@ -35,13 +35,14 @@ F64 = NDArray[np.float64]
 LIFT, LIFT_SLOPE = 0.025, 2.5  # of the peg's lower end over the rim; per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
+TURN = 0.15  # how far ahead of the hand its target turns: its way need not wait for that [rad]
 LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
 CLEAR = 0.03  # of the hand over the peg once it has let go [m]
 ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand sets the peg up [rad]
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
+IN_AIR, BESIDE = 0.006, 0.04  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 
 
 class Way(NamedTuple):
@@ -128,7 +129,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
     missing: height [m]; sideways_at: how little may be missing for a move sideways.
     """
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
-    turn = 0.6 * min(1.0, max(0.05, 1.0 - missing / 0.06))
+    turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
     position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
     return Target(position, way.rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
@@ -195,7 +196,7 @@ def _approach(world: World) -> Target:
     too_low = grip.position[2] + height - ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
     position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.most_opening)
+    return Target(position, grip.rotation, world.most_opening, max_turn=TURN)
 
 
 def hangs(world: World) -> bool:
