@@ -27,11 +27,11 @@ FITS = 0.4  # share of the play that errors may take of a peg that goes down int
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
+SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 20.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
+NOT_NEARER = 0.10  # of the hole than the workspace's middle, along x: a tilted hand gets there [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
 _QUARTER = math.pi / 2
-ASIDE_AT = 0.9
-AHEAD = 1.0  # weight of a hand's yaw against how far it turns
 
 
 def is_in(world: World) -> bool:
@@ -50,14 +50,15 @@ def _to_hole(world: World) -> Way:
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
     turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
-    best = min(turns, key=lambda turn: angle_between(hand, turn) + AHEAD * _off_side(turn))
+    best = min(turns, key=lambda turn: angle_between(hand, turn) + _strain(turn))
     return way_to(world, best, lambda world, end: hole.position)
 
 
-def _off_side(hand: F64) -> float:
-    """How far a hand is from straight ahead, or where it does not point down from pointing to a side [rad]."""
-    tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
-    return abs(abs(azimuth(hand)) - ASIDE_AT * min(1.0, tilt / 0.5))
+def _strain(hand: F64) -> float:
+    """What is against a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
+    tilt, yaw = math.acos(min(1.0, max(-1.0, -float(hand[2, 2])))), abs(azimuth(hand))
+    tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
+    return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
 
 def _quarter(hole: F64, k: int, flip: float) -> F64:
@@ -137,7 +138,10 @@ class Insert:
         centre = world.scene.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
-        hole = draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
+        nearest = centre[0] - NOT_NEARER
+        hole = draw_until(
+            lambda: draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0], lambda at: at[0] > nearest, world, HOLE
+        )
         lies = rng.uniform() < 0.5
         height = (side if lies else length) / 2
 

@@ -25,7 +25,7 @@ AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand o
 AT_ANGLE = 0.25  # [rad]
 OVER, SLOPE, FREE = 0.075, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
 BARE = 0.012  # of the hand beside a held peg's faces and beyond its ends [m]
-ASLANT = 1.7  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
+ASLANT = 0.75  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
 
 
 class Grip(NamedTuple):
