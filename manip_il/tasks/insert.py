@@ -21,7 +21,7 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 
-SIDE, LENGTH, MASS = 0.05, 0.10, 0.15  # of the peg [m], [m], [kg]
+SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # of the peg [m], [m], [kg]
 DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
 FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]

@@ -32,7 +32,7 @@ from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 
-LIFT, LIFT_SLOPE = 0.025, 2.5  # of the peg's lower end over the rim; per error
+LIFT, LIFT_SLOPE = 0.015, 2.5  # of the peg's lower end over the rim; per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
 TURN = 0.15  # how far ahead of the hand its target turns: its way need not wait for that [rad]
@@ -42,7 +42,7 @@ ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a 
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.04  # of a falling peg over the table, and of its axis off the hand that catches it [m]
+IN_AIR, BESIDE = 0.006, 0.045  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 
 
 class Way(NamedTuple):
