@@ -18,6 +18,7 @@ F64 = NDArray[np.float64]
 PEG, HOLE = "peg", "hole"
 FROM_END = 0.04  # of the grip from the peg's upper end [m]
 LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
+BACK = 0.05  # how far behind the hand it is taken to be, when the upper end is the one that is nearer [m]
 STANDS = 0.4  # tilt under which the peg is grasped as it stands, from above [rad]
 LEAN = math.radians(69)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
 LEAN_BY_ROOM = 4.0  # the same at most, by how much farther the arm reaches: its wrist is that far out [rad/m]
@@ -70,13 +71,14 @@ def upper_axis(world: World) -> F64:
 
 
 def _upper_axis(world: World) -> F64:
-    """Upper end: in the hand the end that it holds, of a peg that lies the one away from the robot."""
+    """Upper end: in the hand the one that it points away from, of a peg that lies the one away from the robot."""
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
         return math.copysign(1.0, axis[2]) * axis
     if held(world):
-        return math.copysign(1.0, float(axis @ (ee.position - peg.position))) * axis
+        from_peg = ee.position - peg.position - BACK * ee.rotation[:, 2]
+        return math.copysign(1.0, float(axis @ from_peg)) * axis
     at = azimuth(ee.rotation)
     return min((axis, -axis), key=lambda a: _far_turn(math.atan2(a[1], a[0]), at))
 
