@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.sim.world import World
+from manip_il.sim.world import Scene, World
 from manip_il.tasks.grasp import angle_between, lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
@@ -56,7 +57,7 @@ def _to_hole(world: World) -> Way:
 
 def _strain(hand: F64) -> float:
     """What is against a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
-    tilt, yaw = math.acos(min(1.0, max(-1.0, -float(hand[2, 2])))), abs(azimuth(hand))
+    tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
     tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
@@ -71,13 +72,15 @@ def _is_entered(world: World) -> bool:
     return way.low < DEPTH - 0.002 and math.hypot(*way.off) < 0.006
 
 
-def _play(world: World) -> float:
-    return 2 * float(world.model.geom("hole left").pos[1] - WALL / 2) - world.extents(PEG)[0]
+@cache
+def _opening(scene: Scene) -> float:
+    """Between two walls of the hole [m]."""
+    return 2 * float(scene.model.geom("hole left").pos[1] - WALL / 2)
 
 
 def _lift(world: World) -> float:
     """Height over the hole's floor that the peg's lower end is to have [m]."""
-    error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
+    error = to_hole(world).error - FITS * (_opening(world.scene) - world.extents(PEG)[0])
     if _is_entered(world) or error <= 0:
         return 0.0
     return DEPTH + 0.0005 + min(LIFT, LIFT_SLOPE * error)

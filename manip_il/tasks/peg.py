@@ -95,10 +95,14 @@ def stands(world: World) -> bool:
 
 def held(world: World) -> bool:
     """Return whether both fingers touch the peg, and the hand is between its faces and its ends."""
+    return world.remember("held", lambda: world.touched(PEG) and _around(world))
+
+
+def _around(world: World) -> bool:
     peg = world.pose(PEG)
     x, y, z = np.abs(peg.rotation.T @ (world.ee.position - peg.position)).tolist()
     side, _, length = world.extents(PEG)
-    return max(x, y) < side / 2 + BARE and z < length / 2 + BARE and world.touched(PEG)
+    return max(x, y) < side / 2 + BARE and z < length / 2 + BARE
 
 
 def is_aslant(world: World) -> bool:

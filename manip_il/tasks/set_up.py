@@ -200,7 +200,7 @@ def _approach(world: World) -> Target:
 
 
 def hangs(world: World) -> bool:
-    """Return whether the peg hangs from a hand that points down."""
+    """Return whether the peg hangs from a hand that points along it, more or less."""
     return held(world) and not is_aslant(world) and stands(world)
 
 
