@@ -140,5 +140,5 @@ class ClearTable:
         if held(world, name):
             part = 0.5 + 0.4 * drop_progress(world, name, _to(world))
         else:
-            part = 0.45 * grasp_progress(world, name)
+            part = 0.45 * grasp_progress(world, name, OVER)
         return (done + part) / len(COLOURS)

@@ -161,11 +161,12 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     )
 
 
-def grasp_progress(world: World, name: str) -> float:
-    """Return progress of getting the fingers around an object, 0 to 1, by the way left."""
+def grasp_progress(world: World, name: str, hover: float = 0.0) -> float:
+    """Return progress of getting the fingers around an object, 0 to 1, by the way left; hover: see `approach`."""
     g = grasp_of(world, name)
     above = float(world.ee.position[2]) - g.at[2]
-    return nearness(g.off + abs(above - g.height) + g.height)
+    height = max(g.height, min(hover, g.funnel))
+    return nearness(g.off + abs(above - height) + height)
 
 
 def pick_progress(world: World, name: str) -> float:

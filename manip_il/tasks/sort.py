@@ -259,4 +259,4 @@ class Sort:
             return 1.0 if not _wrong(world) else 0.95
         if held(world, name):
             return 0.5 + 0.4 * _carry_progress(world)
-        return 0.45 * grasp_progress(world, name)
+        return 0.45 * grasp_progress(world, name, OVER)
