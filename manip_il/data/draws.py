@@ -1,4 +1,4 @@
-"""What each episode of a dataset drew: text in `meta/episodes`, one JSON object an episode, `{}` for nothing.
+"""Draws of a dataset's episodes: text in `meta/episodes`, one JSON object an episode, `{}` for nothing.
 
 LeRobot's merge keeps the column, its split and delete drop it; every frame's `sim_state` has the draws all the same.
 """

@@ -1,4 +1,4 @@
-"""What may differ from episode to episode, as numbers that a state holds.
+"""Variation of worlds from episode to episode, as numbers that a state holds.
 
 Five for every object: half its lengths along its own axes [m], its mass [kg] and its sliding friction. Then, for the
 whole world, what `Condition` names so: see `_WORLD`.
@@ -134,7 +134,7 @@ def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
 
 
 def _numbers(value: Any) -> Any:
-    """What a state holds of a drawn value."""
+    """Numbers that a state holds of a drawn value."""
     if isinstance(value, str):
         return float(GEOMS[value])
     return np.concatenate([value[camera] for camera in CAMERAS]) if isinstance(value, Mapping) else value
@@ -276,7 +276,7 @@ def _inertia(kind: int, size: F64, mass: float) -> F64:
 
 
 def _capsule_inertia(radius: float, height: float, mass: float) -> F64:
-    """Of a cylinder of a radius and height [m] with half a ball on both ends."""
+    """Moments of inertia of a cylinder of a radius and height [m] with half a ball on both ends."""
     round_, balls = height, 4 / 3 * radius  # volumes, in circles
     cylinder, ball = mass * round_ / (round_ + balls), mass * balls / (round_ + balls)
     along = cylinder * radius**2 / 2 + ball * 2 * radius**2 / 5

@@ -100,7 +100,7 @@ def _between(scene: Scene) -> bool:
 
 
 def _grasp(scene: Scene) -> tuple[F64, float]:
-    """To the cube, and the nearer it is, the more already on the way to the goal: a finger takes it along."""
+    """Go to the cube, and the nearer it is, the more already on the way to the goal: a finger takes it along."""
     way = scene.to_grasp.copy()
     share = max(0.0, 1 - np.abs(way).max() / CLOSED_ON)
     way[1] += share * np.clip(scene.goal[1] - scene.cube[1], -LEAD, LEAD)
@@ -108,7 +108,7 @@ def _grasp(scene: Scene) -> tuple[F64, float]:
 
 
 def _over(scene: Scene) -> tuple[F64, float]:
-    """To the cube, and not below its top before the fingers are on both sides of it."""
+    """Go to the cube, and not below its top before the fingers are on both sides of it."""
     way = scene.to_grasp.copy()
     if abs(way[1]) > STRADDLE or scene.opening < 2 * HALF + 0.01:
         way[2] = max(way[2], scene.to_cube[2] + CLEAR)
@@ -127,7 +127,7 @@ def _stay(scene: Scene) -> tuple[F64, float]:
 
 
 def _direction(scene: Scene) -> F64:
-    """Where the cube is to go, a unit vector in the plane, (2,)."""
+    """Direction in which the cube is to go, a unit vector in the plane, (2,)."""
     way = (scene.goal - scene.cube)[:2] - LOOK * scene.velocity[:2]
     return way / max(float(np.hypot(*way)), 1e-6)
 
@@ -144,7 +144,7 @@ def _is_behind(scene: Scene) -> bool:
 
 
 def _push(scene: Scene) -> tuple[F64, float]:
-    """As fast as can be where the cube is to go, and towards the line through cube and goal."""
+    """Move as fast as can be where the cube is to go, and towards the line through cube and goal."""
     direction = _direction(scene)
     across = np.array([-direction[1], direction[0]])
     way = direction * (REACH / np.abs(direction).max()) + CENTRING * across * (scene.to_cube[:2] @ across)
@@ -152,13 +152,13 @@ def _push(scene: Scene) -> tuple[F64, float]:
 
 
 def _ends(scene: Scene) -> tuple[F64, F64]:
-    """Where the gripper is and where it is to be behind the cube, both relative to the cube, (2,) [m]."""
+    """Places of the gripper now and behind the cube, both relative to the cube, (2,) [m]."""
     direction = _direction(scene)
     return -scene.to_cube[:2], -direction * (_touching(direction) + AHEAD)
 
 
 def _around(scene: Scene) -> tuple[F64, float]:
-    """To behind the cube, past its corners, as far as one step goes."""
+    """Go behind the cube, past its corners, as far as one step goes."""
     start, end = _ends(scene)
     return np.append(_walk(start, _path(start, end)), scene.to_cube[2] + LOW), CLOSE
 

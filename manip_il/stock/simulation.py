@@ -1,4 +1,4 @@
-"""What rollouts, datasets, checkpoints and evaluations ask of the stock environments."""
+"""The stock environments, as rollouts, datasets, checkpoints and evaluations use a simulation."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _to_hole(world: World) -> Way:
 
 
 def _strain(hand: F64) -> float:
-    """What is against a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
+    """Objection to a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
     tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
     tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
     return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
