@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,15 +21,12 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 
-SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # of the peg [m], [m], [kg]
-DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
-CHAMFER, SLIPPERY = 0.01, 0.05  # of the walls' upper inner edges, as high as wide [m], and its friction
-GUIDED = 0.006  # error of a peg that the chamfer guides into the hole [m]
+SIDE, LENGTH, MASS = 0.03, 0.10, 0.08  # of the peg [m], [m], [kg]
+DEPTH, WALL = 0.04, 0.018  # of the hole, and thickness of the walls around it [m]
+FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
-SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 20.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
-NOT_NEARER = 0.10  # of the hole than the workspace's middle, along x: a tilted hand gets there [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
 _QUARTER = math.pi / 2
@@ -52,15 +48,8 @@ def _to_hole(world: World) -> Way:
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
     turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
-    best = min(turns, key=lambda turn: angle_between(hand, turn) + _strain(turn))
+    best = min(turns, key=lambda turn: angle_between(hand, turn) + abs(azimuth(turn)))
     return way_to(world, best, lambda world, end: hole.position)
-
-
-def _strain(hand: F64) -> float:
-    """Objection to a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
-    tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
-    tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
-    return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
 
 def _quarter(hole: F64, k: int, flip: float) -> F64:
@@ -70,12 +59,16 @@ def _quarter(hole: F64, k: int, flip: float) -> F64:
 
 def _is_entered(world: World) -> bool:
     way = to_hole(world)
-    return way.low < DEPTH - 0.002 and math.hypot(*way.off) < CHAMFER
+    return way.low < DEPTH - 0.002 and math.hypot(*way.off) < 0.006
+
+
+def _play(world: World) -> float:
+    return 2 * float(world.model.geom("hole left").pos[1] - WALL / 2) - world.extents(PEG)[0]
 
 
 def _lift(world: World) -> float:
     """Height over the hole's floor that the peg's lower end is to have [m]."""
-    error = to_hole(world).error - GUIDED
+    error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
     if _is_entered(world) or error <= 0:
         return 0.0
     return DEPTH + 0.0005 + min(LIFT, LIFT_SLOPE * error)
@@ -85,7 +78,7 @@ def _bring(world: World) -> Target:
     """Up, over the hole, the nearer the lower, and slowly down into it."""
     way = to_hole(world)
     missing = _lift(world) - way.low
-    if abs(way.low - (DEPTH - CHAMFER)) < AT_RIM:
+    if abs(way.low - DEPTH) < AT_RIM:
         missing = max(missing, -GENTLE)
     far = math.hypot(*way.off) > 0.01
     return move(world, way, missing, sideways_at=0.015 if far else math.inf, exact=way.error < EXACT)
@@ -124,18 +117,19 @@ class Insert:
         add_object(spec, PEG, "box", [SIDE / 2, SIDE / 2, LENGTH / 2], MASS, RED)
         hole = add_furniture(spec, HOLE)
         inner = (SIDE + self.play) / 2
-        for side, quarter in (("left", 1), ("far", 0), ("right", 3), ("near", 2)):
-            _add_wall(hole, f"hole {side}", quarter * _QUARTER, inner)
+        for side, sign in (("left", 1), ("right", -1)):
+            at = sign * (inner + WALL / 2)
+            add_part(hole, f"hole {side}", (inner + WALL, WALL / 2, DEPTH / 2), (0, at, DEPTH / 2), GREY)
+        for side, sign in (("far", 1), ("near", -1)):
+            at = sign * (inner + WALL / 2)
+            add_part(hole, f"hole {side}", (WALL / 2, inner, DEPTH / 2), (at, 0, DEPTH / 2), GREY)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the hole is and its yaw, and the peg apart from it, half of the time lying, at any yaw."""
         centre = world.scene.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
-        nearest = centre[0] - NOT_NEARER
-        hole = draw_until(
-            lambda: draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0], lambda at: at[0] > nearest, world, HOLE
-        )
+        hole = draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
         lies = rng.uniform() < 0.5
         height = (side if lies else length) / 2
 
@@ -189,26 +183,6 @@ class Insert:
         height = max(0.0, _lift(world) - DEPTH)
         rest = math.hypot(*way.off) + abs(DEPTH + height - way.low) + height + 0.1 * way.angle
         return 0.6 + 0.3 * nearness(rest)
-
-
-def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
-    """Add one wall with a chamfered edge, in the direction of a yaw [rad] from the hole's middle; inner: there [m]."""
-    height, steep = DEPTH - CHAMFER, math.pi / 4
-    c, s = math.cos(yaw), math.sin(yaw)
-    out, thick = inner + WALL / 2, CHAMFER / 2
-    half = (WALL / 2, inner + WALL, height / 2)
-    add_part(hole, name, half, (c * out, s * out, height / 2), GREY)
-    hole.geoms[-1].quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
-    out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
-    add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
-    edge = hole.geoms[-1]
-    turn = np.empty(4)
-    mujoco.mju_mulQuat(
-        turn,
-        np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]),
-        np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]),
-    )
-    edge.quat, edge.friction, edge.priority = turn, [SLIPPERY, 0.005, 0.0001], 1
 
 
 def _rotation_vector(rotation: F64) -> F64:

@@ -32,18 +32,16 @@ from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 
-LIFT, LIFT_SLOPE = 0.015, 2.5  # of the peg's lower end over the rim; per error
+LIFT, LIFT_SLOPE = 0.025, 2.5  # of the peg's lower end over the rim; per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
-TURN = 0.15  # how far ahead of the hand its target turns: its way need not wait for that [rad]
 LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
 CLEAR = 0.03  # of the hand over the peg once it has let go [m]
 ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand sets the peg up [rad]
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
-OVER_WALLS = 0.03  # how much higher the peg is carried beside the hole [m]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.045  # of a falling peg over the table, and of its axis off the hand that catches it [m]
+IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 
 
 class Way(NamedTuple):
@@ -117,14 +115,11 @@ def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
 def _set_up(world: World) -> Target:
     """Up and upright, to a free place; then down on the table."""
     way = to_stand(world)
-    return move(world, way, _set_up_height(world, way) - way.low, sideways_at=0.03)
+    return move(world, way, _set_up_height(way) - way.low, sideways_at=0.03)
 
 
-def _set_up_height(world: World, way: Way) -> float:
-    """Height of the lower end over the table; beside the hole, over the walls around it [m]."""
-    room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
-    most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
-    return min(most, LIFT_SLOPE * max(0.0, way.error - 0.006)) - 0.001
+def _set_up_height(way: Way) -> float:
+    return min(LIFT, LIFT_SLOPE * max(0.0, way.error - 0.006)) - 0.001
 
 
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
@@ -133,13 +128,10 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
     missing: height [m]; sideways_at: how little may be missing for a move sideways.
     """
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
-    turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
-    rotation = way.rotation
-    if exact:  # twice as far, or the arm's weight stops it short
-        sideways, rotation = 2 * sideways, rotation @ world.ee.rotation.T @ rotation
+    turn = 0.6 * min(1.0, max(0.05, 1.0 - missing / 0.06))
     position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
-    return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
+    return Target(position, way.rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
 
 
 def is_up(world: World) -> bool:
@@ -203,11 +195,11 @@ def _approach(world: World) -> Target:
     too_low = grip.position[2] + height - ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
     position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.most_opening, max_turn=TURN)
+    return Target(position, grip.rotation, world.most_opening)
 
 
 def hangs(world: World) -> bool:
-    """Return whether the peg hangs from a hand that points along it, more or less."""
+    """Return whether the peg hangs from a hand that points down."""
     return held(world) and not is_aslant(world) and stands(world)
 
 
@@ -219,7 +211,7 @@ def peg_progress(world: World) -> float:
         return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
     if held(world):
         way = to_stand(world)
-        height = _set_up_height(world, way)
+        height = _set_up_height(way)
         rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
         return 0.33 + 0.2 * nearness(rest)
     near = nearness(grip.off + abs(above - grip.height) + grip.height)
