@@ -1,9 +1,9 @@
-"""Time of one expert label as a multiple of the bare quadratic program that it solves.
+"""Time of one expert label as a multiple of the bare quadratic program that it solves, and of pick_place's label.
 
 python benchmarks/label_speed.py [--quick]
 
 The states are those of real episodes, driven by the expert and by chance. The limit is daqp on the same problems,
-built beforehand; both are timed in the same run, by turns, state by state.
+built beforehand; both are timed in the same run, by turns, state by state. So are the labels of all tasks, task by task.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.scene import build_scene
+from manip_il.tasks.table import TASKS
 
 
 def main() -> int:
@@ -36,6 +37,13 @@ def main() -> int:
     options = parser.parse_args()
     episodes, repeats = (2, 2) if options.quick else (20, 5)
     print(describe_machine())
+    compare_with_solver(episodes, repeats)
+    compare_tasks(episodes, repeats)
+    return 0
+
+
+def compare_with_solver(episodes: int, repeats: int) -> None:
+    """Print the median label of pick_place beside the median of its bare quadratic program."""
     print("robot  states  label [us]  bare QP [us]  label / QP")
     for robot in ROBOTS:
         expert = Expert(build_scene(robot, "pick_place"))
@@ -49,14 +57,30 @@ def main() -> int:
                 solves[repeat, i] = seconds(partial(qpsolvers.solve_problem, solver="daqp"), problem)
         label, solve = np.median(labels.min(axis=0)), np.median(solves.min(axis=0))
         print(f"{robot:5s}  {len(pairs):6d}  {1e6 * label:10.1f}  {1e6 * solve:12.1f}  {label / solve:10.2f}")
-    return 0
 
 
-def visited(robot: str, episodes: int) -> list[State]:
+def compare_tasks(episodes: int, repeats: int) -> None:
+    """Print the median label of every task beside pick_place's."""
+    print("robot  task          states  label [us]  of pick_place's")
+    for robot in ROBOTS:
+        experts = {task: Expert(build_scene(robot, task)) for task in TASKS}
+        states = {task: visited(robot, episodes, task)[:: episodes // 2] for task in TASKS}
+        times = {task: np.empty((repeats, len(states[task]))) for task in TASKS}
+        for repeat in range(repeats):
+            for task, expert in experts.items():
+                times[task][repeat] = [seconds(expert.label, state) for state in states[task]]
+        medians = {task: float(np.median(times[task].min(axis=0))) for task in TASKS}
+        for task, label in medians.items():
+            ratio = label / medians["pick_place"]
+            print(f"{robot:5s}  {task:12s}  {len(states[task]):6d}  {1e6 * label:10.1f}  {ratio:15.2f}")
+
+
+def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
     """States of `episodes` episodes that the expert drove, and as many that chance did."""
     states: list[State] = []
+    horizon = {"expert": TASKS[task].limits.horizon, "random": 50}
     for driver in ("expert", "random"):
-        job = RolloutJob(EnvConfig(robot, horizon=50), driver, hold=5)
+        job = RolloutJob(EnvConfig(robot, task, horizon=horizon[driver]), driver, hold=5)
         for episode in run_job(job, stream_seeds("certificate", episodes)):
             states += [State.from_vector(row) for row in episode.columns["sim_state"]]
     return states
