@@ -3,7 +3,7 @@
 python benchmarks/label_speed.py [--quick]
 
 The states are those of real episodes, driven by the expert and by chance. The limit is daqp on the same problems,
-built beforehand; both are timed in the same run, by turns, state by state. So are the labels of all tasks, task by task.
+built beforehand; both are timed in the same run, by turns, state by state, and all tasks by turns, task by task.
 """
 
 from __future__ import annotations
