@@ -6,6 +6,7 @@ Lengths in [m], angles in [rad], everything in the world's frame: z = 0 is the t
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -220,11 +221,8 @@ class World:
         at, half = self.pose(name).position, self.model.geom_size[others]
         away = self.data.geom_xpos[others] - at
         nearest = away - np.minimum(np.maximum(away, -half), half)  # 0 along an axis on which they overlap
-        x, y, z = nearest.T
-        distance = np.hypot(x, y)
         low, high = _BESIDE
-        near = (z > low) & (z < high) & (distance > 0) & (distance < _NEAR)
-        return list(zip(x[near].tolist(), y[near].tolist(), strict=True))
+        return [(x, y) for x, y, z in nearest.tolist() if low < z < high and 0 < math.hypot(x, y) < _NEAR]
 
     @cached_property
     def _standing(self) -> Mapping[str, NDArray[np.int64]]:
