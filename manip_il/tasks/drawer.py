@@ -44,6 +44,7 @@ DROP = 0.018  # of the object over the drawer's floor where it is let go [m]
 OVER = 0.13  # of the hand over the object on its way to it [m]
 OVER_FRONT = Lift(most=0.085, slope=2.5, free=0.012, rise_first=0.03, max_step=0.06)  # on the way into the drawer
 OVER_TABLE = Lift(most=0.04, slope=0.6, free=0.012, rise_first=0.03, max_step=0.06)  # on the way to beside it
+MUCH_NEARER = 2.3  # how much nearer a hand must be to the other yaw at the handle to take that [rad]
 LEFT = (0.03, 0.06, 0.03)  # of the hand off the handle where it need not rise from it any more: x, y, z [m]
 # In the cabinet's frame: where an object is in the handle's way, x and y; where it lies before the handle of the shut
 # drawer, x; and where it is put aside [m].
@@ -58,9 +59,12 @@ def is_inside(world: World) -> bool:
 
 
 def _yaw(world: World) -> float:
-    """Yaw of a hand whose fingers close along the drawer's way: of two, the nearer one [rad]."""
+    """Yaw of a hand whose fingers close along the drawer's way: of two, the first unless the other is much nearer [rad].
+
+    Two that were chosen by nearness alone would be as near from most starts, and a learner would stand between them.
+    """
     at, quarter = angle_ahead(world.ee.rotation), math.pi / 2
-    return min((quarter, -quarter), key=lambda turn: (abs(turn - at), turn))
+    return quarter if abs(quarter - at) < abs(-quarter - at) + MUCH_NEARER else -quarter
 
 
 def _at_bar(world: World) -> bool:
@@ -123,9 +127,11 @@ def _place(world: World) -> F64:
 
 
 def _leave(world: World) -> Target:
-    """Straight up from the handle."""
+    """Straight up from the handle; the fingers open as they rise over it."""
     ee = world.ee.position
-    return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), FINGERS)
+    over = min(1.0, max(0.0, (ee[2] - BAR_Z) / LEFT[2]))
+    opening = FINGERS + over * (world.most_opening - FINGERS)
+    return Target(np.array([ee[0], ee[1], BAR_Z + HOVER]), hand_down(_yaw(world)), opening)
 
 
 def _is_around_bar(world: World) -> bool:
