@@ -21,12 +21,14 @@ from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
 
 F64 = NDArray[np.float64]
 
-SIDE, LENGTH, MASS = 0.03, 0.10, 0.08  # of the peg [m], [m], [kg]
-DEPTH, WALL = 0.04, 0.018  # of the hole, and thickness of the walls around it [m]
+SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # of the peg [m], [m], [kg]
+DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
 FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
+SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 8.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
+NOT_NEARER = 0.10  # of the hole than the workspace's middle, along x: a tilted hand gets there [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
 _QUARTER = math.pi / 2
@@ -48,8 +50,15 @@ def _to_hole(world: World) -> Way:
     in_hand = peg.rotation.T @ hand
     flip = 1.0 if float(upper_axis(world) @ peg.rotation[:, 2]) > 0 else -1.0
     turns = (_quarter(hole.rotation, k, flip) @ in_hand for k in range(4))
-    best = min(turns, key=lambda turn: angle_between(hand, turn) + abs(azimuth(turn)))
+    best = min(turns, key=lambda turn: angle_between(hand, turn) + _strain(turn))
     return way_to(world, best, lambda world, end: hole.position)
+
+
+def _strain(hand: F64) -> float:
+    """Objection to a hand's yaw, in radians of turning: a tilted hand is to point neither ahead nor backwards."""
+    tilt, yaw = math.acos(min(1.0, max(-1.0, -hand.item(2, 2)))), abs(azimuth(hand))
+    tilted, (least, most) = min(1.0, tilt / TILTED), SIDES
+    return (1 - tilted) * yaw + tilted * STRAIN * max(0.0, least - yaw, yaw - most)
 
 
 def _quarter(hole: F64, k: int, flip: float) -> F64:
@@ -129,7 +138,10 @@ class Insert:
         centre = world.scene.robot.workspace.centre
         side, _, length = world.extents(PEG)
 
-        hole = draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0]
+        nearest = centre[0] - NOT_NEARER
+        hole = draw_until(
+            lambda: draw_resting_place(rng, world, HOLE, 2 * DEPTH) * [1, 1, 0], lambda at: at[0] > nearest, world, HOLE
+        )
         lies = rng.uniform() < 0.5
         height = (side if lies else length) / 2
 
@@ -160,7 +172,7 @@ class Insert:
             "hole.sin4yaw": math.sin(4 * yaw),
             "peg_from_ee": peg - world.ee.position,
             "hole_from_peg": hole.position - lower_end(world),
-            "turn": _rotation_vector(way.rotation @ world.ee.rotation.T),
+            "turn": way.turn,
         }
 
     def destination(self, world: World) -> F64:
@@ -183,11 +195,3 @@ class Insert:
         height = max(0.0, _lift(world) - DEPTH)
         rest = math.hypot(*way.off) + abs(DEPTH + height - way.low) + height + 0.1 * way.angle
         return 0.6 + 0.3 * nearness(rest)
-
-
-def _rotation_vector(rotation: F64) -> F64:
-    """Return the axis of a rotation (3, 3) times its angle, (3,) [rad]."""
-    quaternion, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
-    return vector

@@ -16,16 +16,17 @@ from manip_il.tasks.grasp import OPEN_SLACK, angle_between, lie_of
 F64 = NDArray[np.float64]
 
 PEG, HOLE = "peg", "hole"
-FROM_END = 0.03  # of the grip from the peg's upper end [m]
+FROM_END = 0.04  # of the grip from the peg's upper end [m]
 LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
+BACK = 0.05  # how far behind the hand it is taken to be, when the upper end is the one that is nearer [m]
 STANDS = 0.4  # tilt under which the peg is grasped as it stands, from above [rad]
-LEAN = math.radians(60)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
+LEAN = math.radians(69)  # of the hand, back over the outer end of a peg that lies: less is left to turn [rad]
 LEAN_BY_ROOM = 3.0  # the same at most, by how much farther the arm reaches: its wrist is that far out [rad/m]
 AT_GRIP, CLOSING = (0.012, 0.012, 0.012), (0.016, 0.020, 0.016)  # of the hand off its grip: close, keep closing [m]
 AT_ANGLE = 0.25  # [rad]
-OVER, SLOPE, FREE = 0.075, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
+OVER, SLOPE, FREE = 0.065, 2.0, 0.006  # of the hand over its grip while it is not there; per error; error without [m]
 BARE = 0.012  # of the hand beside a held peg's faces and beyond its ends [m]
-ASLANT = 0.40  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
+ASLANT = 0.75  # of the hand off the peg's axis: it does not carry the peg like that, but sets it up [rad]
 
 
 class Grip(NamedTuple):
@@ -70,13 +71,14 @@ def upper_axis(world: World) -> F64:
 
 
 def _upper_axis(world: World) -> F64:
-    """Upper end: in the hand the end that it holds, of a peg that lies the one away from the robot."""
+    """Upper end: in the hand the one that it points away from, of a peg that lies the one away from the robot."""
     peg, ee = world.pose(PEG), world.ee
     axis = peg.rotation[:, 2]
     if stands(world):
         return math.copysign(1.0, axis[2]) * axis
     if held(world):
-        return math.copysign(1.0, float(axis @ (ee.position - peg.position))) * axis
+        from_peg = ee.position - peg.position - BACK * ee.rotation[:, 2]
+        return math.copysign(1.0, float(axis @ from_peg)) * axis
     at = azimuth(ee.rotation)
     return min((axis, -axis), key=lambda a: _far_turn(math.atan2(a[1], a[0]), at))
 
@@ -93,10 +95,14 @@ def stands(world: World) -> bool:
 
 def held(world: World) -> bool:
     """Return whether both fingers touch the peg, and the hand is between its faces and its ends."""
+    return world.remember("held", lambda: world.touched(PEG) and _around(world))
+
+
+def _around(world: World) -> bool:
     peg = world.pose(PEG)
     x, y, z = np.abs(peg.rotation.T @ (world.ee.position - peg.position)).tolist()
     side, _, length = world.extents(PEG)
-    return max(x, y) < side / 2 + BARE and z < length / 2 + BARE and world.touched(PEG)
+    return max(x, y) < side / 2 + BARE and z < length / 2 + BARE
 
 
 def is_aslant(world: World) -> bool:

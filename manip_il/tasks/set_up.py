@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import angle_between, lie_of
+from manip_il.tasks.grasp import lie_of, rotation_vector, turned_by
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.peg import (
     AT_ANGLE,
@@ -32,31 +32,40 @@ from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
 
-LIFT, LIFT_SLOPE = 0.025, 2.5  # of the peg's lower end over the rim; per error
+LIFT, LIFT_SLOPE = 0.015, 2.5  # of the peg's lower end over the rim; per error
 ANGLE_AS_LENGTH = 0.03  # what a radian counts for in these errors [m/rad]
 SLOW, FAST = 0.010, 0.06  # how far ahead of the hand its target runs, at the rim and far from it [m]
+FARTHER = 1.5  # than its target, in shares of the way, the hand aims where it is exact: the arm's weight stops it short
+TURN = 0.15  # how far ahead of the hand its target turns: its way need not wait for that [rad]
 LET_GO, RELEASE = 0.012, 0.03  # opening beyond the width of a peg that is free, and commanded to free it [m]
 CLEAR = 0.03  # of the hand over the peg once it has let go [m]
 ASIDE = (math.radians(55), math.radians(70))  # yaw, to either side, at which a hand sets the peg up [rad]
 NEAR_MIDDLE = 0.05  # of the workspace, along x: where the peg is set up [m]
 FROM_HOLE = 0.11  # of the peg, where it is set up, from the hole [m]
+OVER_WALLS = 0.03  # how much higher the peg is carried beside the hole [m]
+SET_DOWN = 0.010  # error at which the peg is down on the table [m]
 ON_TABLE = 0.004  # of the lower end over the table: the peg stands there [m]
-IN_AIR, BESIDE = 0.006, 0.026  # of a falling peg over the table, and of its axis off the hand that catches it [m]
+IN_AIR, BESIDE = 0.006, 0.045  # of a falling peg over the table, and of its axis off the hand that catches it [m]
 
 
 class Way(NamedTuple):
     """Way that is left for a peg in the hand.
 
-    rotation: of the hand when the peg stands upright, in line with the hole if it is for that, (3, 3); angle: to there
-    [rad]. off: sideways to there [m], (2,). error: both together [m]. low: of the peg's lower end over the table, when
-    it stands [m].
+    rotation: of the hand when the peg stands upright, in line with the hole if it is for that, (3, 3); turn: to there,
+    as a rotation vector, (3,) [rad]. off: sideways to there [m], (2,). error: both together [m]. low: of the peg's
+    lower end over the table, when it stands [m].
     """
 
     rotation: F64
-    angle: float
+    turn: F64
     off: F64
     error: float
     low: float
+
+    @property
+    def angle(self) -> float:
+        """How far the hand is to turn [rad]."""
+        return math.hypot(*self.turn)
 
 
 def to_stand(world: World) -> Way:
@@ -105,21 +114,27 @@ def way_to(world: World, rotation: F64, to: Callable[[World, F64], F64]) -> Way:
     to: where the lower end of the upright peg goes from a point (3,) [m].
     """
     ee, peg = world.ee, world.pose(PEG)
-    angle = angle_between(ee.rotation, rotation)
+    turn = rotation_vector(rotation @ ee.rotation.T)
     end = peg.position - world.extents(PEG)[2] / 2 * upper_axis(world)
     turned = ee.position + rotation @ (ee.rotation.T @ (end - ee.position))  # the lower end, once the peg is upright
     off = (to(world, turned) - turned)[:2]
-    return Way(rotation, angle, off, math.hypot(*off) + ANGLE_AS_LENGTH * angle, float(turned[2]))
+    error = math.hypot(*off) + ANGLE_AS_LENGTH * math.hypot(*turn)
+    return Way(rotation, turn, off, error, float(turned[2]))
 
 
 def _set_up(world: World) -> Target:
     """Up and upright, to a free place; then down on the table."""
     way = to_stand(world)
-    return move(world, way, _set_up_height(way) - way.low, sideways_at=0.03)
+    return move(world, way, _set_up_height(world, way) - way.low, sideways_at=0.03)
 
 
-def _set_up_height(way: Way) -> float:
-    return min(LIFT, LIFT_SLOPE * max(0.0, way.error - 0.006)) - 0.001
+def _set_up_height(world: World, way: Way) -> float:
+    """Height of the lower end over the table; beside the hole, over the walls around it [m]."""
+    room = math.dist(world.pose(PEG).position[:2], world.pose(HOLE).position[:2]) - FROM_HOLE
+    most = LIFT + OVER_WALLS * min(1.0, max(0.0, 1 - room / OVER_WALLS))
+    tilt = math.acos(min(1.0, float(upper_axis(world)[2])))  # whatever the yaw of the hand: it may be out of reach
+    error = math.hypot(*way.off) + ANGLE_AS_LENGTH * tilt
+    return min(most, LIFT_SLOPE * max(0.0, error - SET_DOWN)) - 0.001
 
 
 def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool = False) -> Target:
@@ -128,10 +143,13 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
     missing: height [m]; sideways_at: how little may be missing for a move sideways.
     """
     sideways = min(1.0, max(0.0, 1.0 - missing / sideways_at))
-    turn = 0.6 * min(1.0, max(0.05, 1.0 - missing / 0.06))
+    turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
+    rotation = way.rotation
+    if exact:
+        sideways, rotation = FARTHER * sideways, turned_by((FARTHER - 1) * way.turn) @ rotation
     position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
-    return Target(position, way.rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
+    return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
 
 
 def is_up(world: World) -> bool:
@@ -195,11 +213,11 @@ def _approach(world: World) -> Target:
     too_low = grip.position[2] + height - ee[2]
     sideways = min(1.0, max(0.0, 1.0 - too_low / 0.03))
     position = np.append(ee[:2] + sideways * (grip.position - ee)[:2], grip.position[2] + height)
-    return Target(position, grip.rotation, world.most_opening)
+    return Target(position, grip.rotation, world.most_opening, max_turn=TURN)
 
 
 def hangs(world: World) -> bool:
-    """Return whether the peg hangs from a hand that points down."""
+    """Return whether the peg hangs from a hand that points along it, more or less."""
     return held(world) and not is_aslant(world) and stands(world)
 
 
@@ -211,7 +229,7 @@ def peg_progress(world: World) -> float:
         return 0.55 + 0.11 * min(1.0, max(0.0, above / (FROM_END + CLEAR)))
     if held(world):
         way = to_stand(world)
-        height = _set_up_height(way)
+        height = _set_up_height(world, way)
         rest = math.hypot(*way.off) + abs(height - way.low) + height + 0.25 * way.angle
         return 0.33 + 0.2 * nearness(rest)
     near = nearness(grip.off + abs(above - grip.height) + grip.height)

@@ -17,6 +17,7 @@ from manip_il.tasks.insert import APART
 from manip_il.tasks.peg import HOLE, PEG, azimuth, hand_at, lower_end, upper_axis
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
+from manip_il.tasks.task import phases
 
 from ..tables import every_robot
 
@@ -79,3 +80,15 @@ def test_the_expert_puts_a_standing_and_a_lying_peg_into_the_hole(task: str):
                 break
         assert env.solved
         assert lower_end(env.world)[2] < 0.004
+
+
+def test_a_peg_that_the_arm_cannot_lean_over_far_enough_is_set_upright_first():
+    env = ManipEnv("fetch", "insert")
+    expert, names, seen = Expert(env.scene), phases(TASKS["insert"]), list[str]()
+    env.start(SEEDS[0])
+    while not env.solved and len(seen) < env.config.horizon:
+        label = expert.label(env.get_state())
+        seen.append(names[label.phase])
+        env.advance(label.action)
+    assert env.solved
+    assert seen.index("set_up") < seen.index("let_stand") < len(seen) - seen[::-1].index("grasp")
