@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,11 +24,12 @@ F64 = NDArray[np.float64]
 
 SIDE, LENGTH, MASS = 0.058, 0.10, 0.15  # of the peg [m], [m], [kg]
 DEPTH, WALL = 0.03, 0.018  # of the hole, and thickness of the walls around it [m]
-FITS = 0.4  # share of the play that errors may take of a peg that goes down into the hole
+CHAMFER, SLIPPERY = 0.005, 0.05  # of the walls' upper inner edges, as high as wide [m], and its friction
+GUIDED = 0.003  # error of a peg that the chamfer guides into the hole [m]
 AT_RIM, GENTLE = 0.005, 0.003  # of the lower end from the rim's height, where the hand presses down by so much [m]
 EXACT = 0.02  # error under which the hand is placed exactly [m]
 IN = 0.003  # of the peg's lower end off the hole's floor: inserted [m]
-SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 8.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
+SIDES, TILTED, STRAIN = (0.6, 1.75), 0.5, 4.0  # yaw of a hand that is tilted so far, in [rad]; weight beyond it
 NOT_NEARER = 0.10  # of the hole than the workspace's middle, along x: a tilted hand gets there [m]
 APART = 0.14  # of the peg from the hole at the start [m]
 NOT_FARTHER = 0.05  # of a peg that lies beyond the workspace's middle at the start [m]
@@ -71,13 +73,9 @@ def _is_entered(world: World) -> bool:
     return way.low < DEPTH - 0.002 and math.hypot(*way.off) < 0.006
 
 
-def _play(world: World) -> float:
-    return 2 * float(world.model.geom("hole left").pos[1] - WALL / 2) - world.extents(PEG)[0]
-
-
 def _lift(world: World) -> float:
     """Height over the hole's floor that the peg's lower end is to have [m]."""
-    error = to_hole(world).error - FITS * world.remember("play", lambda: _play(world))
+    error = to_hole(world).error - GUIDED
     if _is_entered(world) or error <= 0:
         return 0.0
     return DEPTH + 0.0005 + min(LIFT, LIFT_SLOPE * error)
@@ -116,7 +114,7 @@ class Insert:
     instruction: str = "Put the peg into the hole."
     play: float = 0.002
     sizes: tuple[float, float] | None = None
-    limits: Limits = field(default=Limits(tolerance=0.004, horizon=400))
+    limits: Limits = field(default=Limits(tolerance=0.004, horizon=600))
     objects: tuple[str, ...] = (PEG,)
     grasped: tuple[str, ...] = (PEG,)
     rungs: tuple[Rung, ...] = _RUNGS
@@ -126,12 +124,8 @@ class Insert:
         add_object(spec, PEG, "box", [SIDE / 2, SIDE / 2, LENGTH / 2], MASS, RED)
         hole = add_furniture(spec, HOLE)
         inner = (SIDE + self.play) / 2
-        for side, sign in (("left", 1), ("right", -1)):
-            at = sign * (inner + WALL / 2)
-            add_part(hole, f"hole {side}", (inner + WALL, WALL / 2, DEPTH / 2), (0, at, DEPTH / 2), GREY)
-        for side, sign in (("far", 1), ("near", -1)):
-            at = sign * (inner + WALL / 2)
-            add_part(hole, f"hole {side}", (WALL / 2, inner, DEPTH / 2), (at, 0, DEPTH / 2), GREY)
+        for side, quarter in (("left", 1), ("far", 0), ("right", 3), ("near", 2)):
+            _add_wall(hole, f"hole {side}", quarter * _QUARTER, inner)
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw where the hole is and its yaw, and the peg apart from it, half of the time lying, at any yaw."""
@@ -195,3 +189,23 @@ class Insert:
         height = max(0.0, _lift(world) - DEPTH)
         rest = math.hypot(*way.off) + abs(DEPTH + height - way.low) + height + 0.1 * way.angle
         return 0.6 + 0.3 * nearness(rest)
+
+
+def _add_wall(hole: Any, name: str, yaw: float, inner: float) -> None:
+    """Add one wall with a chamfered edge, in the direction of a yaw [rad] from the hole's middle; inner: there [m]."""
+    height, steep = DEPTH - CHAMFER, math.pi / 4
+    c, s = math.cos(yaw), math.sin(yaw)
+    out, thick = inner + WALL / 2, CHAMFER / 2
+    half = (WALL / 2, inner + WALL, height / 2)
+    add_part(hole, name, half, (c * out, s * out, height / 2), GREY)
+    hole.geoms[-1].quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    out, up = inner + CHAMFER / 2 + thick * math.sin(steep), height + CHAMFER / 2 - thick * math.cos(steep)
+    add_part(hole, f"{name} edge", (CHAMFER / math.sqrt(2), inner + WALL, thick), (c * out, s * out, up), GREY)
+    edge = hole.geoms[-1]
+    turn = np.empty(4)
+    mujoco.mju_mulQuat(
+        turn,
+        np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]),
+        np.array([math.cos(steep / 2), 0.0, -math.sin(steep / 2), 0.0]),
+    )
+    edge.quat, edge.friction, edge.priority = turn, [SLIPPERY, 0.005, 0.0001], 1

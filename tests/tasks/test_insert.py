@@ -29,7 +29,7 @@ SEEDS = stream_seeds("certificate", 6)
 def test_the_hole_is_wider_than_the_peg_by_the_play(task: str, play: float):
     world = World(build_scene("panda", task))
     left, right = (world.model.geom(f"hole {side}") for side in ("left", "right"))
-    between = left.pos[1] - left.size[1] - (right.pos[1] + right.size[1])
+    between = left.pos[1] - left.size[0] - (right.pos[1] + right.size[0])
     assert between - world.extents(PEG)[0] == pytest.approx(play)
 
 
