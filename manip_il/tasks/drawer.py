@@ -59,7 +59,7 @@ def is_inside(world: World) -> bool:
 
 
 def _yaw(world: World) -> float:
-    """Yaw of a hand whose fingers close along the drawer's way: of two, the first unless the other is much nearer [rad].
+    """Yaw of a hand whose fingers close along the drawer's way: the first of two, or one that is much nearer [rad].
 
     Two that were chosen by nearness alone would be as near from most starts, and a learner would stand between them.
     """
