@@ -76,7 +76,7 @@ class Expert:
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
     def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
-        """A joint step [rad] and what it leaves of the error; an exact one is aimed again, off by what the first misses."""
+        """A joint step [rad] and what it leaves of the error; an exact one is aimed again, off by what it misses."""
         ik, most = self._ik, self._scene.robot.max_joint_step
         first = ik.step(position, rotation, most, target.lean)
         if first is None or not target.exact:

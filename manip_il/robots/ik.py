@@ -61,7 +61,8 @@ class ArmIK:
     def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
         """Return one step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
 
-        lean: from 0 to 1, how far the hand may lean off the rotation for the sake of its position. Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
+        lean: how far the hand may lean off the rotation for the sake of its position, 0 to 1.
+        Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
         of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.
         """
         weight = _ORIENTATION_COST + lean * (_LEANING_COST - _ORIENTATION_COST)
@@ -113,7 +114,7 @@ class ArmIK:
         return jacobian[:, self._dofs]
 
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
-        """Distance to a pose, position and angle weighted as the frame task weights them; weight: of the angle [m/rad]."""
+        """Distance to a pose, position and angle weighted as the frame task weights them, the angle by `weight`."""
         data = self._configuration.data
         dx, dy, dz = (data.site_xpos[self._site] - position).tolist()
         cosine = (float(data.site_xmat[self._site] @ rotation.ravel()) - 1) / 2
