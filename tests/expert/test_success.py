@@ -79,9 +79,11 @@ def test_the_expert_lifts_what_the_hand_does_not_reach_upright(task: str, x: flo
     assert not env.world.reach.nearly(place)
     env.world.place(name, place, UPRIGHT)
     env.world.update()
+    highest = 0.0
     for _ in range(60):
         env.begin_step()
         label = expert.label(env.get_state())
         assert label.valid
         env.advance(label.action)
-    assert env.world.pose(name).position[2] > half + 0.03
+        highest = max(highest, env.world.pose(name).position[2])
+    assert highest > half + 0.03
