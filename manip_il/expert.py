@@ -57,7 +57,8 @@ class Expert:
             if position[2] < FALLEN:
                 return f"{name} off the table"
             in_hand = math.dist(position, world.ee.position.tolist()) < world.extents(name)[0] / 2
-            if not in_hand and not world.reach.leaning(position):
+            reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
+            if not in_hand and not reaches(position):
                 return f"{name} out of reach"
         return ""
 

@@ -224,6 +224,8 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     """Return an angle from a hand that points down [rad] without what a hand (3, 3) may lean."""
+    if not lean:
+        return angle
     tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
     free = min(tilt, lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
