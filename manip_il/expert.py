@@ -57,7 +57,8 @@ class Expert:
             if position[2] < FALLEN:
                 return f"{name} off the table"
             in_hand = math.dist(position, world.ee.position.tolist()) < world.extents(name)[0] / 2
-            if not in_hand and not world.reach.nearly(position):
+            reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
+            if not in_hand and not reaches(position):
                 return f"{name} out of reach"
         return ""
 
@@ -65,7 +66,7 @@ class Expert:
         ee, ee_rotation = self._ik.ee_pose(q)
         position = ee + _clip_norm(target.position - ee, target.max_step)
         rotation = _turn_towards(ee_rotation, target.rotation, target.max_turn)
-        step = self._step(q, position, rotation, target.exact)
+        step = self._step(q, position, rotation, target)
         if step is None:
             return self._hold(q, "inverse kinematics has no solution")
         dq, residual = step
@@ -75,15 +76,15 @@ class Expert:
         action = self._scene.actions.join(q + dq, target.opening)
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
 
-    def _step(self, q: F64, position: F64, rotation: F64, exact: bool) -> tuple[F64, float] | None:
-        """A joint step [rad] and what it leaves of the error; `exact`: aimed again, off by what the first misses."""
+    def _step(self, q: F64, position: F64, rotation: F64, target: Target) -> tuple[F64, float] | None:
+        """A joint step [rad] and what it leaves of the error; an exact one is aimed again, off by what it misses."""
         ik, most = self._ik, self._scene.robot.max_joint_step
-        first = ik.step(position, rotation, most)
-        if first is None or not exact:
+        first = ik.step(position, rotation, most, target.lean)
+        if first is None or not target.exact:
             return first
         reached, turned = ik.ee_pose(q + first[0])
         ik.ee_pose(q)
-        second = ik.step(2 * position - reached, rotation @ turned.T @ rotation, most)
+        second = ik.step(2 * position - reached, rotation @ turned.T @ rotation, most, target.lean)
         return first if second is None else (second[0], first[1])
 
     def _hold(self, q: F64, reason: str) -> Label:

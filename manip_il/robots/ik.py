@@ -18,6 +18,7 @@ F64 = NDArray[np.float64]
 
 _POSITION_COST = 1.0  # [1/m]
 _ORIENTATION_COST = 0.2  # [1/rad]
+_LEANING_COST = 0.04  # the same of a hand that leans to get farther [1/rad]
 _POSTURE_COST = 0.01  # [1/rad]; without it the label depends on the path that led to the posture
 _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
@@ -57,14 +58,17 @@ class ArmIK:
         data = self._configuration.data
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
-    def step(self, position: F64, rotation: F64, largest: float) -> tuple[F64, float] | None:
+    def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
         """Return one step from the posture last given to `ee_pose` towards a pose of `ee`; `largest`: of a joint [rad].
 
+        lean: how far the hand may lean off the rotation for the sake of its position, 0 to 1.
         Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
         of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.
         """
+        weight = _ORIENTATION_COST + lean * (_LEANING_COST - _ORIENTATION_COST)
         self._frame.set_target(_se3(position, rotation))
-        before = self._pose_error(position, rotation)
+        self._frame.set_orientation_cost(weight)
+        before = self._pose_error(position, rotation, weight)
         problem = mink.build_ik(self._configuration, self._tasks, 1.0, _DAMPING, self._limits)
         x = _solve(problem)
         if x is None:
@@ -78,7 +82,7 @@ class ArmIK:
         data = self._configuration.data
         data.qpos[self._address] += dq
         mujoco.mj_kinematics(self._configuration.model, data)
-        return dq, self._pose_error(position, rotation) / before
+        return dq, self._pose_error(position, rotation, weight) / before
 
     def solve(self, q: F64, position: F64, rotation: F64) -> F64:
         """Return joints (arm,) [rad], within their limits and near `q`, with which `ee` has a pose.
@@ -109,13 +113,13 @@ class ArmIK:
         mujoco.mj_jacSite(configuration.model, configuration.data, jacobian[:3], jacobian[3:], self._site)
         return jacobian[:, self._dofs]
 
-    def _pose_error(self, position: F64, rotation: F64) -> float:
-        """Distance to a pose, position and angle weighted as the frame task weights them."""
+    def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
+        """Distance to a pose, position and angle weighted as the frame task weights them, the angle by `weight`."""
         data = self._configuration.data
         dx, dy, dz = (data.site_xpos[self._site] - position).tolist()
         cosine = (float(data.site_xmat[self._site] @ rotation.ravel()) - 1) / 2
         angle = math.acos(min(1.0, max(-1.0, cosine)))
-        return math.hypot(dx, dy, dz, _ORIENTATION_COST * angle)
+        return math.hypot(dx, dy, dz, weight * angle)
 
 
 def _solve(problem: qpsolvers.Problem) -> F64 | None:

@@ -38,6 +38,7 @@ _STEPS = 80  # of inverse kinematics, at most
 _NEAR, _ANGLE = 1e-3, 0.05  # where it has arrived [m], and what a radian counts for beside that [m/rad]
 ARRIVES = 0.004  # what the hand may miss a pose by and still be there [m]
 STRETCH = 0.02  # it still gets there less exactly [m]
+_LEAN = 0.13  # how much farther a hand that leans gets, sideways [m]
 _BLOCKED = 0.1  # what a posture in which the robot meets itself counts for [m]
 _BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)  # what a file that is no map raises
 _CLEARANCE = 0.02  # parts that are nearer than that meet [m]
@@ -66,6 +67,11 @@ class Reach:
     def _corner(self) -> tuple[float, float, float]:
         return tuple(self.origin.tolist())
 
+    @cached_property
+    def _middle(self) -> tuple[float, float]:
+        x, y, _ = (self.origin + _CELL / 2 * (np.array(self.errors.shape) - 1)).tolist()
+        return x, y
+
     def error(self, position: Sequence[float] | F64) -> float:
         """Return how far from `position` [m], (3,), the hand ends; beyond the map also how far that is from it [m]."""
         place = (np.asarray(position) - self.origin) / _CELL
@@ -89,6 +95,20 @@ class Reach:
     def nearly(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand gets near `position` [m], (3,): close enough for a label to make sense."""
         return self.has(position) or self.error(position) < STRETCH
+
+    def lean(self, position: Sequence[float] | F64) -> float:
+        """Return how much the hand has to lean to get to `position` [m], (3,): 0 for upright, to 1."""
+        if self.has(position):
+            return 0.0
+        return min(1.0, max(0.0, (self.error(position) - ARRIVES) / (STRETCH - ARRIVES)))
+
+    def leaning(self, position: Sequence[float] | F64) -> bool:
+        """Return whether a hand that may lean gets near `position` [m], (3,): it does upright, a little farther in."""
+        if self.nearly(position):
+            return True
+        (x, y, z), (in_x, in_y) = position, self._middle
+        inwards = _LEAN / max(_LEAN, math.hypot(in_x - x, in_y - y))
+        return self.nearly((x + inwards * (in_x - x), y + inwards * (in_y - y), z))
 
 
 @cache

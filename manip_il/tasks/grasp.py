@@ -32,6 +32,7 @@ FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, an
 SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
 NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
+LEAN = 0.5  # of a hand that reaches as far as it can [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
 _BOX, _SPHERE = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_SPHERE)
@@ -64,7 +65,8 @@ class Grasp(NamedTuple):
     is from that [rad].
     at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
     sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
-    must be for that [m]; height: the same, but no higher than to clear its top.
+    must be for that [m]; height: the same, but no higher than to clear its top. lean: how much the hand leans to get to
+    it, 0 to 1.
     """
 
     offset: tuple[float, float, float]
@@ -80,6 +82,7 @@ class Grasp(NamedTuple):
     off: float
     height: float
     funnel: float
+    lean: float
 
 
 def grasp_of(world: World, name: str) -> Grasp:
@@ -101,7 +104,8 @@ def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM, neighbours)
-    angle = angle_from_down(ee.rotation, yaw)
+    lean = world.reach.lean(position)
+    angle = _beyond_lean(angle_from_down(ee.rotation, yaw), ee.rotation, lean)
     x, y, z = position.tolist()
     ee_x, ee_y, ee_z = ee.position.tolist()
     dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
@@ -126,6 +130,7 @@ def _grasp(world: World, name: str) -> Grasp:
         off=off,
         height=min(half + HOVER, funnel),
         funnel=funnel,
+        lean=lean,
     )
 
 
@@ -215,6 +220,15 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
     (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
     trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
     return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))
+
+
+def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
+    """Return an angle from a hand that points down [rad] without what a hand (3, 3) may lean."""
+    if not lean:
+        return angle
+    tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
+    free = min(tilt, lean * LEAN)
+    return math.sqrt(max(0.0, angle * angle - free * free))
 
 
 def angle_between(a: F64, b: F64) -> float:

@@ -87,13 +87,13 @@ def approach(world: World, name: str, hover: float = 0.0) -> Target:
     too_low = z + height - ee_z
     sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
     position = np.array([ee_x + sideways * (x - ee_x), ee_y + sideways * (y - ee_y), z + height])
-    return Target(position, hand_down(g.yaw), g.wide)
+    return Target(position, hand_down(g.yaw), g.wide, lean=g.lean)
 
 
 def close_on(world: World, name: str) -> Target:
     """Close the fingers at the object's position."""
     g = grasp_of(world, name)
-    return Target(np.array(g.at), hand_down(g.yaw), CLOSED)
+    return Target(np.array(g.at), hand_down(g.yaw), CLOSED, lean=g.lean)
 
 
 def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:

@@ -23,6 +23,7 @@ class Target(NamedTuple):
 
     max_step: how far ahead of the hand its target may run [m]; max_turn: [rad]. exact: do not let the arm's posture,
     which inverse kinematics keeps near home, pull the hand off its target by a millimetre; for fits tighter than that.
+    lean: how far the hand may lean off its rotation for the sake of its position, 0 to 1.
     """
 
     position: F64
@@ -31,6 +32,7 @@ class Target(NamedTuple):
     max_step: float = 0.12
     max_turn: float = 0.6
     exact: bool = False
+    lean: float = 0.0
 
 
 @dataclass(frozen=True)

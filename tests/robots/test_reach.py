@@ -14,6 +14,7 @@ from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
 from manip_il.robots.robot import Robot, get_robot
+from manip_il.tasks.grasp import LEAN
 
 from ..tables import every_robot
 from .own import write
@@ -64,17 +65,26 @@ def test_beyond_the_map_nothing_is_reached_and_the_error_grows(share, axis: int,
     assert MAP.nearly(outside) == (MAP.error(outside) < STRETCH)
 
 
-def solve_from_home(ik: ArmIK, robot: Robot, position: np.ndarray) -> float:
-    """How far the hand, pointing down, ends from a position [m]."""
+@given(shares)
+def test_a_hand_leans_only_where_it_does_not_get_upright(share: tuple[float, ...]):
+    lean = MAP.lean(within(share))
+    assert 0 <= lean <= 1
+    assert (lean > 0) == (MAP.error(within(share)) > ARRIVES)
+    if MAP.nearly(within(share)):
+        assert MAP.leaning(within(share))
+
+
+def solve_from_home(ik: ArmIK, robot: Robot, position: np.ndarray, lean: float = 0.0) -> tuple[float, float]:
+    """How far the hand, told to point down, ends from a position [m], and from pointing down [rad]."""
     q = np.asarray(robot.home, dtype=np.float64)
     for _ in range(120):
         ik.ee_pose(q)
-        step = ik.step(position, np.diag([1.0, -1.0, -1.0]), robot.max_joint_step)
+        step = ik.step(position, np.diag([1.0, -1.0, -1.0]), robot.max_joint_step, lean)
         assert step is not None
         q = np.clip(q + step[0], ik.limits[:, 0], ik.limits[:, 1])
     at, rotation = ik.ee_pose(q)
-    assert np.arccos(np.clip((np.trace(np.diag([1.0, -1.0, -1.0]) @ rotation) - 1) / 2, -1, 1)) < 0.1
-    return float(np.linalg.norm(at - position))
+    angle = np.arccos(np.clip((np.trace(np.diag([1.0, -1.0, -1.0]) @ rotation) - 1) / 2, -1, 1))
+    return float(np.linalg.norm(at - position)), float(angle)
 
 
 @every_robot
@@ -88,8 +98,23 @@ def test_what_the_map_has_inverse_kinematics_reaches(robot: str):
         position = np.array([*xy, draws.uniform(0.02, space.height)])
         if there.has(position):
             tried += 1
-            assert solve_from_home(ik, the_robot, position) < 0.005
+            miss, angle = solve_from_home(ik, the_robot, position)
+            assert miss < 0.005
+            assert angle < 0.1
     assert tried > 20
+
+
+@pytest.mark.parametrize("x", [0.19, 0.86])  # near the base and far from it [m]
+def test_a_hand_that_leans_gets_where_an_upright_one_does_not(x: float):
+    the_robot, place = get_robot("panda"), np.array([x, 0.02, 0.025])
+    there, ik = reach_of(the_robot), ArmIK(the_robot)
+    assert not there.nearly(place)
+    assert there.leaning(place)
+    assert there.lean(place) == 1
+    assert solve_from_home(ik, the_robot, place)[0] > 0.02
+    miss, angle = solve_from_home(ik, the_robot, place, 1.0)
+    assert miss < 0.006
+    assert angle < LEAN
 
 
 @every_robot

@@ -13,10 +13,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from manip_il.robots.reach import Reach
 from manip_il.sim.world import Pose
 from manip_il.tasks.grasp import (
     FUNNEL_RADIUS,
     HOVER,
+    LEAN,
     LOWEST_EE,
     OPEN_SLACK,
     angle_between,
@@ -44,6 +46,8 @@ from manip_il.tasks.task import Rung, Target
 OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [m]
 EDGES = (0.03, 0.05, 0.07)
 RUNGS = pick_rungs("object")
+UPRIGHT = Reach(np.array([-1.0, -1.0, -1.0]), np.zeros((41, 41, 41)))  # the hand gets everywhere pointing down
+LEANING = Reach(UPRIGHT.origin, np.ones((41, 41, 41)))  # nowhere
 widths = st.floats(0.03, 0.07)
 steepest = 60.0  # change of a target per change of where the hand is
 
@@ -60,6 +64,7 @@ class Placed:
     touching: bool = False
     most_opening: float = OPEN
     around: tuple[tuple[float, float], ...] = ()
+    reach: Reach = UPRIGHT
 
     def pose(self, name: str) -> Pose:
         return {"object": self.cube}[name]
@@ -101,6 +106,14 @@ def turned(rotation: np.ndarray, **changes: Any) -> Placed:
     """The cube turned, and the hand over it."""
     world = at(0, 0, 0.1, **changes)
     return replace(world, cube=Pose(world.cube.position, rotation))
+
+
+@pytest.mark.parametrize(("reach", "lean", "phase"), [(UPRIGHT, 0.0, "descend"), (LEANING, 1.0, "grasp")])
+def test_a_hand_may_lean_where_it_does_not_get_upright(reach: Reach, lean: float, phase: str):
+    world = at(0, 0, 0, reach=reach)
+    leaning = replace(world, ee=Pose(world.ee.position, about((0, 1, 0), 0.9 * LEAN) @ world.ee.rotation))
+    name, target = rung(leaning)
+    assert (name, target.lean) == (phase, lean)
 
 
 def cube_yaw(rotation: np.ndarray) -> tuple[float, float]:
