@@ -11,8 +11,6 @@ from manip_il.tasks.pick_place import OBJECT, PickPlace
 from manip_il.tasks.starts import LIFT, UPRIGHT, draw_lying, draw_until
 from manip_il.tasks.task import Limits, Start
 
-ROOM = 0.03  # within reach around the object at the start: dropped from where it was lifted, it stays there [m]
-
 
 @dataclass(frozen=True)
 class Lift(PickPlace):
@@ -24,6 +22,6 @@ class Lift(PickPlace):
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw the object on the table, lying or standing at any yaw, and the height of the goal over it."""
-        at, turn = draw_lying(rng, world, OBJECT, ROOM)
+        at, turn = draw_lying(rng, world, OBJECT)
         goal = draw_until(lambda: at + [0.0, 0.0, rng.uniform(*LIFT)], world.reach.has, world, "the goal")
         return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT)})

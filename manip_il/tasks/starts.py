@@ -25,17 +25,17 @@ _HALF = np.sqrt(0.5)
 _UPWARDS = (np.array([_HALF, 0.0, -_HALF, 0.0]), np.array([_HALF, _HALF, 0.0, 0.0]), UPRIGHT)  # turn x, y or z up
 
 
-def draw_lying(rng: np.random.Generator, world: World, name: str, room: float = 0.0) -> tuple[F64, F64]:
-    """Draw on which side an object lies or stands, where, and its yaw: (3,) [m] and wxyz (4,); room: see `has_room`.
+def draw_lying(rng: np.random.Generator, world: World, name: str) -> tuple[F64, F64]:
+    """Draw on which side an object lies or stands, where, and its yaw: (3,) [m] and wxyz (4,).
 
     Sides that look alike count once; a capsule lies. A cube turns within an eighth of a turn, as its faces are alike.
     """
     lengths = world.extents(name)
     if is_cube(world, name):
-        return draw_resting(rng, world, name, room), draw_yaw(rng)
+        return draw_resting(rng, world, name), draw_yaw(rng)
     sides = _sides(world.kind(name), lengths)
     up = sides[int(rng.integers(len(sides)))]
-    at = draw_resting_place(rng, world, name, lengths[up] / 2, room)
+    at = draw_resting_place(rng, world, name, lengths[up] / 2)
     turn = np.empty(4)
     mujoco.mju_mulQuat(turn, draw_yaw(rng, np.pi), _UPWARDS[up])
     return at, turn
