@@ -64,7 +64,7 @@ class Way(NamedTuple):
 
     @property
     def angle(self) -> float:
-        """How far the hand is to turn [rad]."""
+        """Angle that the hand is to turn [rad]."""
         return math.hypot(*self.turn)
 
 
