@@ -62,8 +62,8 @@ def jumping_labels() -> Iterator[None]:
     """The hand's target is where it will have to be, however far, and joint steps are as long as the IK's."""
     plain = ArmIK.step
 
-    def unclipped(ik: ArmIK, position: F64, rotation: F64, _longest: float) -> tuple[F64, float] | None:
-        return plain(ik, position, rotation, FAR)
+    def unclipped(ik: ArmIK, position: F64, rotation: F64, _longest: float, lean: float) -> tuple[F64, float] | None:
+        return plain(ik, position, rotation, FAR, lean)
 
     jobs._expert.cache_clear()
     unbounded: dict[str, Any] = {
