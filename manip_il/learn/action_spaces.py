@@ -40,6 +40,7 @@ from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
+from manip_il.robots.rotations import rotation_matrix, rotation_vector
 
 if TYPE_CHECKING:  # inverse kinematics takes a second to import
     from manip_il.robots.ik import ArmIK
@@ -109,8 +110,6 @@ class HandDelta:
 
     def encode(self, actions: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return motions of the hand (N, n) of actions (N, n), by forward kinematics."""
-        from manip_il.robots.ik import rotation_vector
-
         ik, targets = _arm_ik(self.robot), np.zeros_like(actions)
         for target, action, state in zip(targets, actions, states, strict=True):
             position, rotation = ik.ee_pose(state[ARM])
@@ -121,8 +120,6 @@ class HandDelta:
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
-        from manip_il.robots.ik import rotation_matrix
-
         ik, actions = _arm_ik(self.robot), np.empty_like(targets)
         for action, target, state in zip(actions, targets, states, strict=True):
             q, motion = np.asarray(state[ARM], np.float64), np.asarray(target, np.float64)

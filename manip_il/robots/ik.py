@@ -12,6 +12,7 @@ import qpsolvers
 from numpy.typing import NDArray
 
 from manip_il.robots.robot import Robot
+from manip_il.robots.rotations import rotation_vector
 from manip_il.robots.spec import arm_model
 
 F64 = NDArray[np.float64]
@@ -133,22 +134,6 @@ def _solve(problem: qpsolvers.Problem) -> F64 | None:
     lower, sense = np.full(len(upper), -_UNBOUNDED), np.zeros(len(upper), dtype=np.intc)
     x, _, exit_flag, _ = daqp.solve(problem.P, problem.q, matrix, upper, lower, sense)
     return x if exit_flag > 0 else None
-
-
-def rotation_vector(rotation: F64) -> F64:
-    """Return axis times angle [rad], at most pi long, of a rotation matrix (3, 3)."""
-    quaternion, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
-    return vector
-
-
-def rotation_matrix(vector: F64) -> F64:
-    """Return the rotation (3, 3) about an axis by an angle, given as their product (3,) [rad]."""
-    quaternion, matrix = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(9)
-    mujoco.mju_quatIntegrate(quaternion, vector, 1.0)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
 
 
 def _se3(position: F64, rotation: F64) -> mink.SE3:

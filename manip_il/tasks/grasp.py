@@ -234,20 +234,3 @@ def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
 def angle_between(a: F64, b: F64) -> float:
     """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
     return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))
-
-
-def rotation_vector(rotation: F64) -> F64:
-    """Return the axis of a rotation (3, 3) times its angle, (3,) [rad]."""
-    quaternion, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
-    return vector
-
-
-def turned_by(vector: F64) -> F64:
-    """Return the rotation whose `rotation_vector` (3,) [rad] this is, (3, 3)."""
-    angle = math.hypot(*vector)
-    quaternion, rotation = np.empty(4), np.empty(9)
-    mujoco.mju_axisAngle2Quat(quaternion, vector / max(angle, 1e-12), angle)
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    return rotation.reshape(3, 3)

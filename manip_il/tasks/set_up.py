@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import rotation_matrix, rotation_vector
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import lie_of, rotation_vector, turned_by
+from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.peg import (
     AT_ANGLE,
@@ -146,7 +147,7 @@ def move(world: World, way: Way, missing: float, sideways_at: float, exact: bool
     turn = TURN * min(1.0, max(0.25, 1.0 - missing / 0.06))
     rotation = way.rotation
     if exact:
-        sideways, rotation = FARTHER * sideways, turned_by((FARTHER - 1) * way.turn) @ rotation
+        sideways, rotation = FARTHER * sideways, rotation_matrix((FARTHER - 1) * way.turn) @ rotation
     position = world.ee.position + np.array([*(sideways * way.off), max(missing, -SLOW)])
     step = min(FAST, SLOW + max(0.0, way.error - 0.02))
     return Target(position, rotation, CLOSED, max_step=step, max_turn=turn, exact=exact)
