@@ -19,7 +19,7 @@ ARG TORCH_BACKEND=
 COPY pyproject.toml requirements.lock ./
 RUN /opt/uv/bin/uv pip compile --quiet --no-header --no-annotate --python /usr/bin/python3 \
         ${TORCH_BACKEND:+--torch-backend=$TORCH_BACKEND} --no-emit-package cmake --no-emit-package triton \
-        --constraints requirements.lock pyproject.toml --output-file runtime.txt
+        --extra so101 --constraints requirements.lock pyproject.toml --output-file runtime.txt
 
 # Those packages with the lock's hashes; one that the lock has not ends the build. Tests and headers go again.
 FROM uv AS packages

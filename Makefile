@@ -30,17 +30,21 @@ setup: .venv/.installed  ## the environment, in .venv; as root also OpenGL and F
 	$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e .
 	touch $@
 
+.venv/.robots: robots.lock .venv/.installed
+	$(UV) pip install --quiet --python $(BIN)/python --no-deps --require-hashes -r robots.lock
+	touch $@
+
 demo: setup  ## the whole story, small: runs/quickstart/report.html
 	$(BIN)/manip-il quickstart --output_dir=runs/quickstart $(DEMO)
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
 # A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
 TWO := -n 2 --dist loadfile --no-loadscope-reorder
-test: setup  ## every test
+test: setup .venv/.robots  ## every test
 	@.ci/system browser sshd
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO)
 
-test-fast: setup  ## the tests that take seconds and need no OpenGL
+test-fast: setup .venv/.robots  ## the tests that take seconds and need no OpenGL
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO) -m "not slow and not gl"
 
 FUZZ ?= 20000
@@ -70,7 +74,7 @@ bench: setup  ## every speed ratio
 
 lock: | $(filter .tools%,$(UV))  ## choose the versions anew
 	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
-	    --python $(PYTHON) --extra dev --extra ray --extra tensorboard --extra export pyproject.toml -o requirements.lock
+	    --python $(PYTHON) --extra dev --extra so101 --extra ray --extra tensorboard --extra export pyproject.toml -o requirements.lock
 
 clean:  ## remove what tools left behind; keeps .venv, runs and datasets
 	rm -rf build *.egg-info .pytest_cache .ruff_cache .hypothesis .import_linter_cache

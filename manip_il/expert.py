@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
+from manip_il.robots.rotations import angle_between
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.grasp import angle_between
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Target, objects_in
 

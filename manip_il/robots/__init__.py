@@ -3,4 +3,4 @@
 from pathlib import Path
 
 HERE = Path(__file__).parent
-ROBOTS = {"panda": HERE / "panda.yaml", "fetch": HERE / "fetch.yaml"}
+ROBOTS = {"panda": HERE / "panda.yaml", "fetch": HERE / "fetch.yaml", "so101": HERE / "so101.yaml"}

@@ -7,6 +7,7 @@ the distance is measured at which the fingers come to rest. So parallel, hinged 
 from __future__ import annotations
 
 import bisect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.robots.geometry import distance, nearest
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
 F64 = NDArray[np.float64]
+Geoms = Sequence[Sequence[int]]  # of each finger
 TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # of the sweep from closed to open
 _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
-_FAR = 1.0  # longest distance between fingers that is measured [m]
 _PAD = 0.004  # what is this much farther from the other finger than the nearest is no pad [m]
+_LOPSIDED = 0.004  # the middle of the pads moves by more where only one of two fingers moves [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -33,11 +36,13 @@ class Sweep:
     """Measured relation of command and opening.
 
     shares: of the way from closed to open, commanded and measured, rising, (c,). openings: between the pads at rest
-    [m], rising, (c,). pads: for each finger its geoms' places among the finger's, the nearest to the other one first.
+    [m], rising, (c,). middles: of the pads along the hand's y [m], (c,); all 0 where both sides move alike. pads: for
+    each finger its geoms' places among the finger's, the nearest to the other one first.
     """
 
     shares: F64
     openings: F64
+    middles: F64
     pads: tuple[tuple[int, ...], ...]
 
 
@@ -54,11 +59,12 @@ class Gripper:
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()  # numpy's interp takes 3 us
-        fingers = [_finger_geoms(model, prefix + name) for name in config.fingers]
+        fingers = finger_geoms(model, config.fingers, prefix)
         self.geoms = frozenset(geom for finger in fingers for geom in finger)
         self.pads = tuple(
             tuple(finger[i] for i in pads) for finger, pads in zip(fingers, self._sweep.pads, strict=True)
         )
+        self.lopsided = bool(self._sweep.middles.any())
         self.least, self.most = float(self._sweep.openings[0]), float(self._sweep.openings[-1])
 
     def opening(self, qpos: F64) -> float:
@@ -73,6 +79,13 @@ class Gripper:
         """Return the actuators' commands for an opening [m], (g,)."""
         share = np.interp(opening, self._sweep.openings, self._sweep.shares)
         return self._closed + share * self._travel
+
+    def middle(self, opening: float) -> float:
+        """Return where the middle between the pads is along the hand's y, at an opening [m]; 0 where all fingers move.
+
+        Where one jaw stands and the other turns or slides, what is held ends beside the standing one.
+        """
+        return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
 
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) -> bool:
         """Return whether every finger touches one of an object's geoms. Needs kinematics to be up to date in `data`."""
@@ -97,36 +110,66 @@ def sweep(robot: Robot) -> Sweep:
         data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = value
     q = np.array([model.joint(name).qposadr[0] for name in config.joints])
     ctrl = np.array([model.actuator(name).id for name in config.joints])
-    fingers = [_finger_geoms(model, name) for name in config.fingers]
+    fingers = finger_geoms(model, config.fingers)
     closed, travel = np.asarray(config.closed), np.subtract(config.open, config.closed)
     data.qpos[q] = closed
-    shares, openings, pads = [], [], ()
+    shares, poses = [], []
     for share in np.linspace(0, 1, _COMMANDS):
         data.ctrl[ctrl] = closed + share * travel
         mujoco.mj_step(model, data, _SETTLE)
-        mujoco.mj_kinematics(model, data)
-        gaps = _gaps(model, data, fingers)
         shares.append(float(((data.qpos[q] - closed) / travel).mean()))
-        openings.append(min(float(gap.min()) for gap in gaps))
-        pads = pads or tuple(_pads(gap) for gap in gaps)
+        poses.append(data.qpos.copy())
+    jaws = _apart(*_at(model, data, poses[-1]), fingers)
+    if not all(jaws):
+        raise UsageError(
+            f"robot {robot.name}: the fingers touch where they are open; look at gripper.open and gripper.fingers"
+        )
+    gaps = [_gaps(*_at(model, data, pose), jaws) for pose in poses]
+    least = [min(float(gap.min()) for gap in one) for one in gaps]
+    shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # a linkage's links pass another
+    pads = [[jaw[i] for i in _pads(gap)] for jaw, gap in zip(jaws, gaps[shut], strict=True)]
+    measured = [_opening(*_at(model, data, pose), pads) for pose in poses[shut:]]
+    openings, shares = [opening for opening, _ in measured], shares[shut:]
+    middles = np.array([middle for _, middle in measured])
     if openings[-1] - openings[0] < _LEAST_TRAVEL or (np.diff(openings) <= 0).any() or (np.diff(shares) <= 0).any():
         raise UsageError(
             f"robot {robot.name}: the fingers stand {openings[0]:.3f} m apart closed and {openings[-1]:.3f} m open; "
             "expected them to come apart all the way: look at gripper.closed, gripper.open and gripper.fingers"
         )
-    return Sweep(np.array(shares), np.array(openings), pads)
+    if np.ptp(middles) < _LOPSIDED:
+        middles = np.zeros(len(middles))
+    places = tuple(tuple(finger.index(pad) for pad in own) for finger, own in zip(fingers, pads, strict=True))
+    return Sweep(np.array(shares), np.array(openings), middles, places)
 
 
-def _gaps(model: mujoco.MjModel, data: mujoco.MjData, fingers: list[tuple[int, ...]]) -> list[F64]:
+def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    data.qpos[:] = pose
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
+def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[list[int]]:
+    """The geoms of each finger that touch no other one when all are open: not those around a jaw's hinge."""
+    gaps = _gaps(model, data, fingers)
+    return [[geom for geom, gap in zip(*one, strict=True) if gap > 0] for one in zip(fingers, gaps, strict=True)]
+
+
+def _gaps(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[F64]:
     """For each finger, how far each of its geoms is from the other fingers [m]."""
     gaps = []
     for finger in fingers:
         others = [geom for other in fingers if other is not finger for geom in other]
-        distance = [
-            min(mujoco.mj_geomDistance(model, data, one, other, _FAR, None) for other in others) for one in finger
-        ]
-        gaps.append(np.array(distance))
+        gaps.append(
+            np.array([min((distance(model, data, one, other) for other in others), default=0.0) for one in finger])
+        )
     return gaps
+
+
+def _opening(model: mujoco.MjModel, data: mujoco.MjData, pads: Geoms) -> tuple[float, float]:
+    """Distance between the pads, and where the middle between them is along y of `ee` [m]."""
+    gap = min(float(one.min()) for one in _gaps(model, data, pads))
+    middle = nearest(model, data, pads)[1].mean(axis=0) - data.site("ee").xpos
+    return gap, float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle)
 
 
 def _pads(gaps: F64) -> tuple[int, ...]:
@@ -134,15 +177,21 @@ def _pads(gaps: F64) -> tuple[int, ...]:
     return tuple(int(i) for i in order if gaps[i] <= gaps.min() + _PAD)
 
 
-def _finger_geoms(model: mujoco.MjModel, body: str) -> tuple[int, ...]:
-    """Return the ids of the geoms of a finger and of what hangs on it that can touch things."""
-    root = model.body(body).id
-    bodies = {root}
-    for child in range(root + 1, model.nbody):
-        if model.body_parentid[child] in bodies:
-            bodies.add(child)
-    touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    geoms = tuple(i for i in range(model.ngeom) if model.geom_bodyid[i] in bodies and touching[i])
-    if not geoms:
-        raise UsageError(f"finger {body!r} has no geom that can touch anything; expected at least one")
-    return geoms
+def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:
+    """Return for each finger the ids of its geoms that can touch things, and of what hangs on it but another finger.
+
+    prefix: of the bodies' names. Raises `UsageError` for a finger without one.
+    """
+    roots = {model.body(prefix + name).id: place for place, name in enumerate(fingers)}
+    owners, touching = dict(roots), (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    for body in range(1, model.nbody):
+        if body not in owners and int(model.body_parentid[body]) in owners:
+            owners[body] = owners[int(model.body_parentid[body])]
+    found = [
+        tuple(i for i in range(model.ngeom) if owners.get(int(model.geom_bodyid[i])) == place and touching[i])
+        for place in range(len(fingers))
+    ]
+    for name, geoms in zip(fingers, found, strict=True):
+        if not geoms:
+            raise UsageError(f"finger {name!r} has no geom that can touch anything; expected at least one")
+    return found

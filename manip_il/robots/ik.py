@@ -12,15 +12,12 @@ import qpsolvers
 from numpy.typing import NDArray
 
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import rotation_vector
+from manip_il.robots.rotations import rotation_vector, yaw_ahead
 from manip_il.robots.spec import arm_model
 
 F64 = NDArray[np.float64]
 
 _POSITION_COST = 1.0  # [1/m]
-_ORIENTATION_COST = 0.2  # [1/rad]
-_LEANING_COST = 0.04  # the same of a hand that leans to get farther [1/rad]
-_POSTURE_COST = 0.01  # [1/rad]; without it the label depends on the path that led to the posture
 _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
@@ -41,8 +38,10 @@ class ArmIK:
         home = np.zeros(model.nq)
         home[self._address] = robot.home
         self._site = model.site("ee").id
-        self._frame = mink.FrameTask("ee", "site", _POSITION_COST, _ORIENTATION_COST, lm_damping=_LM_DAMPING)
-        posture = mink.PostureTask(model, cost=_POSTURE_COST)
+        self._costs = costs = robot.costs
+        self._frame = mink.FrameTask("ee", "site", _POSITION_COST, costs.orientation, lm_damping=_LM_DAMPING)
+        # without this the label depends on the path that led to the posture
+        posture = mink.PostureTask(model, cost=costs.posture)
         posture.set_target(home)
         self._tasks = [self._frame, posture]
         joints = [model.joint(name) for name in robot.joints]
@@ -51,6 +50,22 @@ class ArmIK:
         self._qpos = np.zeros(model.nq)
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
+        self._robot, self._shoulder = robot, joints[0].id
+        self._links = [int(model.jnt_bodyid[joint.id]) for joint in joints[2:]]
+
+    def ahead(self, position: F64) -> float:
+        """Return the yaw that counts as none for a hand at a position (3,) [m]; [rad]."""
+        return yaw_ahead(self._robot, self._configuration.data.xanchor[self._shoulder], position)
+
+    def smallest_singular_value(self, q: F64) -> float:
+        """Return how far a posture (arm,) [rad] is from one in which the hand cannot be moved some way."""
+        self.ee_pose(q)
+        return float(np.linalg.svd(self._site_jacobian(), compute_uv=False)[-1])
+
+    def lowest_link(self, q: F64) -> float:
+        """Return the height of the lowest joint beyond the shoulder in a posture (arm,) [rad]; [m]."""
+        self.ee_pose(q)
+        return float(self._configuration.data.xpos[self._links, 2].min()) if self._links else 0.0
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
@@ -66,7 +81,8 @@ class ArmIK:
         Returns the joint displacement [rad] (arm,), shortened as a whole where a joint's is too long, and how much
         of the weighted pose error it leaves, as a share; None where the quadratic program has no solution.
         """
-        weight = _ORIENTATION_COST + lean * (_LEANING_COST - _ORIENTATION_COST)
+        costs = self._costs
+        weight = costs.orientation + lean * (costs.leaning - costs.orientation)
         self._frame.set_target(_se3(position, rotation))
         self._frame.set_orientation_cost(weight)
         before = self._pose_error(position, rotation, weight)

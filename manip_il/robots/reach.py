@@ -18,13 +18,13 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots import HERE
+from manip_il.robots.meeting import CLEARANCE, Body
 from manip_il.robots.robot import Robot
-from manip_il.robots.spec import arm_spec
+from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
 
 if TYPE_CHECKING:
     from manip_il.robots.ik import ArmIK
@@ -33,15 +33,15 @@ F64 = NDArray[np.float64]
 _CELL = 0.05  # of the grid [m]
 _BEYOND = 0.3  # the map goes on around the workspace by this much [m]
 _ABOVE = 0.05  # and above it [m]
-_VERSION = 1  # of how the map is computed
+_VERSION = 2  # of how the map is computed
 _STEPS = 80  # of inverse kinematics, at most
 _NEAR, _ANGLE = 1e-3, 0.05  # where it has arrived [m], and what a radian counts for beside that [m/rad]
 ARRIVES = 0.004  # what the hand may miss a pose by and still be there [m]
 STRETCH = 0.02  # it still gets there less exactly [m]
 _LEAN = 0.13  # how much farther a hand that leans gets, sideways [m]
+_MOST_LEAN = 1.0  # of the hand of an arm that cannot hold it upright [rad]
 _BLOCKED = 0.1  # what a posture in which the robot meets itself counts for [m]
 _BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)  # what a file that is no map raises
-_CLEARANCE = 0.02  # parts that are nearer than that meet [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def _keep(reach: Reach, path: Path) -> None:
 
 def _key(robot: Robot) -> str:
     """Hash what a map follows from: the robot's files, and the constants of this file."""
-    constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, _CLEARANCE)
+    constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, CLEARANCE)
     return hashlib.sha256(repr(constants).encode() + robot.content()).hexdigest()[:16]
 
 
@@ -146,35 +146,13 @@ def _solve(robot: Robot) -> Reach:
     half = space.half_width + _BEYOND
     origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
     shape = tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
-    errors, body = np.empty(shape), _Body(robot)
+    errors, body = np.empty(shape), Body(robot)
     for index in np.ndindex(*shape):
-        miss, q = _miss(robot, ik, origin + _CELL * np.array(index))
+        point = origin + _CELL * np.array(index)
+        point[2] = max(point[2], robot.ee.lowest)  # no hand gets to the table itself
+        miss, q = _miss(robot, ik, point)
         errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
     return Reach(origin, errors.astype(np.float32).astype(np.float64))
-
-
-class _Body:
-    """The whole robot, to see whether parts of it meet that are apart at home."""
-
-    def __init__(self, robot: Robot):
-        self._model = arm_spec(robot).compile()
-        self._model.geom_margin[:] = _CLEARANCE
-        self._data = mujoco.MjData(self._model)
-        self._q = np.array([self._model.joint(name).qposadr[0] for name in robot.joints])
-        gripper = [self._model.joint(name).qposadr[0] for name in robot.gripper.joints]
-        self._data.qpos[gripper] = robot.gripper.open
-        self._at_home = frozenset[frozenset[int]]()
-        self._at_home = self._meeting(np.asarray(robot.home))
-
-    def meets_itself(self, q: F64) -> bool:
-        return not self._meeting(q) <= self._at_home
-
-    def _meeting(self, q: F64) -> frozenset[frozenset[int]]:
-        self._data.qpos[self._q] = q
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_collision(self._model, self._data)
-        bodies = self._model.geom_bodyid
-        return frozenset(frozenset((int(bodies[c.geom1]), int(bodies[c.geom2]))) for c in self._data.contact)
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
@@ -182,12 +160,11 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
     An angle counts as a length.
     """
-    down, q, limits = np.diag([1.0, -1.0, -1.0]), np.asarray(robot.home, dtype=np.float64), ik.limits
-    miss = np.inf
+    yaw, q, limits = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits
+    down, miss = hand_down(yaw), np.inf
     for _ in range(_STEPS):
         ee, rotation = ik.ee_pose(q)
-        angle = np.arccos(np.clip((np.trace(down.T @ rotation) - 1) / 2, -1.0, 1.0))
-        miss = float(np.linalg.norm(position - ee) + _ANGLE * angle)
+        miss = float(np.linalg.norm(position - ee) + _ANGLE * _angle_off(robot, rotation, yaw))
         if miss < _NEAR:
             break
         step = ik.step(position, down, robot.max_joint_step)
@@ -195,3 +172,10 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
             break
         q = np.clip(q + step[0], limits[:, 0], limits[:, 1])
     return miss, q
+
+
+def _angle_off(robot: Robot, hand: F64, yaw: float) -> float:
+    """How far a hand (3, 3) is from pointing down at a yaw [rad]; one that leans anyway may lean a good deal."""
+    if robot.leans:
+        return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
+    return float(np.arccos(np.clip((np.trace(hand_down(yaw).T @ hand) - 1) / 2, -1.0, 1.0)))

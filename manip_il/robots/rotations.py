@@ -1,10 +1,14 @@
-"""Rotation matrices from and to rotation vectors."""
+"""Rotations of a hand: matrices from and to rotation vectors and yaws, and angles between them."""
 
 from __future__ import annotations
+
+import math
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from manip_il.robots.robot import Robot
 
 F64 = NDArray[np.float64]
 
@@ -23,3 +27,48 @@ def rotation_matrix(vector: F64) -> F64:
     mujoco.mju_quatIntegrate(quaternion, vector, 1.0)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)
+
+
+def hand_down(yaw: float) -> F64:
+    """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+
+
+def yaw_ahead(robot: Robot, shoulder: F64, position: F64) -> float:
+    """Return the yaw that counts as none for a robot's hand at a position (3,), its shoulder at (3,) [m]; [rad]."""
+    if robot.yaw == "world":
+        return 0.0
+    return math.atan2(position[1] - shoulder[1], position[0] - shoulder[0])
+
+
+def angle_ahead(rotation: F64) -> float:
+    """Return the yaw of the x axis of a rotation (3, 3) [rad]."""
+    return math.atan2(rotation[1, 0], rotation[0, 0])
+
+
+def angle_across(rotation: F64) -> float:
+    """Return the yaw of a hand (3, 3) by the way that its fingers move, however it leans [rad]."""
+    return math.atan2(rotation[0, 1], -rotation[1, 1])
+
+
+def off_yaw(rotation: F64, yaw: float) -> float:
+    """Return how far a hand (3, 3) is from a yaw, however it leans [rad]."""
+    return abs(math.remainder(angle_across(rotation) - yaw, 2 * math.pi))
+
+
+def angle_off_vertical(rotation: F64) -> float:
+    """Return how far a hand (3, 3) leans from pointing down [rad]."""
+    return math.acos(min(1.0, max(-1.0, -float(rotation[2, 2]))))
+
+
+def angle_from_down(rotation: F64, yaw: float) -> float:
+    """Return `angle_between` a rotation (3, 3) and `hand_down(yaw)` [rad]."""
+    (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
+    trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
+    return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))
+
+
+def angle_between(a: F64, b: F64) -> float:
+    """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
+    return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))

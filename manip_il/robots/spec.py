@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import fnmatch
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from manip_il.errors import UnknownName, UsageError
+from manip_il.errors import UnknownName
+from manip_il.robots.files import ModelFiles
+from manip_il.robots.motors import calm, motorise
+from manip_il.robots.parts import GRIPPER, GripperConfig
 from manip_il.robots.robot import Robot
 
-_KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
-_FORCE = 200.0  # of an arm joint [N m]
-_ARMATURE, _DAMPING = 0.1, 1.0  # of an arm joint [kg m^2], [N m s/rad]
-_FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
-_HINGE_GAINS = (20.0, 0.5, 10.0)  # kp [N m/rad], kv [N m s/rad], torque [N m] of a turning one
-_FINGER_ARMATURE, _FINGER_DAMPING = 0.2, 10.0  # [kg], [N s/m]
-_HINGE_ARMATURE, _HINGE_DAMPING = 0.005, 0.1  # [kg m^2], [N m s/rad]
+
+def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) -> mujoco.MjSpec:
+    """Return a robot's model, its gripper's on its hand, without what a model brings for a world of its own.
+
+    Raises `UsageError` naming the file that MuJoCo cannot read, or the body that is not there; robot: its name.
+    """
+    spec = files.load(robot)
+    _strip(spec)
+    if gripper.files is None:
+        return spec
+    require(robot, "body", (hand,), spec.bodies)
+    hand_spec = gripper.files.load(robot)
+    _strip(hand_spec)
+    mount = spec.body(hand).add_frame(pos=gripper.position, quat=gripper.quaternion)
+    spec.attach(hand_spec, prefix=GRIPPER, frame=mount)
+    return spec
 
 
 def arm_spec(robot: Robot) -> mujoco.MjSpec:
@@ -26,12 +39,15 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
     Raises `UsageError` naming a joint, body or file that is not there, and what is.
     """
-    spec = _load(robot)
-    _require(robot, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
-    _require(robot, "body", (robot.ee.body, *robot.gripper.fingers), spec.bodies)
-    _strip(spec)
-    _fix_joints(robot, spec)
-    _motorise(robot, spec)
+    spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper)
+    require(robot.name, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
+    require(robot.name, "body", (robot.hand, robot.ee.body, *robot.gripper.fingers), spec.bodies)
+    linked = linkage(spec, robot)
+    _fix_joints(robot, spec, linked)
+    if linked:
+        _keep_links_apart(spec, robot.hand)
+        calm(spec, linked)
+    motorise(robot, spec)
     ee = robot.ee
     spec.body(ee.body).add_site(name="ee", pos=ee.position, quat=ee.quaternion, size=[0.004] * 3, group=4)
     for body in spec.bodies:
@@ -48,39 +64,46 @@ def arm_model(robot: Robot) -> mujoco.MjModel:
     spec = arm_spec(robot)
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    for name in robot.gripper.joints:
+    for one in [*spec.tendons, *spec.equalities]:
+        spec.delete(one)
+    for name in (*robot.gripper.joints, *linkage(spec, robot)):
         spec.delete(spec.joint(name))
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     return spec.compile()
 
 
-def _require(robot: Robot, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
-    known = [one.name for one in there if one.name != "world"]
+def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -> None:
+    """Raise `UnknownName` for a name that a model has not; kind: of what it names."""
+    known = [one.name for one in there if one.name and one.name != "world"]
     for name in names:
         if name not in known:
-            raise UnknownName(f"{kind} in the YAML of robot {robot.name}:", name, known)
+            raise UnknownName(f"{kind} in the YAML of robot {robot}:", name, known)
 
 
-def _load(robot: Robot) -> mujoco.MjSpec:
-    """Read the model with its includes and meshes. Raises `UsageError` where MuJoCo cannot."""
-    try:
-        text = robot.model.read_text()
-        if robot.includes is None and robot.meshes is None:
-            return mujoco.MjSpec.from_file(str(robot.model))
-        include = {one.name: one.read_bytes() for one in sorted((robot.includes or robot.model.parent).glob("*.xml"))}
-        assets = {name: one.read_bytes() for name, one in robot.mesh_files().items()}
-        spec = mujoco.MjSpec.from_string(text, include=include, assets=assets)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"robot {robot.name}: cannot read {robot.model}: {' '.join(str(error).split())}") from None
-    spec.meshdir = ""
-    return spec
+def linkage(spec: mujoco.MjSpec, robot: Robot) -> list[str]:
+    """Return the names of the gripper's joints that nothing drives: those of a linkage, below the hand."""
+    apart = {*robot.joints, *robot.gripper.joints, *robot.fixed}
+    below = spec.body(robot.hand).find_all("joint")
+    return [joint.name for joint in below if joint.parent.name != robot.hand and joint.name not in apart]
 
 
-def _fix_joints(robot: Robot, spec: mujoco.MjSpec) -> None:
+def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
+    """Let no part of a linkage touch another: they overlap in most models, and would jam."""
+    below = spec.body(hand).find_all("body")
+    for number, body in enumerate(below):
+        body.name = body.name or f"{hand} part {number}"
+    bodies = [hand, *(body.name for body in below)]
+    there = {frozenset((one.bodyname1, one.bodyname2)) for one in spec.excludes}
+    for one, other in itertools.combinations(bodies, 2):
+        if frozenset((one, other)) not in there:
+            spec.add_exclude(bodyname1=one, bodyname2=other)
+
+
+def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
     """Delete joints that are neither the arm's nor the gripper's, their bodies left where the YAML says."""
-    kept = {*robot.joints, *robot.gripper.joints}
-    known = {joint.name for joint in spec.joints} - kept
+    kept = {*robot.joints, *robot.gripper.joints, *linked}
+    known = {joint.name for joint in spec.joints} - kept | set(linked)
     for name in robot.fixed:
         if name not in known:
             raise UnknownName(f"joint in 'fixed' of robot {robot.name}:", name, known)
@@ -88,7 +111,7 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec) -> None:
         _stand_at(joint, robot.fixed.get(joint.name, 0.0))
         spec.delete(joint)
     if robot.base is not None:
-        root = spec.body(robot.ee.body)
+        root = spec.body(robot.hand)
         while root.parent.name != "world":
             root = root.parent
         root.pos = np.array(robot.base)
@@ -130,30 +153,6 @@ def _foreign(spec: mujoco.MjSpec) -> Iterator[Any]:
     yield from [texture for texture in spec.textures if texture.type == sky or texture.name not in used]
     for kind in ("actuators", "sensors", "cameras", "lights", "sites"):
         yield from list(getattr(spec, kind))
-
-
-def _motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
-    """Give every joint position control in place of the model's motors."""
-    for name, kp in zip(robot.joints, robot.gains, strict=True):
-        joint = spec.joint(name)
-        joint.damping, joint.stiffness, joint.armature = np.array([_DAMPING, 0, 0]), np.zeros(3), _ARMATURE
-        _position_actuator(spec, joint, (kp, kp * _KV_PER_KP, _FORCE))
-    for name in robot.gripper.joints:
-        joint = spec.joint(name)
-        slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-        joint.damping = np.array([_FINGER_DAMPING if slides else _HINGE_DAMPING, 0, 0])
-        joint.armature = _FINGER_ARMATURE if slides else _HINGE_ARMATURE
-        _position_actuator(spec, joint, _FINGER_GAINS if slides else _HINGE_GAINS)
-
-
-def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
-    """PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
-    kp, kv, force = gains
-    actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    actuator.set_to_position(kp=kp, kv=kv)
-    actuator.forcelimited, actuator.forcerange = True, [-force, force]
-    if joint.range[0] < joint.range[1]:
-        actuator.ctrllimited, actuator.ctrlrange = True, joint.range
 
 
 def _paint(robot: Robot, spec: mujoco.MjSpec) -> None:

@@ -12,6 +12,7 @@ from manip_il.stock import table as stock
 from manip_il.tasks import NAMES
 
 DT_SIM = 0.002  # longest step of physics [s]
+LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
 MOST_HZ = round(1 / DT_SIM)
 
 
@@ -38,9 +39,9 @@ class EnvConfig:
         if self.robot == stock.ROBOT:
             stock.take_limits(self)
         self._take_object()
-        self._take_limits()
         if not 1 <= self.control_hz <= MOST_HZ:
             raise UsageError(f"control_hz is {self.control_hz}; expected 1 to {MOST_HZ}")
+        self._take_limits()
         if not 0 < self.tolerance < 1:
             raise UsageError(f"tolerance is {self.tolerance} m; expected between 0 and 1")
         if self.horizon > LONGEST_EPISODE:
@@ -65,8 +66,14 @@ class EnvConfig:
         from manip_il.tasks.table import get_task  # here, as help needs no simulator
 
         limits = get_task(self.task, self.object).limits
-        for name in ("tolerance", "success_steps", "horizon"):
-            object.__setattr__(self, name, getattr(self, name) or getattr(limits, name))
+        rate = self.control_hz / LIMITS_HZ
+        found = {
+            "tolerance": limits.tolerance,
+            "success_steps": round(limits.success_steps * rate),
+            "horizon": round(limits.horizon * rate),
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, getattr(self, name) or value)
 
     @property
     def physics_steps(self) -> int:

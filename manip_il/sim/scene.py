@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 from functools import cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import arm_spec
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
@@ -26,6 +29,8 @@ TABLE = "table"  # the name of its geom
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 _FLOOR = -0.4  # [m]
+_TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
+_ON_TABLE = 0.02  # of a robot's lowest point from the table's top: it stands there [m]
 _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
@@ -61,7 +66,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     _add_look(spec)
     _add_table(spec, robot)
     arm = arm_spec(robot)
-    _add_pedestal(spec, arm)
+    _add_pedestal(spec, arm, robot)
     _add_wrist_camera(arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_front_camera(spec, robot)
@@ -94,9 +99,29 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene
         arm_q=np.array([joint.qposadr[0] for joint in joints], dtype=np.int64),
         arm_ctrl=np.array([model.actuator(PREFIX + name).id for name in robot.joints], dtype=np.int64),
         ee_site=model.site(PREFIX + "ee").id,
+        shoulder=joints[0].id,
+        yaws=_yaws(robot, model, joints[-1]),
         nominal=variation.nominal(model, objects),
         shape=shape,
     )
+
+
+def _yaws(robot: Robot, model: mujoco.MjModel, roll: Any) -> tuple[float, float]:
+    """Least and greatest yaw of the hand, off the one that counts as none, that its last joint turns it to [rad]."""
+    if robot.yaw == "world" or not roll.limited[0]:
+        return -np.inf, np.inf
+    data, yaws = mujoco.MjData(model), []
+    for turn in (0.0, _TURN):
+        for name, value in zip(robot.joints, robot.home, strict=True):
+            data.joint(PREFIX + name).qpos[0] = value
+        data.joint(roll.name).qpos[0] += turn
+        mujoco.mj_kinematics(model, data)
+        ee = data.site(PREFIX + "ee")
+        ahead = yaw_ahead(robot, data.xanchor[model.joint(PREFIX + robot.joints[0]).id], ee.xpos)
+        yaws.append(math.remainder(angle_across(ee.xmat.reshape(3, 3)) - ahead, 2 * np.pi))
+    sign = np.sign(math.remainder(yaws[1] - yaws[0], 2 * np.pi))
+    ends = [yaws[0] + sign * (end - robot.home[-1]) for end in roll.range]
+    return min(ends) + _SPARE_TURN, max(ends) - _SPARE_TURN
 
 
 def _objects(model: mujoco.MjModel) -> dict[str, Object]:
@@ -161,9 +186,8 @@ def _add_look(spec: mujoco.MjSpec) -> None:
 
 def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     box, plane = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
-    x, y = robot.workspace.centre
-    half = np.array(_TABLE_HALF)
-    middle = [x + _TABLE_BEYOND, y, -half[2]]
+    y, half = robot.workspace.centre[1], np.array(_TABLE_HALF)
+    middle = [_table_x(robot), y, -half[2]]
     spec.worldbody.add_geom(
         name=TABLE, type=box, size=half, pos=middle, material="table", friction=[1.0, 0.005, 0.0001]
     )
@@ -175,17 +199,23 @@ def _add_table(spec: mujoco.MjSpec, robot: Robot) -> None:
     spec.worldbody.add_geom(name="floor", type=plane, size=[4, 4, 0.1], pos=[0, 0, _FLOOR], material="floor")
 
 
-def _add_pedestal(spec: mujoco.MjSpec, arm: mujoco.MjSpec) -> None:
-    """From the floor to the robot's lowest point, where that is in the air."""
+def _table_x(robot: Robot) -> float:
+    return robot.workspace.centre[0] + _TABLE_BEYOND
+
+
+def _add_pedestal(spec: mujoco.MjSpec, arm: mujoco.MjSpec, robot: Robot) -> None:
+    """From the floor to the robot's lowest point, where that is in the air and does not stand on the table."""
     model = arm.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
-    root = [i for i in touching if model.body_weldid[model.geom_bodyid[i]] == 0]
-    corners = np.array([_corner_lows(model, data, i) for i in root or touching])
+    fixed = [i for i in range(model.ngeom) if model.body_weldid[model.geom_bodyid[i]] == 0]
+    root = [i for i in touching if i in fixed]
+    corners = np.array([_corner_lows(model, data, i) for i in root or fixed or touching])
     lowest = float(corners[:, 2].min())
     height = lowest - 0.01 - _FLOOR
-    if height <= 0.02:
+    on_table = abs(lowest) < _ON_TABLE and abs(corners[:, 0].mean() - _table_x(robot)) < _TABLE_HALF[0]
+    if height <= 0.02 or on_table:
         return
     x, y = corners[:, :2].mean(axis=0)
     spec.worldbody.add_geom(
@@ -199,12 +229,7 @@ def _add_pedestal(spec: mujoco.MjSpec, arm: mujoco.MjSpec) -> None:
 
 def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
     """The middle of a geom in x and y, and its lowest z [m], (3,); of its box, where it is no mesh."""
-    mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-    points = middle + half * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    if mesh >= 0:  # turned as a mesh is in its geom, its box reaches farther down than it does
-        start = model.mesh_vertadr[mesh]
-        points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
-    placed = data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
+    placed = outline(model, data, geom)
     return np.append((placed.max(axis=0) + placed.min(axis=0))[:2] / 2, placed[:, 2].min())
 
 

@@ -21,6 +21,7 @@ from manip_il.robots.action_space import ActionSpace
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.reach import Reach, reach_of
 from manip_il.robots.robot import Robot
+from manip_il.robots.rotations import angle_across, angle_ahead, angle_from_down, off_yaw, yaw_ahead
 from manip_il.sim import variation as variations
 from manip_il.sim.shape import draws_shape
 from manip_il.sim.variation import Object
@@ -29,6 +30,7 @@ F64 = NDArray[np.float64]
 T = TypeVar("T")
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # of what stands around an object, in height and sideways: a hand may meet it [m]
+_MOST_TURNS = 4  # that look alike, to either side
 GOAL = "goal"  # the mocap body that shows where things are to go
 
 
@@ -44,8 +46,9 @@ class Scene:
     """A robot and a task's objects as one compiled model, and the addresses of what is named in it.
 
     task: its name. arm_q, arm_ctrl: indices of the arm's joints into qpos and ctrl. objects: free bodies
-    by name. ee_site: id of the site `ee`. nominal: the variation that the model has as compiled, (v,).
-    shape: of its object, as `EnvConfig.object`.
+    by name. ee_site, shoulder: ids of the site `ee` and of the arm's first joint. yaws: least and greatest of the hand,
+    off the one that counts as none [rad]. nominal: the variation that the model has as compiled, (v,). shape: of its
+    object, as `EnvConfig.object`.
     """
 
     robot: Robot
@@ -57,6 +60,8 @@ class Scene:
     arm_q: NDArray[np.int64]
     arm_ctrl: NDArray[np.int64]
     ee_site: int
+    shoulder: int
+    yaws: tuple[float, float]
     nominal: F64
     shape: str = ""
 
@@ -192,6 +197,61 @@ class World:
     def most_opening(self) -> float:
         """Opening between the pads of the open gripper."""
         return self.scene.gripper.most
+
+    @property
+    def lowest(self) -> float:
+        """Height of `ee` over the table at which the fingertips just clear it."""
+        return self.scene.robot.ee.lowest
+
+    def ahead(self, position: F64) -> float:
+        """Return the yaw that counts as none for a hand at a position (3,) [rad]."""
+        return yaw_ahead(self.scene.robot, self.data.xanchor[self.scene.shoulder], position)
+
+    @property
+    def faces_ahead(self) -> bool:
+        """Whether the hand's yaw counts from straight ahead of the shoulder, and not along the world's x."""
+        return self.scene.robot.yaw != "world"
+
+    @property
+    def leans(self) -> bool:
+        """Whether the arm has too few joints for a hand that points down everywhere."""
+        return self.scene.robot.leans
+
+    @property
+    def lopsided(self) -> bool:
+        """Whether one jaw alone moves."""
+        return self.scene.gripper.lopsided
+
+    def middle(self, opening: float) -> float:
+        """Return where the middle between the pads is along the hand's y, at an opening [m]."""
+        return self.scene.gripper.middle(opening)
+
+    def turns(self, yaw: float, alike: float, position: F64) -> list[float]:
+        """Return the ways round, off straight ahead, to which a hand at a position (3,) [m] can turn for a yaw [rad].
+
+        alike: a turn by which it looks the same [rad].
+        """
+        low, high = self.scene.yaws
+        off = math.remainder(yaw - self.ahead(position), alike)
+        ways = [off + turn * alike for turn in range(-_MOST_TURNS, _MOST_TURNS + 1)] if math.isfinite(low) else [off]
+        return [way for way in ways if low <= way <= high] or [off]
+
+    def turned(self, position: F64) -> float:
+        """Return how far the hand is turned off straight ahead at a position (3,) [m]; [rad]."""
+        low, high = self.scene.yaws
+        middle = (low + high) / 2 if math.isfinite(low) else 0.0
+        return middle + math.remainder(self.hand_yaw - self.ahead(position) - middle, 2 * math.pi)
+
+    @property
+    def hand_yaw(self) -> float:
+        """Yaw of the hand [rad]."""
+        hand = self.ee.rotation
+        return angle_across(hand) if self.scene.robot.leans else angle_ahead(hand)
+
+    def off_down(self, yaw: float) -> float:
+        """Return how far the hand is from pointing down at a yaw [rad]; only off the yaw, of an arm that leans."""
+        hand = self.ee.rotation
+        return off_yaw(hand, yaw) if self.scene.robot.leans else angle_from_down(hand, yaw)
 
     def extents(self, name: str) -> tuple[float, ...]:
         """Return lengths of an object along its own axes x, y and z."""

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, add_bin, drop_place, drop_progress, drop_rungs, is_in
-from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.ladder import grasp_progress, grasp_rungs, held
 from manip_il.tasks.objects import BLUE, RED, WOOD, YELLOW, add_cube
 from manip_il.tasks.pick_place import observe_object
@@ -68,7 +68,8 @@ def _all_in(world: World) -> bool:
 
 def _rise(world: World) -> Target:
     """Stand over the box."""
-    return Target(world.pose(BOX).position + [0.0, 0.0, 0.2], hand_down(0.0), world.most_opening)
+    at = world.pose(BOX).position + [0.0, 0.0, 0.2]
+    return Target(at, hand_down(world.ahead(at)), world.most_opening)
 
 
 _LET_GO, _CARRY = drop_rungs(current, _to, _inside, tuple(COLOURS))

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import angle_ahead, angle_from_down, hand_down
 from manip_il.sim.world import World
 from manip_il.tasks.cabinet import (
     BAR,
@@ -23,7 +24,7 @@ from manip_il.tasks.cabinet import (
     middle_of_drawer,
     pulled,
 )
-from manip_il.tasks.grasp import angle_ahead, angle_from_down, hand_down, lie_of
+from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import Lift, carry, carry_progress, grasp_progress, grasp_rungs, held, let_go, nearness
 from manip_il.tasks.objects import add_cube
 from manip_il.tasks.pick_place import OBJECT, observe_object

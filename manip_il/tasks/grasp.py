@@ -21,7 +21,6 @@ FUNNEL_SLOPE = 2.0  # height the hand gains per misalignment beyond it
 ANGLE_AS_LENGTH = 0.05  # how much misalignment a radian of wrong orientation counts for [m/rad]
 ANGLE_FREE = 0.1  # orientation error that counts for nothing [rad]
 TIGHT = 0.35  # share of the room beside an object that fills the hand which misalignment may take
-LOWEST_EE = 0.021  # of the ee site over the table: the fingertips just clear it [m]
 DEEPEST = 0.035  # of the ee site under an object's top: the palm just clears it [m]
 OPEN_SLACK = 0.016  # opening beyond the object's width at which the hand may descend, where there is so much [m]
 OPEN_SHARE = 0.6  # of what the gripper opens beyond the object's width
@@ -30,6 +29,7 @@ WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a m
 FUNNEL_STEEP = 4.0  # the same where something stands around the object
 FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
 SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
+BESIDE_JAW = 0.005  # of an object from a jaw that stands, when the hand comes down around both [m]
 NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 LEAN = 0.5  # of a hand that reaches as far as it can [rad]
@@ -60,9 +60,9 @@ class Lie(NamedTuple):
 class Grasp(NamedTuple):
     """An object as the hand sees it.
 
-    offset: its centre in the `ee` frame [m]. width, length, half: of it between the fingers, across them, and half its
-    height [m]. tilt: off the nearest face [rad]. yaw: of a hand that points down to grasp it; angle: how far the hand
-    is from that [rad].
+    offset: its centre in the `ee` frame, off the middle between pads that hold it [m]. width, length, half: of it
+    between the fingers, across them, and half its height [m]. tilt: off the nearest face [rad]. yaw: of a hand that
+    points down to grasp it; angle: how far the hand is from that [rad].
     at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
     sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
     must be for that [m]; height: the same, but no higher than to clear its top. lean: how much the hand leans to get to
@@ -103,28 +103,32 @@ def lie_of(world: World, name: str) -> Lie:
 def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
-    yaw, width, length = _nearest(lie.grasps, ee.rotation, world.most_opening - _LEAST_ROOM, neighbours)
-    lean = world.reach.lean(position)
-    angle = _beyond_lean(angle_from_down(ee.rotation, yaw), ee.rotation, lean)
+    yaw, width, length = _nearest(lie, world, position, world.most_opening - _LEAST_ROOM, neighbours)
+    lean = 0.0 if world.leans else world.reach.lean(position)
+    angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     x, y, z = position.tolist()
     ee_x, ee_y, ee_z = ee.position.tolist()
     dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
+    aside = world.middle(width + 2 * BESIDE_JAW)  # of the object before a hand of which one jaw alone moves [m]
+    at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
     room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
-    off = math.hypot(dx, dy) + ANGLE_AS_LENGTH * max(0.0, angle - free)
+    off = math.hypot(at_x - ee_x, at_y - ee_y) + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
     funnel = slope * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
     half = lie.tall / 2
-    narrower = max(0.0, room - NARROW) * _crowding(yaw, world.most_opening, neighbours)
+    crowding = 1.0 if world.lopsided else _crowding(yaw, world.most_opening, neighbours)
+    narrower = max(0.0, room - NARROW) * crowding
+    across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
     return Grasp(
-        offset=tuple(a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist()),
+        offset=(across, along - world.middle(width), ahead),
         width=width,
         length=length,
         half=half,
         tilt=lie.tilt,
         yaw=yaw,
         angle=angle,
-        at=(x, y, max(z, LOWEST_EE, z + half - DEEPEST)),
+        at=(at_x, at_y, max(z, world.lowest, z + half - DEEPEST)),
         wide=world.most_opening - narrower,
         open_enough=world.opening >= width + min(OPEN_SLACK, OPEN_SHARE * room),
         off=off,
@@ -135,30 +139,35 @@ def _grasp(world: World, name: str) -> Grasp:
 
 
 def _nearest(
-    grasps: Sequence[tuple[float, float, float]],
-    hand: F64,
-    widest: float,
-    neighbours: Sequence[tuple[float, float]],
+    lie: Lie, world: World, position: F64, widest: float, neighbours: Sequence[tuple[float, float]]
 ) -> tuple[float, float, float]:
-    """The grasp whose yaw is nearest to the hand's, with a small preference for 0 and for a narrow one.
+    """The grasp whose yaw is nearest to the hand's, with a small preference for none and for a narrow one.
 
-    hand: rotation of `ee`, (3, 3). Nearest to the hand, not to zero: a learner that averages both sides of the boundary
-    between two grasps then leaves it by any turn, and does not stand still in the middle. widest: what the fingers go
-    around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
+    Nearest to the hand, not to none: a learner that averages both sides of the boundary between two grasps then leaves
+    it by any turn, and does not stand still in the middle. position: of the object (3,) [m]. widest: what the fingers
+    go around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
     """
-    at = angle_ahead(hand)
+    grasps, at, ahead = lie.grasps, world.hand_yaw, world.ahead(position)
+    if world.faces_ahead:
+        at = world.turned(position)
+        grasps = [
+            (way, width, length)
+            for yaw, width, length in grasps
+            for way in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
+        ]
     narrowest = min(width for _, width, _ in grasps)
     fitting = [grasp for grasp in grasps if grasp[1] <= max(widest, narrowest)]
-    return min(
+    yaw, width, length = min(
         fitting,
         key=lambda g: (
             abs(g[0] - at)
             + PREFER_ZERO * abs(g[0])
             + WIDTH_AS_ANGLE * (g[1] - narrowest)
-            + CROWDED * _crowding(g[0], widest, neighbours),
+            + CROWDED * _crowding(g[0] + ahead, widest, neighbours),
             g[0],
         ),
     )
+    return yaw + ahead, width, length
 
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
@@ -204,24 +213,6 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     return Lie(grasps, extents[up], math.acos(min(1.0, heights[up])), folds)
 
 
-def hand_down(yaw: float) -> F64:
-    """Return rotation of `ee` with the hand pointing down, turned by `yaw` [rad] about the world's z; (3, 3)."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
-
-
-def angle_ahead(rotation: F64) -> float:
-    """Return the yaw of the x axis of a rotation (3, 3) [rad]."""
-    return math.atan2(rotation[1, 0], rotation[0, 0])
-
-
-def angle_from_down(rotation: F64, yaw: float) -> float:
-    """Return `angle_between` a rotation (3, 3) and `hand_down(yaw)` [rad]."""
-    (xx, xy, _), (yx, yy, _), (_, _, zz) = rotation.tolist()
-    trace = math.cos(yaw) * (xx - yy) + math.sin(yaw) * (xy + yx) - zz
-    return math.acos(min(1.0, max(-1.0, (trace - 1) / 2)))
-
-
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     """Return an angle from a hand that points down [rad] without what a hand (3, 3) may lean."""
     if not lean:
@@ -229,8 +220,3 @@ def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
     free = min(tilt, lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
-
-
-def angle_between(a: F64, b: F64) -> float:
-    """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
-    return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import angle_between
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import angle_between, lie_of
+from manip_il.tasks.grasp import lie_of
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_object, add_part
 from manip_il.tasks.peg import HOLE, PEG, azimuth, held, lower_end, upper_axis

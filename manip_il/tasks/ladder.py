@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import HOVER, LOWEST_EE, angle_ahead, grasp_of, hand_down
+from manip_il.tasks.grasp import HOVER, grasp_of
 from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
@@ -93,7 +94,11 @@ def approach(world: World, name: str, hover: float = 0.0) -> Target:
 def close_on(world: World, name: str) -> Target:
     """Close the fingers at the object's position."""
     g = grasp_of(world, name)
-    return Target(np.array(g.at), hand_down(g.yaw), CLOSED, lean=g.lean)
+    at = np.array(g.at)
+    if world.lopsided:  # the jaw that moves brings the object to the other; the hand does not follow
+        across = np.array([math.sin(g.yaw), -math.cos(g.yaw), 0.0])
+        at += across * float(across @ (world.ee.position - at))
+    return Target(at, hand_down(g.yaw), CLOSED, lean=g.lean)
 
 
 def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
@@ -104,8 +109,8 @@ def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
     if off > lift.free:
         way[:2] *= min(1.0, max(0.0, 1.0 - (way[2] + height) / lift.rise_first))
     position = world.ee.position + way + [0.0, 0.0, height]
-    position[2] = max(position[2], LOWEST_EE)
-    return Target(position, hand_down(0.0), CLOSED, max_step=lift.max_step)
+    position[2] = max(position[2], world.lowest)
+    return Target(position, hand_down(world.ahead(position)), CLOSED, max_step=lift.max_step)
 
 
 def let_go(world: World, name: str, height: float) -> Target:
@@ -114,7 +119,11 @@ def let_go(world: World, name: str, height: float) -> Target:
     beyond = min(RELEASE, world.most_opening - g.width)
     free = world.opening > g.width + FREED * beyond and not world.touched(name)
     up = world.pose(name).position[2] + height if free else ee.position[2]
-    return Target(np.array([*ee.position[:2], up]), hand_down(angle_ahead(ee.rotation)), g.width + beyond)
+    at = np.array([*ee.position[:2], up])
+    if world.lopsided:  # the jaw that stands goes off the object, as the other one does
+        along = g.offset[1] + world.middle(g.width) - world.middle(g.width + beyond)
+        at[:2] += along * ee.rotation[:2, 1]
+    return Target(at, hand_down(world.hand_yaw), g.width + beyond)
 
 
 def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.reach import ARRIVES, reach_of
+from manip_il.robots.rotations import angle_between
 from manip_il.sim.world import Scene, World
-from manip_il.tasks.grasp import OPEN_SLACK, angle_between, lie_of
+from manip_il.tasks.grasp import OPEN_SLACK, lie_of
 
 F64 = NDArray[np.float64]
 

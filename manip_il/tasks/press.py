@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.ladder import CLOSED, nearness
 from manip_il.tasks.objects import GREY, RED, add_furniture, add_part
 from manip_il.tasks.reach import observe_hand
@@ -49,7 +49,8 @@ def _aim(world: World) -> Target:
     height = min(HOVER, SLOPE * max(0.0, off - OVER)) if off > OVER else -TRAVEL - DEEPER
     height += TOP + TIP
     sideways = min(1.0, max(0.0, 1.0 - (height - ee[2]) / 0.03))
-    return Target(np.append(ee[:2] + sideways * (to - ee[:2]), height), hand_down(0.0), CLOSED)
+    at = np.append(ee[:2] + sideways * (to - ee[:2]), height)
+    return Target(at, hand_down(world.ahead(at)), CLOSED)
 
 
 def _is_down(world: World) -> bool:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.grasp import LOWEST_EE, hand_down
 from manip_il.tasks.ladder import AT_GOAL, nearness
 from manip_il.tasks.objects import RED, add_goal, add_object
 from manip_il.tasks.reach import observe_hand
@@ -22,17 +23,36 @@ F64 = NDArray[np.float64]
 PUCK = "puck"
 PUCK_SIZE = (0.03, 0.02)  # radius, half its height [m]
 PUCK_MASS = 0.15  # [kg]
-BEHIND = 0.05  # of the hand from the puck's middle, where it stands behind it [m]
 PUSHING = (0.01, 0.12)  # of the hand behind the puck's middle while it pushes: no nearer, no farther [m]
 BESIDE = 0.02  # of the hand off the line through puck and goal while it pushes [m]
-LOW = LOWEST_EE + 0.004  # of the hand while it pushes [m]
-LOW_ENOUGH = 0.05  # under this height it pushes [m]
+LOW = 0.004  # of the hand while it pushes, over its lowest [m]
+LOW_ENOUGH = 0.025  # over that it pushes [m]
 ABOVE = 0.10  # of the hand on its way around the puck [m]
 SLOPE = 2.0  # height the hand gains per distance from where it stands behind the puck
-OPENING = 0.04  # of the fingers, across the push: the puck rests against both [m]
 STEP = 0.03  # how far ahead of the hand its target runs while it pushes [m]
 FAR = 0.08  # least distance of the goal from the puck at the start [m]
 ROOM = 0.06  # within reach behind the puck at the start [m]
+
+
+class Hand(NamedTuple):
+    """Measures of a hand that pushes. behind: from the puck's middle, where it stands behind it [m].
+
+    opening: of the fingers, across the push: the puck rests against both [m]. touching: behind the puck's middle, where
+    it comes to touch it [m]; lower: over its lowest until then [m].
+    """
+
+    behind: float
+    opening: float
+    touching: float
+    lower: float
+
+
+UPRIGHT_HAND = Hand(0.05, 0.04, 0.0, LOW_ENOUGH)
+LEANING_HAND = Hand(0.065, 0.02, 0.045, 0.006)  # of a weak arm: on its way down it would ride on the puck
+
+
+def _style(world: World) -> Hand:
+    return LEANING_HAND if world.leans else UPRIGHT_HAND
 
 
 def _way(world: World) -> tuple[F64, float]:
@@ -44,16 +64,29 @@ def _way(world: World) -> tuple[F64, float]:
 
 def _across(world: World, direction: F64) -> F64:
     """Rotation of a hand that points down with its fingers across the push: of two, the nearer one, (3, 3)."""
-    hand = world.ee.rotation
-    yaw, at = math.atan2(direction[1], direction[0]), math.atan2(hand[1, 0], hand[0, 0])
-    turns = (yaw - math.pi, yaw, yaw + math.pi)
-    return hand_down(min(turns, key=lambda turn: (abs(turn - at) + 0.3 * abs(turn), turn)))
+    yaw, puck = math.atan2(direction[1], direction[0]), world.pose(PUCK).position
+    if world.faces_ahead:
+        at, turns = world.turned(puck), world.turns(yaw, math.pi, puck)
+    else:
+        at, turns = world.hand_yaw, [yaw - math.pi, yaw, yaw + math.pi]
+    return hand_down(min(turns, key=lambda turn: (abs(turn - at) + 0.3 * abs(turn), turn)) + world.ahead(puck))
+
+
+def _hand(world: World) -> F64:
+    """Where the hand pushes: the middle between its fingers when they are open for that, (3,) [m]."""
+    return world.ee.position + world.ee.rotation[:, 1] * world.middle(_style(world).opening)
+
+
+def _to(world: World, position: F64, direction: F64, max_step: float = 0.12) -> Target:
+    """Target of a hand whose middle between the fingers is to be at a position (3,) [m], across a push (2,)."""
+    rotation, opening = _across(world, direction), _style(world).opening
+    return Target(position - rotation[:, 1] * world.middle(opening), rotation, opening, max_step=max_step)
 
 
 def _behind(world: World) -> tuple[float, float]:
     """Distances of the hand behind the puck on the line to the goal, and beside that line [m]."""
     direction, _ = _way(world)
-    x, y = (world.ee.position - world.pose(PUCK).position)[:2].tolist()
+    x, y = (_hand(world) - world.pose(PUCK).position)[:2].tolist()
     return -(x * direction[0] + y * direction[1]), abs(x * direction[1] - y * direction[0])
 
 
@@ -63,38 +96,45 @@ def _at_goal(world: World) -> bool:
 
 def _stay(world: World) -> Target:
     """Hold the hand where it is."""
-    return Target(world.ee.position.copy(), world.ee.rotation.copy(), OPENING)
+    return Target(world.ee.position.copy(), world.ee.rotation.copy(), _style(world).opening)
 
 
 def _pushes(world: World) -> bool:
     behind, beside = _behind(world)
     nearest, farthest = PUSHING
-    return nearest < behind < farthest and beside < BESIDE and world.ee.position[2] < LOW_ENOUGH
+    return nearest < behind < farthest and beside < BESIDE and world.ee.position[2] < _low_enough(world, behind)
+
+
+def _low_enough(world: World, behind: float) -> float:
+    """Height under which a hand pushes that is some way behind the puck's middle [m]."""
+    style = _style(world)
+    apart = min(1.0, max(0.0, (behind - style.touching) / (style.behind - style.touching)))
+    return world.lowest + LOW + LOW_ENOUGH - (LOW_ENOUGH - style.lower) * apart
 
 
 def _push(world: World) -> Target:
     direction, distance = _way(world)
     behind, _ = _behind(world)
     on_line = world.pose(PUCK).position[:2] - direction * behind
-    ahead = on_line + direction * (distance + max(0.0, behind - BEHIND))
-    return Target(np.append(ahead, LOW), _across(world, direction), OPENING, max_step=STEP)
+    ahead = on_line + direction * (distance + max(0.0, behind - _style(world).behind))
+    return _to(world, np.append(ahead, world.lowest + LOW), direction, STEP)
 
 
 def _around(world: World) -> Target:
     """To behind the puck: up, over it and down, the nearer to there the lower; straight up if too low beside it."""
     direction, _ = _way(world)
-    ee = world.ee.position
-    to = world.pose(PUCK).position[:2] - direction * BEHIND
-    off = math.hypot(*(to - ee[:2]))
-    height = LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
-    sideways = min(1.0, max(0.0, 1.0 - (height - ee[2]) / 0.03))
-    return Target(np.append(ee[:2] + sideways * (to - ee[:2]), height), _across(world, direction), OPENING)
+    hand = _hand(world)
+    to = world.pose(PUCK).position[:2] - direction * _style(world).behind
+    off = math.hypot(*(to - hand[:2]))
+    height = world.lowest + LOW + min(ABOVE, SLOPE * max(0.0, off - 0.01))
+    sideways = min(1.0, max(0.0, 1.0 - (height - hand[2]) / 0.03))
+    return _to(world, np.append(hand[:2] + sideways * (to - hand[:2]), height), direction)
 
 
 def _near(world: World) -> bool:
     direction, _ = _way(world)
-    to = world.pose(PUCK).position[:2] - direction * BEHIND
-    return math.hypot(*(to - world.ee.position[:2])) < ABOVE / SLOPE
+    to = world.pose(PUCK).position[:2] - direction * _style(world).behind
+    return math.hypot(*(to - _hand(world)[:2])) < ABOVE / SLOPE
 
 
 _RUNGS = (
@@ -163,5 +203,5 @@ class Push:
         direction, distance = _way(world)
         if _at_goal(world) or _pushes(world):
             return 0.5 + 0.5 * nearness(distance)
-        to = np.append(world.pose(PUCK).position[:2] - direction * BEHIND, LOW)
-        return 0.45 * nearness(math.dist(to, world.ee.position))
+        to = np.append(world.pose(PUCK).position[:2] - direction * _style(world).behind, world.lowest + LOW)
+        return 0.45 * nearness(math.dist(to, _hand(world)))

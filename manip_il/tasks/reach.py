@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import GOAL, World
-from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.ladder import AT_GOAL, CLOSED, nearness
 from manip_il.tasks.objects import CUBE_HALF, add_goal
 from manip_il.tasks.starts import UPRIGHT, draw_goal
@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 
 
 def _to_goal(world: World) -> Target:
-    return Target(world.goal.copy(), hand_down(0.0), CLOSED)
+    return Target(world.goal.copy(), hand_down(world.ahead(world.goal)), CLOSED)
 
 
 _RUNGS = (

@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.rotations import angle_from_down, hand_down
 from manip_il.sim.world import World
 from manip_il.tasks.bins import OVER, OVER_WALL, WALL, add_bin, drop_place, drop_rungs, is_in
-from manip_il.tasks.grasp import angle_from_down, grasp_of, hand_down, lie_of
+from manip_il.tasks.grasp import grasp_of, lie_of
 from manip_il.tasks.ladder import CLEAR, CLOSED, approach, grasp_progress, grasp_rungs, held, nearness
 from manip_il.tasks.objects import BLUE, RED, YELLOW, add_cube, add_furniture
 from manip_il.tasks.pick_place import observe_object

@@ -86,7 +86,10 @@ class Stack:
 
     def draw(self, rng: np.random.Generator, world: World) -> Start:
         """Draw both cubes on the table, apart, at any yaw."""
-        base = draw_resting(rng, world, BASE, ROOM)
+        height = (world.extents(BASE)[2] + world.extents(TOP)[2]) / 2
+        base = draw_until(
+            lambda: draw_resting(rng, world, BASE, ROOM), lambda at: world.reach.has(at + [0, 0, height]), world, BASE
+        )
         top = draw_until(
             lambda: draw_resting(rng, world, TOP, ROOM), lambda at: math.dist(at, base) > APART, world, TOP
         )

@@ -16,9 +16,11 @@ from manip_il.tasks.grasp import is_cube
 F64 = NDArray[np.float64]
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])  # wxyz
 FROM_HAND = 0.1  # of an object from the hand at the start, x and y, as in gymnasium-robotics' FetchPickAndPlace [m]
+LIFT_HEIGHT = 0.45  # of a workspace with that room; in a lower one it is less [m]
+FROM_HAND_SHARE = 0.75  # the same in half widths of the workspace, where that is less
 IN_AIR = 0.5  # share of goals that are off the table, as in the same environment
 LIFT = (0.1, 0.25)  # of a goal above an object's start [m]
-_FEW_DRAWS = 50  # beside others, before they are drawn anew
+FEW_DRAWS = 50  # beside others, before they are drawn anew
 _MOST_DRAWS = 1_000
 _BOX, _SPHERE, _CAPSULE = (int(kind) for kind in (mjtGeom.mjGEOM_BOX, mjtGeom.mjGEOM_SPHERE, mjtGeom.mjGEOM_CAPSULE))
 _HALF = np.sqrt(0.5)
@@ -55,13 +57,14 @@ def draw_resting(rng: np.random.Generator, world: World, name: str, room: float 
 
 def draw_resting_place(rng: np.random.Generator, world: World, name: str, height: float, room: float = 0.0) -> F64:
     """Draw a place on the table, (3,) [m], where the hand reaches to a height [m] and does not begin."""
-    centre = np.array(world.scene.robot.workspace.centre)
+    space = world.scene.robot.workspace
+    centre, apart = np.array(space.centre), min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
     def draw() -> F64:
         return np.append(_xy(rng, world), height)
 
     def fits(at: F64) -> bool:
-        return bool(np.linalg.norm(at[:2] - centre) >= FROM_HAND) and has_room(world, at, room)
+        return bool(np.linalg.norm(at[:2] - centre) >= apart) and has_room(world, at, room)
 
     return draw_until(draw, fits, world, name)
 
@@ -108,7 +111,7 @@ def draw_together(
     for _ in range(_MOST_DRAWS):
         places: list[F64] = []
         for name in names:
-            drawn = (draw(name) for _ in range(_FEW_DRAWS))
+            drawn = (draw(name) for _ in range(FEW_DRAWS))
             at = next((at for at in drawn if fits(at, places)), None)
             if at is None:
                 break

@@ -15,7 +15,6 @@ from manip_il.robots.gripper import TOUCH, Gripper, sweep
 from manip_il.robots.robot import ROBOTS, Robot, get_robot
 from manip_il.robots.spec import arm_spec
 from manip_il.sim.world import World
-from manip_il.tasks.ladder import LOWEST_EE
 from manip_il.tasks.pick_place import OBJECT
 
 from ..scenes import started, still, world_at_home
@@ -117,7 +116,7 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.update()
         lowest = min(_lowest(world, geom) for geom in gripper.geoms)
-        assert lowest - (float(world.ee.position[2]) - LOWEST_EE) > top + 1e-3
+        assert lowest - (float(world.ee.position[2]) - world.lowest) > top + 1e-3
 
 
 def _lowest(world: World, geom: int) -> float:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
+from manip_il.robots.meeting import Body
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.tasks.grasp import LEAN
@@ -120,7 +121,7 @@ def test_a_hand_that_leans_gets_where_an_upright_one_does_not(x: float):
 @every_robot
 def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
     the_robot = get_robot(robot)
-    there, ik, body = reach_of(the_robot), ArmIK(the_robot), reach._Body(the_robot)
+    there, ik, body = reach_of(the_robot), ArmIK(the_robot), Body(the_robot)
     draws = np.random.default_rng(2)
     for _ in range(30):
         index = tuple(draws.integers(there.errors.shape).tolist())

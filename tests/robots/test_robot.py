@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.robots import reach
+from manip_il.robots import ROBOTS, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.reach import Reach
 from manip_il.robots.robot import Robot, get_robot
@@ -53,7 +53,7 @@ def test_a_yaml_is_found_from_the_current_folder(tmp_path: Path, monkeypatch):
     write(tmp_path, "near")
     monkeypatch.chdir(tmp_path)
     assert get_robot("near.yaml").name == "near"
-    assert get_robot("./near.yaml").model == tmp_path / "own.xml"
+    assert get_robot("./near.yaml").files.model == tmp_path / "own.xml"
 
 
 def but(**changes: Any) -> dict[str, Any]:
@@ -282,5 +282,5 @@ def test_the_arm_alone_stands_where_the_scenes_arm_does(robot: str):
 @every_robot
 def test_what_a_robot_follows_from_is_the_same_bytes_again(robot: str):
     the_robot = get_robot(robot)
-    assert the_robot.content() == Robot.read(Path(the_robot.model).with_name(f"{robot}.yaml")).content()
+    assert the_robot.content() == Robot.read(ROBOTS[robot]).content()
     assert arm_spec(the_robot).compile().nq == arm_spec(the_robot).compile().nq

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.mdp import State
+from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
 from manip_il.sim.shape import KINDS
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import Lie, hand_down, lie_of
+from manip_il.tasks.grasp import Lie, lie_of
 from manip_il.tasks.pick_place import OBJECT, observe_object
 
 from ..scenes import SEED, started

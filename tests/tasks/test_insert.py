@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from manip_il.expert import Expert
+from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import hand_down
 from manip_il.tasks.insert import APART
 from manip_il.tasks.peg import HOLE, PEG, azimuth, hand_at, lower_end, upper_axis
 from manip_il.tasks.starts import UPRIGHT

@@ -14,19 +14,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from manip_il.robots.reach import Reach
+from manip_il.robots.rotations import angle_ahead, angle_between, angle_from_down, hand_down
 from manip_il.sim.world import Pose
-from manip_il.tasks.grasp import (
-    FUNNEL_RADIUS,
-    HOVER,
-    LEAN,
-    LOWEST_EE,
-    OPEN_SLACK,
-    angle_between,
-    angle_from_down,
-    grasp_of,
-    hand_down,
-    lie_of,
-)
+from manip_il.tasks.grasp import FUNNEL_RADIUS, HOVER, LEAN, OPEN_SLACK, grasp_of, lie_of
 from manip_il.tasks.ladder import (
     AT_GOAL,
     AT_GRASP_ANGLE,
@@ -44,6 +34,7 @@ from manip_il.tasks.reach import ReachGoal
 from manip_il.tasks.task import Rung, Target
 
 OPEN, EDGE = 0.08, 0.05  # of the hand; of the cube where a test says no other [m]
+LOWEST = 0.021  # of the hand over the table [m]
 EDGES = (0.03, 0.05, 0.07)
 RUNGS = pick_rungs("object")
 UPRIGHT = Reach(np.array([-1.0, -1.0, -1.0]), np.zeros((41, 41, 41)))  # the hand gets everywhere pointing down
@@ -65,6 +56,23 @@ class Placed:
     most_opening: float = OPEN
     around: tuple[tuple[float, float], ...] = ()
     reach: Reach = UPRIGHT
+    lowest: float = LOWEST
+    leans: bool = False
+    lopsided: bool = False
+    faces_ahead: bool = False
+
+    @property
+    def hand_yaw(self) -> float:
+        return angle_ahead(self.ee.rotation)
+
+    def ahead(self, position: np.ndarray) -> float:
+        return 0.0
+
+    def off_down(self, yaw: float) -> float:
+        return angle_from_down(self.ee.rotation, yaw)
+
+    def middle(self, opening: float) -> float:
+        return 0.0
 
     def pose(self, name: str) -> Pose:
         return {"object": self.cube}[name]
@@ -143,7 +151,7 @@ def top(world: Placed) -> float:
     [
         (at(-0.2, 0.1, 0.2), "approach", OPEN, [0.5, 0.1, EDGE + HOVER]),
         (at(0, 0, 0.08), "descend", OPEN, [0.5, 0.1, EDGE / 2]),  # all the way
-        *((at(0.003, -0.003, 0.004, edge=e), "grasp", 0.0, [0.5, 0.1, max(e / 2, LOWEST_EE)]) for e in EDGES),
+        *((at(0.003, -0.003, 0.004, edge=e), "grasp", 0.0, [0.5, 0.1, max(e / 2, LOWEST)]) for e in EDGES),
         *((held((-0.2, 0.1, 0.0), e), "carry", 0.0, [0.3, 0.2, 0.2]) for e in EDGES),  # over the goal first
         *((held((-0.01, 0.0, -0.05), e), "carry", 0.0, [0.49, 0.1, 0.1]) for e in EDGES),  # and then down
     ],
@@ -156,7 +164,7 @@ def test_the_ladder_leads_to_the_goal(world: Placed, name: str, opening: float, 
 
 @given(widths)
 def test_hovering_and_waiting_count_from_the_top_whatever_the_objects_size(edge: float):
-    raised = max(0.0, LOWEST_EE - edge / 2)  # a low cube is gripped above its middle
+    raised = max(0.0, LOWEST - edge / 2)  # a low cube is gripped above its middle
     hovering = at(-0.2, 0.1, 0.2, edge=edge)
     assert rung(hovering)[1].position[2] == pytest.approx(top(hovering) + HOVER + raised)
     for waiting in (at(0, 0, 0.1, edge=edge, tilt=MAX_TILT + 0.1), at(0, 0, 0.1, edge=edge, opening=0.0)):
@@ -306,8 +314,8 @@ def test_no_target_is_in_the_table(
     world = at(
         off * np.cos(direction), off * np.sin(direction), height, opening=opening, edge=edge, touching=touching
     )  # fmt: skip
-    assert rung(world)[1].position[2] >= LOWEST_EE
-    assert rung(replace(world, goal=np.array([0.5, 0.1, 0.0])))[1].position[2] >= LOWEST_EE
+    assert rung(world)[1].position[2] >= LOWEST
+    assert rung(replace(world, goal=np.array([0.5, 0.1, 0.0])))[1].position[2] >= LOWEST
 
 
 @given(

@@ -1,0 +1,59 @@
+"""Outlines of geoms, and distances between them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+_AT_TIP = 0.025  # of a fingertip: what is farther from it is no pad [m]
+_FAR = 1.0  # longest distance that is measured [m]
+_NUDGES = (0.0, 1e-5, -1e-5, 3e-5)  # [m]
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+def outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> F64:
+    """Return points around a geom in the world, (n, 3) [m]: of its mesh, or the corners of its box."""
+    mesh, middle, half = int(model.geom_dataid[geom]), model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    points = middle + half * _CORNERS
+    if mesh >= 0:  # turned as a mesh is in its geom, its box reaches farther than it does
+        start = model.mesh_vertadr[mesh]
+        points = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+    return data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T
+
+
+def at_tip(model: mujoco.MjModel, data: mujoco.MjData, finger: Sequence[int], along: F64) -> list[int]:
+    """Return the geoms of a finger that reach near its tip, along a direction (3,) of the world."""
+    ends = {geom: float((outline(model, data, geom) @ along).max()) for geom in finger}
+    return [geom for geom in finger if ends[geom] > max(ends.values()) - _AT_TIP]
+
+
+def distance(model: mujoco.MjModel, data: mujoco.MjData, one: int, other: int, ends: F64 | None = None) -> float:
+    """Return how far two geoms are apart, at most 1 m, and put their nearest points (6,) into `ends`; [m].
+
+    For two that are apart MuJoCo now and then returns exactly 0; not from a hair's breadth beside.
+    """
+    place = data.geom_xpos[one].copy()
+    apart = 0.0
+    for nudge in _NUDGES:
+        data.geom_xpos[one] = place + nudge
+        apart = mujoco.mj_geomDistance(model, data, one, other, _FAR, ends)
+        if apart != 0.0:
+            break
+    data.geom_xpos[one] = place
+    return apart
+
+
+def nearest(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[Sequence[int]]) -> tuple[tuple[int, int], F64]:
+    """Return the nearest geoms of the first group and of the others, and their nearest points, (2, 3) [m]."""
+    first, *rest = groups
+    least, pair, points, ends = np.inf, (first[0], rest[0][0]), np.zeros(6), np.empty(6)
+    for one, other in itertools.product(first, [geom for group in rest for geom in group]):
+        apart = distance(model, data, one, other, ends)
+        if apart < least:
+            least, pair, points = apart, (one, other), ends.copy()
+    return pair, points.reshape(2, 3)

@@ -1,0 +1,123 @@
+"""Parts of a robot as its YAML says them, checked: hand, gripper, workspace, costs of inverse kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from manip_il import checks
+from manip_il.errors import ManipError
+from manip_il.robots.files import KEYS, ModelFiles
+from manip_il.robots.reading import FURTHEST, names, numbers, tree_of
+
+GRIPPER = "gripper/"  # prefix of the names of a gripper with a model of its own
+
+
+@dataclass(frozen=True)
+class EndEffector:
+    """Frame `ee`: between the fingertips, z out of the hand, y along the fingers' motion.
+
+    With the hand straight down at zero yaw its axes are world x, -y, -z. position [m] and quaternion (wxyz) in `body`.
+    lowest: of the frame over the table [m]: the fingertips just clear it.
+    """
+
+    body: str
+    position: tuple[float, ...]
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    lowest: float = 0.021
+
+    @classmethod
+    def read(cls, what: str, tree: Any) -> Self:
+        """Make it of what YAML holds; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls)
+        quaternion = numbers(f"{what}.quaternion", tree.get("quaternion", cls.quaternion), 4, 1.0)
+        if np.linalg.norm(quaternion) < 0.1:
+            raise ManipError(f"{what}.quaternion is {quaternion}; expected one of length 1, wxyz")
+        position = numbers(f"{what}.position", tree["position"], 3, FURTHEST)
+        lowest = checks.number(f"{what}.lowest", tree.get("lowest", cls.lowest), 0.0, 0.2)
+        return cls(checks.text(f"{what}.body", tree["body"]), position, quaternion, lowest)
+
+
+@dataclass(frozen=True)
+class GripperConfig:
+    """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
+
+    finger_mass: of every finger in place of the model's [kg]. files: of a gripper that has a model of its own, whose
+    names begin with `gripper/`; position [m] and quaternion (wxyz): of that model in the hand's body.
+    """
+
+    joints: tuple[str, ...]
+    closed: tuple[float, ...]
+    open: tuple[float, ...]
+    fingers: tuple[str, ...]
+    finger_mass: float | None = None
+    files: ModelFiles | None = None
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def read(cls, what: str, tree: Any, folder: Path) -> Self:
+        """Make it of what YAML holds in a folder; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls, without=("files",), more=KEYS)
+        joints, fingers = (names(f"{what}.{name}", tree[name]) for name in ("joints", "fingers"))
+        if len(fingers) < 2:
+            raise ManipError(f"{what}.fingers names {len(fingers)}; expected two or more bodies")
+        closed, opened = (numbers(f"{what}.{name}", tree[name], len(joints), FURTHEST) for name in ("closed", "open"))
+        for joint, at, to in zip(joints, closed, opened, strict=True):
+            if at == to:
+                raise ManipError(
+                    f"{what}.closed and {what}.open are both {at:g} for joint {joint!r}; expected two places"
+                )
+        mass = tree.get("finger_mass")
+        mass = None if mass is None else checks.number(f"{what}.finger_mass", mass, 1e-6, 100)
+        files = ModelFiles.read(f"{what}.", tree, folder) if "model" in tree else None
+        if files is not None:
+            joints, fingers = (tuple(GRIPPER + name for name in several) for several in (joints, fingers))
+        position = numbers(f"{what}.position", tree.get("position", cls.position), 3, FURTHEST)
+        quaternion = numbers(f"{what}.quaternion", tree.get("quaternion", cls.quaternion), 4, 1.0)
+        return cls(joints, closed, opened, fingers, mass, files, position, quaternion)
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Volume in which tasks take place: +- half_width about the centre on the table, up to a height over it [m]."""
+
+    centre: tuple[float, ...]
+    half_width: float = 0.15
+    height: float = 0.45
+
+    @classmethod
+    def read(cls, what: str, tree: Any) -> Self:
+        """Make it of what YAML holds; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls)
+        half_width, height = (
+            checks.number(f"{what}.{name}", tree.get(name, getattr(cls, name)), 0.02, 2)
+            for name in ("half_width", "height")
+        )
+        return cls(numbers(f"{what}.centre", tree["centre"], 2, FURTHEST), half_width, height)
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Costs of inverse kinematics, beside 1 for a metre off the hand's position.
+
+    orientation: of a radian off its rotation; leaning: the same of a hand that leans to get farther; posture: of a
+    radian of a joint off home.
+    """
+
+    orientation: float = 0.2
+    leaning: float = 0.04
+    posture: float = 0.01
+
+    @classmethod
+    def read(cls, what: str, tree: Any, found: Costs) -> Costs:
+        """Make it of what YAML holds, else of what was found; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls)
+        values = {
+            name: checks.number(f"{what}.{name}", tree.get(name, getattr(found, name)), 1e-6, 100)
+            for name in ("orientation", "leaning", "posture")
+        }
+        return cls(**values)
