@@ -18,7 +18,10 @@ WITH_A_PEG = [(robot, task) for robot, task in GRASPING if task in ("insert", "i
 WITH_CUBES = [scene for scene in GRASPING if scene not in WITH_A_PEG]
 WITH_A_CUBE = [(robot, task) for robot, task in GRASPING if task in ONE_CUBE]
 
+LARGE = [robot for robot in ROBOTS if robot != "so101"]  # what needs a table's width is beyond a small one
+
 every_robot = pytest.mark.parametrize("robot", list(ROBOTS))
+every_large_robot = pytest.mark.parametrize("robot", LARGE)
 every_task = pytest.mark.parametrize("task", list(TASKS))
 every_scene = pytest.mark.parametrize(("robot", "task"), SCENES)
 every_scene_that_grasps = pytest.mark.parametrize(("robot", "task"), GRASPING)

@@ -29,6 +29,7 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) 
     require(robot, "body", (hand,), spec.bodies)
     hand_spec = gripper.files.load(robot)
     _strip(hand_spec)
+    copy_options(spec, hand_spec)
     mount = spec.body(hand).add_frame(pos=gripper.position, quat=gripper.quaternion)
     spec.attach(hand_spec, prefix=GRIPPER, frame=mount)
     return spec
@@ -135,11 +136,15 @@ def _strip(spec: mujoco.MjSpec) -> None:
     """Delete what a model brings for a world of its own: motors, mocap bodies, sky, views, gravity and time."""
     for one in _foreign(spec):
         spec.delete(one)
-    plain = mujoco.MjSpec().option
-    for name in [name for name in dir(plain) if not name.startswith("_")]:
-        setattr(spec.option, name, getattr(plain, name))
+    copy_options(mujoco.MjSpec(), spec)
     for name in [name for name in dir(spec) if name.startswith("nuser_")]:
         setattr(spec, name, -1)
+
+
+def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
+    """Give a spec another one's options of physics; MuJoCo warns where those of two that it joins differ."""
+    for name in [name for name in dir(origin.option) if not name.startswith("_")]:
+        setattr(spec.option, name, getattr(origin.option, name))
 
 
 def _foreign(spec: mujoco.MjSpec) -> Iterator[Any]:

@@ -16,7 +16,7 @@ from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
-from manip_il.robots.spec import arm_spec
+from manip_il.robots.spec import arm_spec, copy_options
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.variation import Object
@@ -68,6 +68,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     arm = arm_spec(robot)
     _add_pedestal(spec, arm, robot)
     _add_wrist_camera(arm)
+    copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_front_camera(spec, robot)
     task.build(spec)

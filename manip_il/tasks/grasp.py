@@ -29,7 +29,8 @@ WIDTH_AS_ANGLE = 20.0  # how much farther the hand turns for a grasp that is a m
 FUNNEL_STEEP = 4.0  # the same where something stands around the object
 FINGER = (0.014, 0.010, 0.016)  # of a finger: its thickness, half its width, and where a neighbour is beside it [m]
 SHORT = 0.02  # of the room for a finger, at which a grasp is as crowded as any [m]
-BESIDE_JAW = 0.005  # of an object from a jaw that stands, when the hand comes down around both [m]
+BESIDE_JAW, NEARER = 0.008, 0.002  # of an object from a jaw that stands as the hand comes down; less is as good [m]
+BY_JAW = 0.004  # the same as `FUNNEL_RADIUS`, of a hand of which one jaw alone moves [m]
 NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
 LEAN = 0.5  # of a hand that reaches as far as it can [rad]
@@ -113,9 +114,11 @@ def _grasp(world: World, name: str) -> Grasp:
     at_x, at_y = x - aside * math.sin(yaw), y + aside * math.cos(yaw)
     room = max(0.0, world.most_opening - width)  # what the open gripper leaves beside it [m]
     free = min(ANGLE_FREE, TIGHT * room / width)
-    off = math.hypot(at_x - ee_x, at_y - ee_y) + ANGLE_AS_LENGTH * max(0.0, angle - free)
+    way = at_x - ee_x, at_y - ee_y
+    away = math.hypot(*(_beside_jaw(*way, yaw, -dz < lie.tall / 2) if world.lopsided else way))
+    off = away + ANGLE_AS_LENGTH * max(0.0, angle - free)
     slope = FUNNEL_STEEP if neighbours else FUNNEL_SLOPE
-    funnel = slope * max(0.0, off - min(FUNNEL_RADIUS, TIGHT * room))
+    funnel = slope * max(0.0, off - min(BY_JAW if world.lopsided else FUNNEL_RADIUS, TIGHT * room))
     half = lie.tall / 2
     crowding = 1.0 if world.lopsided else _crowding(yaw, world.most_opening, neighbours)
     narrower = max(0.0, room - NARROW) * crowding
@@ -136,6 +139,17 @@ def _grasp(world: World, name: str) -> Grasp:
         funnel=funnel,
         lean=lean,
     )
+
+
+def _beside_jaw(x: float, y: float, yaw: float, around: bool) -> tuple[float, float]:
+    """A way to an object, across and along the motion of a hand's one jaw, that need not be gone to the end [m].
+
+    around: the jaws are on both sides of it, so that it may be at the one that stands.
+    """
+    c, s = math.cos(yaw), math.sin(yaw)
+    across, along = c * x + s * y, s * x - c * y
+    nearer, farther = (BESIDE_JAW if around else NEARER), BESIDE_JAW
+    return across, max(along - farther, 0.0) + min(along + nearer, 0.0)
 
 
 def _nearest(

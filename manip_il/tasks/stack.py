@@ -22,6 +22,7 @@ F64 = NDArray[np.float64]
 
 TOP, BASE = "top", "base"  # the cube that is carried, and the one that it is put on
 ON_XY, ON_Z, LEVEL = 0.015, 0.004, 0.1  # off the place on the base: sideways, in height [m]; tilt [rad]
+LEANS_Z, LEANS = 0.008, 0.3  # the same of a cube in a hand that leans: in height [m], its tilt [rad]
 OVER_BASE = Lift(most=0.06, slope=2.5, free=0.008, rise_first=0.03, max_step=0.05)  # of the carried cube over its place
 PRESS = 0.01  # aimed at below the base's top: the cube comes down surely, and does not hang over it [m]
 AWAY, AWAY_ENOUGH = 0.06, 0.035  # of the hand over the stack's top once it has let go; at which it is away [m]
@@ -40,6 +41,16 @@ def stands(world: World) -> bool:
     """Return whether the upper cube lies level on the base."""
     x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
     return math.hypot(x, y) < ON_XY and abs(z) < ON_Z and max(lie_of(world, TOP).tilt, lie_of(world, BASE).tilt) < LEVEL
+
+
+def _rests(world: World) -> bool:
+    """Whether the upper cube is on the base as a hand that leans puts it there: it lies level once it is let go."""
+    x, y, z = (world.pose(TOP).position - place_on_base(world)).tolist()
+    return world.leans and math.hypot(x, y) < ON_XY and abs(z) < LEANS_Z and lie_of(world, TOP).tilt < LEANS
+
+
+def _may_let_go(world: World) -> bool:
+    return stands(world) or _rests(world)
 
 
 def _hand_is_away(world: World) -> bool:
@@ -61,7 +72,7 @@ def _is_done(world: World) -> bool:
 
 _RUNGS = (
     Rung("done", "the cube stands on the other, and the hand is away", _is_done, _let_go),
-    Rung("let_go", "the cube stands on the other, and the hand lets go of it", stands, _let_go),
+    Rung("let_go", "the cube stands on the other, and the hand lets go of it", _may_let_go, _let_go),
     Rung("carry", "the cube is in the hand, on its way to the other", lambda w: held(w, TOP), _carry),
     *grasp_rungs(lambda w: TOP),
 )

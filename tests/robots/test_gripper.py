@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from manip_il.robots.geometry import distance, outline
 from manip_il.robots.gripper import TOUCH, Gripper, sweep
 from manip_il.robots.robot import ROBOTS, Robot, get_robot
 from manip_il.robots.spec import arm_spec
@@ -34,7 +35,8 @@ def with_cube(robot: str, opening: float, offset: tuple[float, float, float]) ->
     world.data.qpos[gripper.q] = gripper.command(opening)
     world.update()
     mujoco.mju_mat2Quat(quat, world.ee.rotation.ravel())
-    world.place(OBJECT, world.ee.position + world.ee.rotation @ offset, quat)
+    middle = np.array([0.0, world.middle(opening), 0.0])
+    world.place(OBJECT, world.ee.position + world.ee.rotation @ (middle + offset), quat)
     world.update()
     return world
 
@@ -58,7 +60,7 @@ def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.update()
         gap = min(
-            mujoco.mj_geomDistance(world.model, world.data, one, other, 1.0, None)
+            distance(world.model, world.data, one, other)
             for one in gripper.pads[0]
             for pads in gripper.pads[1:]
             for other in pads
@@ -115,14 +117,8 @@ def test_the_lowest_hand_keeps_its_fingers_off_the_table(robot: str):
     for opening in (gripper.least, gripper.most):
         world.data.qpos[gripper.q] = gripper.command(opening)
         world.update()
-        lowest = min(_lowest(world, geom) for geom in gripper.geoms)
+        lowest = min(float(outline(world.model, world.data, geom)[:, 2].min()) for geom in gripper.geoms)
         assert lowest - (float(world.ee.position[2]) - world.lowest) > top + 1e-3
-
-
-def _lowest(world: World, geom: int) -> float:
-    """The lowest z of a geom's box [m]."""
-    rotation, box = world.data.geom_xmat[geom].reshape(3, 3), world.model.geom_aabb[geom]
-    return float((world.data.geom_xpos[geom] + rotation @ box[:3])[2] - (np.abs(rotation) @ box[3:])[2])
 
 
 @pytest.mark.parametrize("jaws", JAWS)

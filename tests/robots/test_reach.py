@@ -15,6 +15,7 @@ from manip_il.robots.ik import ArmIK
 from manip_il.robots.meeting import Body
 from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
 from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.rotations import angle_between, hand_down, off_yaw
 from manip_il.tasks.grasp import LEAN
 
 from ..tables import every_robot
@@ -77,15 +78,15 @@ def test_a_hand_leans_only_where_it_does_not_get_upright(share: tuple[float, ...
 
 def solve_from_home(ik: ArmIK, robot: Robot, position: np.ndarray, lean: float = 0.0) -> tuple[float, float]:
     """How far the hand, told to point down, ends from a position [m], and from pointing down [rad]."""
-    q = np.asarray(robot.home, dtype=np.float64)
+    q, down = np.asarray(robot.home, dtype=np.float64), hand_down(ik.ahead(position))
     for _ in range(120):
         ik.ee_pose(q)
-        step = ik.step(position, np.diag([1.0, -1.0, -1.0]), robot.max_joint_step, lean)
+        step = ik.step(position, down, robot.max_joint_step, lean)
         assert step is not None
         q = np.clip(q + step[0], ik.limits[:, 0], ik.limits[:, 1])
     at, rotation = ik.ee_pose(q)
-    angle = np.arccos(np.clip((np.trace(np.diag([1.0, -1.0, -1.0]) @ rotation) - 1) / 2, -1, 1))
-    return float(np.linalg.norm(at - position)), float(angle)
+    angle = off_yaw(rotation, ik.ahead(position)) if robot.leans else angle_between(rotation, down)
+    return float(np.linalg.norm(at - position)), angle
 
 
 @every_robot
@@ -125,7 +126,9 @@ def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
     draws = np.random.default_rng(2)
     for _ in range(30):
         index = tuple(draws.integers(there.errors.shape).tolist())
-        miss, q = reach._miss(the_robot, ik, there.origin + CELL * np.array(index))
+        point = there.origin + CELL * np.array(index)
+        point[2] = max(point[2], the_robot.ee.lowest)
+        miss, q = reach._miss(the_robot, ik, point)
         blocked = miss < reach._BLOCKED and body.meets_itself(q)
         assert there.errors[index] == pytest.approx(miss + (reach._BLOCKED if blocked else 0.0), abs=2e-3)
 

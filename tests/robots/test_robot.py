@@ -69,10 +69,14 @@ def without(tree: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 MISTAKES = {
-    "wrong key": (but(gians=[1]), ["unknown key", "'gians'", "did you mean 'gains'", "known: base,"]),
+    "wrong key": (but(gians=[1]), ["unknown key", "'gians'", "did you mean 'gains'", "gripper"]),
     "wrong key inside": (inside("gripper", opne=[1]), ["gripper", "'opne'", "did you mean 'open'"]),
     "the name is the file's": (but(name="mine"), ["unknown key", "'name'"]),
-    "missing key": (without(tree_of(), "home"), ["has no 'home'"]),
+    "missing key": (without(tree_of(), "workspace"), ["has no 'workspace'"]),
+    "no hand": (without(tree_of(), "ee"), ["has no 'hand'"]),
+    "home without joints": (without(tree_of(), "joints"), ["home is given without joints"]),
+    "an unknown yaw": (but(yaw="wrold"), ["unknown yaw", "did you mean 'world'"]),
+    "text to mend that is not there": (but(mend={"<no>": ""}), ["has no text '<no>' to mend"]),
     "missing key inside": (but(gripper=without(tree_of()["gripper"], "fingers")), ["gripper has no 'fingers'"]),
     "too few numbers": (but(home=[0, 0, 0]), ["home has 3 numbers", "expected 5"]),
     "too many numbers": (but(gains=[1000] * 6), ["gains has 6 numbers", "expected 5"]),
@@ -116,7 +120,7 @@ MISTAKES = {
     "a part that is no mapping": (but(gripper=None), ["gripper is None"]),
     "a package that is not installed": (
         but(model="no_such_arms:arm.xml"),
-        ["model is in 'no_such_arms'", "not installed", "pip install no_such_arms"],
+        ["model is in 'no_such_arms'", "not installed", "pip install --no-deps no-such-arms"],
     ),
     "a model that is not there": (but(model="onw.xml"), ["cannot read", "onw.xml", "No such file"]),
     "a folder for a model": (but(model="."), ["robot own", "cannot read"]),
@@ -262,8 +266,10 @@ def test_the_fingers_move_along_the_hands_y(robot: str):
         world.update()
         places.append(np.array([world.data.geom_xpos[pads[0]] for pads in gripper.pads]))
     moved = (places[1] - places[0]) @ world.ee.rotation
-    assert (np.abs(moved[:, 1]) > 0.02).all()
-    assert (np.abs(moved[:, [0, 2]]) < 0.4 * np.abs(moved[:, [1]])).all()
+    moves = moved[np.abs(moved).max(axis=1) > 1e-9]  # of some one jaw alone
+    assert len(moves) == 2 - world.lopsided
+    assert (np.abs(moves[:, 1]) > 0.02).all()
+    assert world.leans or (np.abs(moves[:, [0, 2]]) < 0.4 * np.abs(moves[:, [1]])).all()
 
 
 @every_robot

@@ -19,7 +19,7 @@ from manip_il.tasks.table import TASKS
 from manip_il.tasks.task import instruction_in, phases
 
 from ..scenes import SEED, drive_until, started
-from ..tables import every_robot
+from ..tables import every_large_robot
 
 STARTS = range(SEED, SEED + 100)
 
@@ -57,7 +57,7 @@ def test_a_restored_state_says_the_same_in_words_and_numbers():
         np.testing.assert_allclose(numbers["bin_from_cube.x"], bin_at[0] - cube[0], atol=1e-6)
 
 
-@every_robot
+@every_large_robot
 def test_an_episodes_text_is_that_of_its_state(robot: str):
     world = started(robot, "sort").world
     for episode in run_job(RolloutJob(EnvConfig(robot, "sort", horizon=6), "expert"), STARTS[:3]):
@@ -66,7 +66,7 @@ def test_an_episodes_text_is_that_of_its_state(robot: str):
         assert episode.instruction == instruction_in(TASKS["sort"], world)
 
 
-@every_robot
+@every_large_robot
 def test_the_cube_that_is_named_ends_in_its_bin_and_the_others_where_they_were(robot: str):
     env = started(robot, "sort")
     expert, before = Expert(env.scene), {name: env.world.pose(name).position.copy() for name in COLOURS}

@@ -12,7 +12,7 @@ from manip_il.robots.found.hand import find_ee
 from manip_il.robots.found.home import find_home
 from manip_il.robots.parts import EndEffector
 from manip_il.robots.robot import Robot, costs_of, yaw_of
-from manip_il.robots.spec import bare_spec
+from manip_il.robots.spec import bare_spec, require
 
 
 def complete(said: Mapping[str, Any]) -> dict[str, Any]:
@@ -20,6 +20,7 @@ def complete(said: Mapping[str, Any]) -> dict[str, Any]:
     said = dict(said)
     spec = bare_spec(said["name"], said["files"], said["hand"], said["gripper"])
     joints = said.setdefault("joints", arm_joints(said["name"], spec, said["hand"], said["gripper"].joints))
+    require(said["name"], "joint", joints, spec.joints)
     said.setdefault("costs", costs_of(len(joints)))
     said.setdefault("yaw", yaw_of(len(joints)))
     forces, armature = motor_limits(said["name"], said["files"], spec, joints)
