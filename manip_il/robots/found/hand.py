@@ -20,6 +20,7 @@ _AT_OBJECT = 0.7  # of the way from closed to open: fingers that turn then stand
 _SETTLE, _STEP = 1000, 0.002  # physics steps, and their length [s]
 FROM_TIP = 0.012  # of the frame, from the fingertips [m]
 _CLEAR = 0.006  # of the fingertips over the table at the frame's lowest [m]
+_SQUARE = 0.95  # cosine of how far the fingers' way may be off an axis of the hand's body to count as along it
 _LEAST_GAP = 1e-4  # between fingers half closed [m]
 _METRES, _TURN = 4, 6  # digits
 
@@ -27,7 +28,7 @@ _METRES, _TURN = 4, 6  # digits
 def find_ee(robot: Robot) -> EndEffector:
     """Return the frame between the fingertips: z from the hand to them, y along the way that the fingers come together.
 
-    Both are along axes of the hand's body. Raises `UsageError` where the fingers never stand before the hand.
+    Along axes of the hand's body, where that is nearly so. Raises `UsageError` where the fingers never stand before the hand.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = model.body(robot.hand).id
@@ -42,7 +43,7 @@ def find_ee(robot: Robot) -> EndEffector:
     way = other - one - z * (z @ (other - one))
     if np.linalg.norm(way) < _LEAST_GAP:
         raise UsageError(f"robot {robot.name}: the fingers do not come apart; look at gripper.fingers and gripper.open")
-    y = _along_axis(way)
+    y = _along_axis(way / np.linalg.norm(way), _SQUARE)
     x = np.cross(y, z)
     low, high = (max((points[pad] @ x).min() for pad in pads), min((points[pad] @ x).max() for pad in pads))
     position = x * (low + high) / 2 + y * (y @ (one + other)) / 2 + z * (tip - FROM_TIP)
@@ -79,9 +80,11 @@ def _tip(robot: Robot, z: F64) -> float:
     return max(float(((outline(model, data, geom) - data.xpos[hand]) @ along).max()) for geom in geoms)
 
 
-def _along_axis(vector: F64) -> F64:
-    """The unit vector along the axis that a vector is most along, (3,)."""
+def _along_axis(vector: F64, least: float = 0.0) -> F64:
+    """The unit vector along the axis that a vector is most along, (3,); the vector where its share is below `least`."""
     axis = int(np.argmax(np.abs(vector)))
+    if abs(float(vector[axis])) < least:
+        return vector
     unit = np.zeros(3)
     unit[axis] = np.sign(vector[axis])
     return unit
