@@ -28,7 +28,7 @@ _METRES, _TURN = 4, 6  # digits
 def find_ee(robot: Robot) -> EndEffector:
     """Return the frame between the fingertips: z from the hand to them, y along the way that the fingers come together.
 
-    Along axes of the hand's body, where that is nearly so. Raises `UsageError` where the fingers never stand before the hand.
+    Along axes of the hand's body, where that is nearly so. Raises `UsageError` where the fingers do not come apart.
     """
     model, data = _settled(robot, _AT_OBJECT)
     hand = model.body(robot.hand).id

@@ -1,0 +1,140 @@
+"""What a robot's YAML need not say, found on its model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.errors import ManipError
+from manip_il.robots.gripper import sweep
+from manip_il.robots.ik import ArmIK
+from manip_il.robots.robot import FOUND, Robot, get_robot
+from manip_il.robots.rotations import angle_across, angle_off_vertical
+from manip_il.seeding import stream_seeds
+from manip_il.sim.config import EnvConfig
+
+from .own import ARM, JAWS, tree_of, write
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "configs" / "robots").glob("*.yaml"))
+SEEDS = stream_seeds("validation", 4)
+every_example = pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+
+
+def short(jaws: str = "slides", **said: Any) -> dict[str, Any]:
+    """What the YAML of one's own arm must say, and what it says beside that."""
+    tree = {key: value for key, value in tree_of(jaws).items() if key not in FOUND}
+    return tree | {"hand": "hand"} | said
+
+
+@pytest.fixture(scope="module", params=list(JAWS))
+def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("found"), request.param, request.param, short(request.param))
+
+
+@pytest.fixture(scope="module")
+def own(path: Path) -> Robot:
+    return get_robot(str(path))
+
+
+def test_the_arms_joints_are_those_from_base_to_hand(own: Robot):
+    assert list(own.joints) == tree_of()["joints"]
+
+
+def test_the_frame_is_between_the_tips_with_y_along_their_way(own: Robot):
+    said = tree_of()["ee"]
+    assert own.ee.body == said["body"]
+    np.testing.assert_allclose(own.ee.position, said["position"], atol=0.012)
+    np.testing.assert_allclose(np.abs(own.ee.quaternion), np.abs(said["quaternion"]), atol=1e-6)
+
+
+def test_at_home_the_hand_is_over_the_workspace_and_points_down(own: Robot):
+    ik = ArmIK(own)
+    position, rotation = ik.ee_pose(np.array(own.home))
+    np.testing.assert_allclose(position[:2], own.workspace.centre, atol=0.01)
+    assert angle_off_vertical(rotation) < 0.05
+    assert abs(np.sin(angle_across(rotation) - ik.ahead(position))) < 0.05
+    limited = np.isfinite(ik.limits).all(axis=1)
+    margins = np.minimum(np.array(own.home) - ik.limits[:, 0], ik.limits[:, 1] - np.array(own.home))
+    assert (margins[limited] > 0.1).all()
+
+
+def test_gains_suit_the_inertia_that_a_joint_moves(own: Robot):
+    shoulder, roll = own.gains[1], own.gains[-1]
+    assert shoulder > 2 * roll > 0  # the whole arm hangs on one, the hand on the other
+    assert own.forces == (200.0,) * 5  # the model sets no limits
+
+
+def test_what_is_found_is_the_same_again(own: Robot, path: Path):
+    again = Robot.read(path)
+    assert all(getattr(again, name) == getattr(own, name) for name in FOUND)
+
+
+def test_what_the_yaml_says_is_not_sought(tmp_path: Path):
+    said = {name: tree_of()[name] for name in ("joints", "home", "gains")}
+    robot = get_robot(str(write(tmp_path, tree=short(**said, armature=[0.3] * 5))))
+    assert robot.home == tuple(said["home"])
+    assert robot.gains == tuple(said["gains"])
+    assert robot.armature == (0.3,) * 5
+
+
+def test_limits_of_motors_are_those_of_the_model(tmp_path: Path):
+    weak = '<motor joint="turn" gear="50" ctrlrange="-1 1" ctrllimited="true"/>'
+    model = ARM.replace('<motor name="motor" joint="turn"/>', weak).replace("FINGERS", JAWS["slides"][0])
+    assert get_robot(str(write(tmp_path, tree=short(), model=model))).forces[:2] == (50.0, 200.0)
+
+
+MISTAKES = {
+    "unknown hand": (short(hand="hnad"), ["unknown body", "did you mean 'hand'"]),
+    "a hand before every joint": (short(hand="base"), ["no joint turns between the base and 'base'"]),
+    "a workspace out of reach": (
+        short(workspace={"centre": [3.0, 0.0]}),
+        ["the hand does not get over the workspace's centre (3, 0)", "workspace.centre"],
+    ),
+    "a gripper's file that is not there": (
+        short(gripper=tree_of()["gripper"] | {"model": "jaws.xml"}),
+        ["cannot read", "jaws.xml", "No such file"],
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line(mistake: str, tmp_path: Path):
+    tree, words = MISTAKES[mistake]
+    with pytest.raises(ManipError) as refused:
+        get_robot(str(write(tmp_path, tree=tree)))
+    assert "\n" not in str(refused.value)
+    for word in words:
+        assert word in str(refused.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach", "pick_place"])
+def test_the_expert_drives_an_arm_of_a_short_yaml(path: Path, task: str):
+    episodes = list(run_job(RolloutJob(EnvConfig(str(path), task), "expert"), SEEDS))
+    assert all(episode.success for episode in episodes)
+
+
+@pytest.mark.slow
+@every_example
+def test_an_example_says_little_and_is_found_whole(example: Path):
+    said = [line for line in example.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    assert len(said) <= 15
+    robot = get_robot(str(example))
+    opens = sweep(robot)
+    assert opens.openings[0] < 0.01
+    assert opens.openings[-1] > 0.06
+    position, rotation = ArmIK(robot).ee_pose(np.array(robot.home))
+    np.testing.assert_allclose(position[:2], robot.workspace.centre, atol=0.015)
+    assert angle_off_vertical(rotation) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ur5e", "xarm7"])
+def test_the_expert_stacks_with_fingers_on_a_linkage(name: str):
+    example = next(path for path in EXAMPLES if path.stem == name)
+    episodes = list(run_job(RolloutJob(EnvConfig(str(example), "stack"), "expert"), SEEDS))
+    assert all(episode.success for episode in episodes)
