@@ -75,7 +75,7 @@ class Gripper:
         return self._closed + share * self._travel
 
     def commanded(self, commands: F64, before: F64) -> float:
-        """Return the opening [m] that commands (g,) ask for: that of the actuator they move farthest from `before` (g,)."""
+        """Return the opening [m] that commands (g,) ask for: of the actuator that they move farthest from `before`."""
         shares = (commands - self._closed) / self._travel
         moved = np.abs(shares - (before - self._closed) / self._travel)
         return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))

@@ -40,8 +40,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
     in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
     render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.
-    Raises `UnknownName` for a robot, task, camera or render_mode, `UsageError` for a size of pictures that `CameraConfig`
-    refuses, `RenderError` for `human` without a display.
+    Raises `UnknownName` for a robot, task, camera or render_mode, `UsageError` for a size of pictures that
+    `CameraConfig` refuses, `RenderError` for `human` without a display.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
