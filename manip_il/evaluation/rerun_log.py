@@ -12,6 +12,7 @@ from typing import Any
 from manip_il.data import schema
 from manip_il.engine.environments import env_spec
 from manip_il.errors import ManipError
+from manip_il.evaluation.rerun_world import ROOT, WorldLog
 from manip_il.evaluation.watch import outcome
 from manip_il.mdp import Transition
 from manip_il.sim.config import CAMERAS, EnvConfig
@@ -51,6 +52,7 @@ class RerunLog:
             except Exception as error:  # rerun raises its own kinds
                 raise ManipError(f"{output} cannot be written: {error}") from error
         self._name_curves()
+        self._in_3d = WorldLog(self._rerun, self._stream, self._world)
 
     @property
     def address(self) -> str:
@@ -78,6 +80,7 @@ class RerunLog:
         }.items():
             stream.log(name, rerun.Scalars(value))
         self._add_label(step)
+        self._in_3d.add(first=step.step == 0)
         if step.done:
             self._say(outcome(step))
         if self._clock is not None:
@@ -115,18 +118,29 @@ class RerunLog:
     def _blueprint(self) -> Any:
         import rerun.blueprint as layout
 
+        x, y = self._world.scene.robot.workspace.centre
+        eye = layout.EyeControls3D(position=(x + 1.1, y - 1.1, 0.9), look_target=(x, y, 0.15), eye_up=(0, 0, 1))
         pictures = [layout.Spatial2DView(origin=schema.IMAGES + name, name=name) for name in CAMERAS]
+        no_legend = layout.PlotLegend(visible=False)
         curves = [
             layout.StateTimelineView(origin=schema.EXPERT_PHASE, name="phase"),
             layout.TimeSeriesView(contents=[schema.PROGRESS, ERROR], name="progress, error [m]"),
-            layout.TimeSeriesView(origin=schema.STATE, name="joints [rad], opening [m]"),
-            layout.TimeSeriesView(origin=schema.EXECUTED_ACTION, name="executed action"),
+            layout.TimeSeriesView(origin=schema.STATE, name="joints [rad], opening [m]", plot_legend=no_legend),
+            layout.TimeSeriesView(origin=schema.EXECUTED_ACTION, name="executed action", plot_legend=no_legend),
             layout.TextLogView(origin=EVENTS, name="episodes"),
         ]
         return layout.Blueprint(
-            layout.Horizontal(layout.Vertical(*pictures), layout.Vertical(*curves, row_shares=[1, 2, 3, 3, 1])),
-            layout.TimePanel(timeline=TIME, expanded=False),
-            layout.SelectionPanel(expanded=False),
+            layout.Horizontal(
+                layout.Vertical(
+                    layout.Spatial3DView(origin=ROOT, name="world", eye_controls=eye),
+                    layout.Horizontal(*pictures),
+                    row_shares=[3, 2],
+                ),
+                layout.Vertical(*curves, row_shares=[1, 2, 2, 2, 1]),
+            ),
+            layout.TimePanel(timeline=TIME, state="collapsed"),
+            layout.SelectionPanel(state="hidden"),
+            layout.BlueprintPanel(state="collapsed"),
         )
 
 
