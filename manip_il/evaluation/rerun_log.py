@@ -32,13 +32,15 @@ _JPEG_QUALITY = 90
 class RerunLog:
     """Steps of episodes, sent to a file, or in real time to whoever opens `address`.
 
-    Raises `ManipError` without rerun, or where the file cannot be written.
+    Raises `ManipError` without rerun, `OSError` where the file cannot be written.
     """
 
     driver = None  # nobody drives by it
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         self._rerun: Any = _import_rerun()
+        if output:
+            output.open("wb").close()  # first: rerun adds lines of its own where it cannot write
         self._env, self._task = env, get_task(env.task, env.object)
         self._spec = env_spec(env)
         self._world = World(build_scene(env.robot, env.task, env.object, env.physics_step))
@@ -47,10 +49,7 @@ class RerunLog:
         self._stream = self._rerun.RecordingStream(APPLICATION)
         self.web_port, self.grpc_port = (0, 0) if output else self._serve()
         if output:
-            try:
-                self._stream.save(output, default_blueprint=self._blueprint())
-            except Exception as error:  # rerun raises its own kinds
-                raise ManipError(f"{output} cannot be written: {error}") from error
+            self._stream.save(output, default_blueprint=self._blueprint())
         self._name_curves()
         self._in_3d = WorldLog(self._rerun, self._stream, self._world)
 

@@ -44,7 +44,7 @@ def require_display() -> None:
         opened = glfw.init()
     if not opened:
         named = ", ".join(f"{name}={os.environ[name]}" for name in DISPLAYS if os.environ.get(name))
-        raise RenderError(f"no window can be opened on the display ({named}); unset it, then {_INSTEAD}")
+        raise RenderError(f"no window can be opened on the display ({named}); unset it, or {_INSTEAD}")
 
 
 class Clock:
