@@ -6,7 +6,10 @@ but for the control sliders (`commands`) and the pull of the mouse (`pull`), for
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import os
+import threading
 import time
 import warnings
 from typing import Any
@@ -26,6 +29,7 @@ F64 = NDArray[np.float64]
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
 _INSTEAD = 'use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
 _LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # height [m], [m], [deg]: the camera at first
+_CLOSING = 5.0  # longest time that closing takes [s]
 
 
 def has_display() -> bool:
@@ -74,9 +78,12 @@ class Window:
         self._model, self._data = self._view.model, mujoco.MjData(self._view.model)
         self._state = np.empty(mujoco.mj_stateSize(self._model, STATE_KIND))
         self._clock = Clock(config.control_hz)
+        others = threading.enumerate()
         self._handle: Any = mujoco.viewer.launch_passive(
             self._model, self._data, show_left_ui=False, show_right_ui=sliders
         )
+        self._threads = [one for one in threading.enumerate() if one not in others]
+        atexit.register(self.close)  # before MuJoCo's own, which do not wait for its threads and may crash
         with self._handle.lock():
             camera = self._handle.cam
             camera.lookat[:] = [*get_robot(config.robot).workspace.centre, _LOOK_AT]
@@ -96,9 +103,10 @@ class Window:
             mujoco.mj_getState(self._model, data, self._state, STATE_KIND)
             mujoco.mj_setState(self._model, self._data, self._state, STATE_KIND)
             mujoco.mj_forward(self._model, self._data)
-        if text:
-            self._handle.set_texts((None, None, text, ""))
-        self._handle.sync()
+        with contextlib.suppress(mujoco.UnexpectedError):  # closed meanwhile
+            if text:
+                self._handle.set_texts((None, None, text, ""))
+            self._handle.sync()
         self._clock.wait()
 
     @property
@@ -112,5 +120,8 @@ class Window:
         mujoco.mjv_applyPerturbForce(self._model, data, self._handle.perturb)
 
     def close(self) -> None:
-        """Close it."""
+        """Close it, and wait until it is gone; a second call changes nothing."""
+        atexit.unregister(self.close)
         self._handle.close()
+        for one in self._threads:
+            one.join(_CLOSING)
