@@ -17,6 +17,7 @@ from manip_il.sim.world import World
 ROOT = "world"
 _SHOWN_GROUPS = 3  # of geoms; those beyond are for contacts alone
 _LEAST_NORMAL = 1e-12
+_NO_COLOUR = (0.5, 0.5, 0.5, 1.0)  # of a geom that has none of its own
 
 
 class WorldLog:
@@ -102,6 +103,6 @@ def _mesh(rerun: Any, model: Any, mesh: int, colour: NDArray[np.uint8]) -> Any:
 
 
 def _colour(model: Any, geom: int) -> NDArray[np.float32]:
-    """Red, green, blue and opacity of a geom, (4,), 0 to 1."""
-    material = int(model.geom_matid[geom])
-    return model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+    """Red, green, blue and opacity of a geom, (4,), 0 to 1: its own, else its material's, as MuJoCo has it."""
+    own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    return own if material < 0 or (own != _NO_COLOUR).any() else model.mat_rgba[material]

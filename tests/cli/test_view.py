@@ -65,10 +65,10 @@ def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys
         recorded = np.concatenate([episode.columns[name] for episode in episodes])
         shown = np.array(column(path, name, SCALARS)).astype(recorded.dtype)
         np.testing.assert_array_equal(shown, recorded)
-    [progress] = np.array(column(path, schema.PROGRESS, SCALARS)).T
-    recorded = np.concatenate([episode.columns[schema.PROGRESS].ravel() for episode in episodes])
+    progress = np.array(column(path, schema.PROGRESS, SCALARS)).ravel()
+    recorded = np.concatenate([episode.columns[schema.PROGRESS].ravel() for episode in episodes]).astype(float)
     np.testing.assert_allclose(progress, recorded, atol=1e-6)
-    [error] = np.array(column(path, "error", SCALARS)).T
+    error = np.array(column(path, "error", SCALARS)).ravel()
     assert error[0] > 0.02 > error[steps[0] - 1]
     events = [line for [line] in column(path, "events", TEXT)]
     task = "seed 3000000: Move the hand to the green goal."
