@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import UnknownName
 from manip_il.mdp import Observation, State
 from manip_il.seeding import rng_for
 from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
@@ -22,7 +21,7 @@ from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import drawn_in, with_drawn
-from manip_il.sim.window import Window, require_display
+from manip_il.sim.window import Window, check_render_mode
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import ask, instruction_in
@@ -68,10 +67,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._task = get_task(self.config.task, self.config.object)
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise UnknownName("render_mode", render_mode, self.metadata["render_modes"])
-        if render_mode == "human":
-            require_display()
+        check_render_mode(render_mode, self.metadata["render_modes"])
         self.render_mode, self._window = render_mode, None
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}

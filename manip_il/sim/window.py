@@ -12,13 +12,14 @@ import os
 import threading
 import time
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.errors import RenderError
+from manip_il.errors import RenderError, UnknownName
 from manip_il.robots.robot import get_robot
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import FILM, EnvConfig
@@ -49,6 +50,14 @@ def require_display() -> None:
     if not opened:
         named = ", ".join(f"{name}={os.environ[name]}" for name in DISPLAYS if os.environ.get(name))
         raise RenderError(f"no window can be opened on the display ({named}); unset it, or {_INSTEAD}")
+
+
+def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+    """Raise `UnknownName` for a render_mode that is not known, `RenderError` for `human` without a display."""
+    if mode not in (None, *known):
+        raise UnknownName("render_mode", mode, known)
+    if mode == "human":
+        require_display()
 
 
 class Clock:

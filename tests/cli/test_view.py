@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -139,3 +140,10 @@ def test_a_display_that_does_not_answer_is_said_in_one_line(monkeypatch, error):
     monkeypatch.setenv("DISPLAY", ":77")
     assert main(REACH) == 1
     assert "no window can be opened on the display (DISPLAY=:77)" in error()
+
+
+def test_without_rerun_what_to_install_is_said_in_one_line(monkeypatch, tmp_path, no_opengl, error):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main([*REACH, f"--output={tmp_path / 'a.rrd'}"]) == 1
+    assert "rerun is not installed; run: pip install 'rerun-sdk" in error()
+    assert list(tmp_path.iterdir()) == []

@@ -7,6 +7,7 @@ import pytest
 
 from manip_il.errors import RenderError, UsageError
 from manip_il.sim import env as module
+from manip_il.sim import window as windows
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import Clock
 
@@ -37,7 +38,7 @@ def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatc
         def close(self):
             shown.append(-1.0)
 
-    monkeypatch.setattr(module, "require_display", lambda: None)
+    monkeypatch.setattr(windows, "require_display", lambda: None)
     monkeypatch.setattr(module, "Window", Window)
     env = ManipEnv("panda", "reach", render_mode="human")
     env.reset(seed=0)
