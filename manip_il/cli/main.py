@@ -39,6 +39,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
+    "view": Command("manip_il.cli.view:ViewOptions", "watch a robot at its task, in a window or a browser"),
     "record": Command("manip_il.cli.record:RecordOptions", "record demonstrations of the expert as a dataset"),
     "render": Command(
         "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"

@@ -97,13 +97,20 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     make = simulation_of(job.env.robot).make
     envs = [make(job.env, cameras, job.conditions) for _ in range(min(lockstep(job), len(seeds)))]
     expert = _expert(job.env)
-    transitions = rollout(envs, seeds, _make_driver(job, envs[0]), _rules(job), expert)
+    steps = run_steps(job, envs, seeds)
     if job.cameras is None and cameras is not None:
-        transitions = map(_without_pictures, transitions)
+        steps = map(_without_pictures, steps)
     branch_env = _BranchEnv(make(job.env, job.cameras)) if job.label == "branch" else None
-    for frames in group_rollouts(transitions):
+    for frames in group_rollouts(steps):
         drawn = draw(job.conditions, frames[0].seed, job.env.object).values
         yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
+
+
+def run_steps(
+    job: RolloutJob, envs: Sequence[RestorableEnvironment], seeds: Iterable[int], driver: Driver | None = None
+) -> Iterator[Transition]:
+    """Yield every step of a job's episodes as it happens in these environments. driver: in place of the job's own."""
+    return rollout(envs, seeds, driver or _make_driver(job, envs[0]), _rules(job), _expert(job.env))
 
 
 def lockstep(job: RolloutJob) -> int:

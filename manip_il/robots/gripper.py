@@ -87,6 +87,12 @@ class Gripper:
         """
         return float(np.interp(opening, self._sweep.openings, self._sweep.middles)) if self.lopsided else 0.0
 
+    def commanded(self, commands: F64, before: F64) -> float:
+        """Return the opening [m] that commands (g,) ask for: of the actuator that they move farthest from `before`."""
+        shares = (commands - self._closed) / self._travel
+        moved = np.abs(shares - (before - self._closed) / self._travel)
+        return float(np.interp(shares[moved.argmax()], self._sweep.shares, self._sweep.openings))
+
     def touches(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) -> bool:
         """Return whether every finger touches one of an object's geoms. Needs kinematics to be up to date in `data`."""
         # For two boxes that are apart `mj_geomDistance` now and then returns 0, but only within its greatest distance.

@@ -21,6 +21,7 @@ from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures
 from manip_il.sim.scene import build_scene
 from manip_il.sim.variation import drawn_in, with_drawn
+from manip_il.sim.window import Window, check_render_mode
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import ask, instruction_in
@@ -37,10 +38,12 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
     "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
     in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
-    Raises `UnknownName` for a robot, task or camera, `UsageError` for a size of pictures that `CameraConfig` refuses.
+    render_mode: `rgb_array`, or `human`: MuJoCo's viewer in real time, from `reset` and `step`.
+    Raises `UnknownName` for a robot, task, camera or render_mode, `UsageError` for a size of pictures that
+    `CameraConfig` refuses, `RenderError` for `human` without a display.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -64,7 +67,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._task = get_task(self.config.task, self.config.object)
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
-        self.render_mode = render_mode
+        check_render_mode(render_mode, self.metadata["render_modes"])
+        self.render_mode, self._window = render_mode, None
         self.cameras, self.image_size = tuple(cameras), image_size
         self.metadata = self.metadata | {"render_fps": self.config.control_hz}
         self._max_episode_steps = self.config.horizon
@@ -94,6 +98,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         if options and "instruction" in options:
             ask(self._task, self.world, str(options["instruction"]))
             self.world.update()
+        if self.render_mode == "human":
+            self.render()
         return self._observation(), self._info()
 
     @property
@@ -140,6 +146,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         """Apply one action (n,) for one control step."""
         self.begin_step()
         self.advance(action)
+        if self.render_mode == "human":
+            self.render()
         return self._observation(), float(self.solved), False, self._step >= self.config.horizon, self._info()
 
     def begin_step(self) -> None:
@@ -224,14 +232,28 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return World(self.scene)
 
     def render(self) -> Picture | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return a picture from the front camera, uint8 (480, 640, 3)."""
+        """Return a picture from the front camera, uint8 (480, 640, 3); None where a window shows the world."""
+        if self.render_mode == "human":
+            if self._window is None:
+                self._window = Window(self.config)
+            self._window.show(self.data, self.looks)
         if self.render_mode != "rgb_array":
             return None
         return self._pictures(CameraConfig(("front",), 480, 640, self.look))["front"]
 
+    def close(self) -> None:
+        """Close the window, where there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    @property
+    def looks(self) -> Drawn:
+        """Appearance of the episode's world: what pictures of it depend on beside poses."""
+        return Drawn(self.drawn.condition, drawn_in(self.world.variation, self.scene.nominal))
+
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
-        looks = Drawn(self.drawn.condition, drawn_in(self.world.variation, self.scene.nominal))
-        return pictures(self.config.robot, self.config.task, self.data, cameras, looks, self.config.object)
+        return pictures(self.config.robot, self.config.task, self.data, cameras, self.looks, self.config.object)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

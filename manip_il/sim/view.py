@@ -43,10 +43,14 @@ _CHANGED = (
 
 
 class ViewModel:
-    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics model's."""
+    """A model to draw from, not to simulate: every name, address and pose in `model` is the physics model's.
 
-    def __init__(self, robot: str, task: str, look: Look, shape: str = ""):
-        self.model: Any = copy.copy(_with_few_faces(robot, task, shape))
+    fine: keep every face of the meshes.
+    """
+
+    def __init__(self, robot: str, task: str, look: Look, shape: str = "", *, fine: bool = False):
+        whole = build_scene(robot, task, shape).model
+        self.model: Any = copy.copy(whole if fine else _with_few_faces(robot, task, shape))
         self.model.vis.quality.offsamples = 0  # the renderer smooths edges itself
         if not look.shadows:
             self.model.vis.quality.shadowsize = 0

@@ -28,6 +28,7 @@ SMALL: Sizes = {  # put into every command that has the option
     "test_episodes": 1,
     "disturbed_episodes": 1,
     "eval.n_episodes": 2,
+    "n_episodes": 1,
     "eval.films": 0,
     "env.horizon": 60,  # a demonstration takes 40 steps; a policy that has learnt nothing takes all that it is given
     "training_seeds": 1,

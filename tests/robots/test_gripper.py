@@ -53,6 +53,17 @@ def test_the_opening_that_is_commanded_is_the_opening_that_is_measured(robot: st
 
 
 @every_robot
+def test_commands_ask_for_the_opening_of_the_actuator_that_they_move_most(robot: str):
+    gripper = world_of(robot).scene.gripper
+    before, wanted = gripper.command(0.02), gripper.command(0.05)
+    assert gripper.commanded(wanted, before) == pytest.approx(0.05, abs=1e-6)
+    for one in range(len(before)):
+        alone = before.copy()
+        alone[one] = wanted[one]
+        assert gripper.commanded(alone, before) == pytest.approx(0.05, abs=1e-6)
+
+
+@every_robot
 def test_the_measured_opening_is_the_gap_between_the_pads(robot: str):
     world = world_of(robot)
     gripper = world.scene.gripper

@@ -1,0 +1,165 @@
+"""`manip-il view`: a robot at its task, live in MuJoCo's viewer, or in Rerun where there is no display."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from manip_il.cli import common_options as common
+from manip_il.cli.inputs import check_policy, find_policy, observation_text, require_folder
+from manip_il.cli.progress import say, warn
+from manip_il.cli.trials import SUITE_HELP, require_suite, suite_conditions
+from manip_il.errors import RenderError, UsageError
+from manip_il.option import option
+from manip_il.stock.table import ROBOT as STOCK
+
+if TYPE_CHECKING:
+    from manip_il.engine.jobs import RolloutJob
+    from manip_il.evaluation.watch import Screen
+    from manip_il.sim.config import CameraConfig, EnvConfig
+    from manip_il.sim.env import ManipEnv
+
+HOLD = 10  # control steps that an episode goes on for after success
+IN_A_FILE = 3  # episodes, where nobody says how many
+SIZE = (240, 320)  # of pictures that no policy looks at [pixels]
+SUFFIX = ".rrd"
+
+
+@dataclass
+class WatchedPolicyGroup:
+    """`--policy.*` of what drives."""
+
+    path: Path | None = option(None, "a checkpoint or a run")
+    type: Literal["expert", "random", "sliders"] | None = option(
+        None, "instead of a checkpoint; sliders: those of the window; by default expert"
+    )
+
+
+@dataclass
+class ViewOptions:
+    """Watch a robot at its task: in MuJoCo's viewer, without a display in a browser (Rerun), or from a file.
+
+    Shows episodes in real time until the window is closed, Ctrl-C, or so many. Without a display it serves the pictures
+    of the cameras, joints, actions, phase, error and progress to a browser; `--output` writes them to a file for `rerun
+    FILE.rrd`, on any machine, as fast as they come.
+    """
+
+    example: ClassVar[str] = "manip-il view --robot.type=panda --task.type=stack --n_episodes=1 --output=stack.rrd"
+    policy: WatchedPolicyGroup = field(default_factory=WatchedPolicyGroup)
+    robot: common.MaybeRobotGroup = field(default_factory=common.MaybeRobotGroup)
+    task: common.MaybeTaskGroup = field(default_factory=common.MaybeTaskGroup)
+    env: common.EnvGroup = field(default_factory=common.EnvGroup)
+    suite: str = option("nominal", SUITE_HELP)
+    n_episodes: int | None = option(None, f"episodes; by default without end, {IN_A_FILE} in a file")
+    seed: int = common.seed_option()
+    trust: bool = common.trust_option()
+    output: Path | None = option(None, "write a file of Rerun's, FILE.rrd, in place of showing anything")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        if self.policy.path is not None and self.policy.type is not None:
+            raise UsageError("give one of --policy.path=DIR and --policy.type=expert|random|sliders")
+        if self.n_episodes is not None and self.n_episodes < 1:
+            raise UsageError(f"--n_episodes is {self.n_episodes}; expected at least 1")
+        self._seeds()
+        if self.output is not None:
+            if self.output.suffix != SUFFIX or self.output.is_dir():
+                raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
+            require_folder(self.output.parent, f"the folder of --output={self.output}")
+        if self.policy.path is not None:
+            find_policy(self.policy.path)
+        require_suite(self.suite)
+        if self.robot.type == STOCK:
+            raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
+        self.env.config(self.robot.type, self.task.type, shape=self.task.object)
+        if self.policy.type == "sliders":
+            self._check_sliders()
+
+    def run(self) -> None:
+        """Run episodes and show them."""
+        from manip_il.engine.jobs import observed_cameras, run_steps
+        from manip_il.evaluation.watch import outcome
+        from manip_il.sim.env import ManipEnv
+
+        job = self._job()
+        env = ManipEnv.of(job.env, observed_cameras(job), job.conditions)
+        with contextlib.closing(self._screen(env)) as screen:
+            for step in run_steps(job, [env], self._seeds(), screen.driver):
+                if not screen.add(step):
+                    break
+                if step.done:
+                    say(outcome(step))
+        if self.output is not None:
+            say(f"next: rerun {self.output}")
+
+    def _seeds(self) -> range:
+        from manip_il.seeding import BLOCK, stream_seeds
+
+        return stream_seeds("validation", self.n_episodes or (IN_A_FILE if self.output else BLOCK), self.seed)
+
+    def _check_sliders(self) -> None:
+        """Raise `UsageError` where nobody can move sliders."""
+        from manip_il.sim.window import DISPLAYS, has_display
+
+        if self.output is not None:
+            raise UsageError("--policy.type=sliders needs a window; leave --output out")
+        if not has_display():
+            raise UsageError(
+                f"--policy.type=sliders needs a display, and neither {' nor '.join(DISPLAYS)} is set; "
+                "choose --policy.type=expert or random, or a --policy.path"
+            )
+
+    def _job(self) -> RolloutJob:
+        """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
+        from manip_il.engine.jobs import RolloutJob
+        from manip_il.learn.checkpoint import read_meta
+        from manip_il.mdp import LONGEST_EPISODE
+
+        path = None if self.policy.path is None else find_policy(self.policy.path)
+        meta = None if path is None else read_meta(path)
+        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object)
+        cameras = None if path is None else check_policy(path, meta, env, trust=self.trust)
+        if cameras is not None and path is not None:
+            say(observation_text(cameras, path))
+        if cameras is None and not self._in_a_window:
+            cameras = self._cameras(env)
+        conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
+        driver = "policy" if path else "random" if self.policy.type == "random" else "expert"
+        if self.policy.type == "sliders" and not self.env.horizon:
+            env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
+        return RolloutJob(env, driver, policy=path, hold=HOLD, conditions=conditions, cameras=cameras, trust=self.trust)
+
+    @property
+    def _in_a_window(self) -> bool:
+        from manip_il.sim.window import has_display
+
+        return self.output is None and has_display()
+
+    def _cameras(self, env: EnvConfig) -> CameraConfig | None:
+        """Return cameras for people, with shadows where nobody waits; None, with a warning, without OpenGL."""
+        from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
+        from manip_il.sim.env import ManipEnv
+
+        cameras = CameraConfig(CAMERAS, *SIZE, FILM if self.output else Look())
+        try:
+            ManipEnv.of(env, cameras).reset(seed=0)
+        except RenderError as error:
+            warn([f"shown without pictures: {error}"])
+            return None
+        return cameras
+
+    def _screen(self, env: ManipEnv) -> Screen:
+        from manip_il.evaluation.rerun_log import RerunLog
+        from manip_il.evaluation.watch import WindowScreen
+
+        if self._in_a_window:
+            return WindowScreen(env, sliders=self.policy.type == "sliders")
+        log = RerunLog(env.config, self.output)
+        if log.address:
+            ports = " ".join(f"-L {port}:localhost:{port}" for port in (log.web_port, log.grpc_port))
+            say(f"open: {log.address}")
+            say(f"from another machine first: ssh {ports} {socket.gethostname()}")
+        return log

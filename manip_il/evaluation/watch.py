@@ -1,0 +1,79 @@
+"""Episodes in a window as they happen, and the window's sliders as a driver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.engine.environments import env_spec
+from manip_il.mdp import Actor, Transition
+from manip_il.rollout import Driver, Turn
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.window import Window
+
+F64 = NDArray[np.float64]
+
+
+class Screen(Protocol):
+    """Interface of what shows episodes as they happen."""
+
+    @property
+    def driver(self) -> Driver | None:
+        """Driver of what it shows, where somebody drives by it."""
+        ...
+
+    def add(self, step: Transition) -> bool:
+        """Show a step; returns whether to go on."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class WindowScreen:
+    """MuJoCo's viewer of one environment, with its phase and progress; objects can be pulled with the mouse.
+
+    sliders: its control sliders drive. Raises `RenderError` where there is no display.
+    """
+
+    def __init__(self, env: ManipEnv, *, sliders: bool = False):
+        self._env, self._phases = env, env_spec(env.config).phases
+        self._window = Window(env.config, sliders=sliders)
+        self.driver = SlidersDriver(self._window, env) if sliders else None
+
+    def add(self, step: Transition) -> bool:
+        """Show the world after a step, in real time; returns False once the window is closed."""
+        phase = f"  {self._phases[step.label.phase]}" if step.label else ""
+        solved = "  solved" if step.success else ""
+        text = f"seed {step.seed}  step {step.step + 1}{phase}  progress {100 * self._env.progress:.0f} %{solved}"
+        self._window.show(self._env.data, self._env.looks, text)
+        self._window.pull(self._env.data)
+        return self._window.is_open
+
+    def close(self) -> None:
+        """Close the window."""
+        self._window.close()
+
+
+class SlidersDriver:
+    """Executes what the control sliders of a window say."""
+
+    def __init__(self, window: Window, env: ManipEnv):
+        self._window, self._env = window, env
+
+    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        """Return joint targets [rad] and opening [m], (n,); an episode begins with those that it starts from."""
+        scene, before = self._env.scene, self._env.data.ctrl
+        [turn] = turns
+        commands = before if turn.step == 0 else self._window.commands
+        opening = scene.gripper.commanded(commands[scene.gripper.ctrl], before[scene.gripper.ctrl])
+        return [(scene.actions.join(commands[scene.arm_ctrl], opening), Actor.LEARNER)]
+
+
+def outcome(step: Transition) -> str:
+    """Return how the episode ended whose last step this is."""
+    return f"seed {step.seed}: {'solved' if step.success or step.state.ever else 'not solved'}, {step.step + 1} steps"

@@ -1,0 +1,136 @@
+"""MuJoCo's own viewer of an environment, in real time, where there is a display.
+
+It shows a copy of the model and of the physics: what is moved or changed in its panels does not reach the episode,
+but for the control sliders (`commands`) and the pull of the mouse (`pull`), for who asks for them.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import threading
+import time
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import RenderError, UnknownName
+from manip_il.robots.robot import get_robot
+from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
+from manip_il.sim.config import FILM, EnvConfig
+from manip_il.sim.view import ViewModel
+from manip_il.sim.world import STATE_KIND
+
+F64 = NDArray[np.float64]
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")  # variables of X11 and Wayland
+_INSTEAD = 'use render_mode="rgb_array", or manip-il view --output=FILE.rrd'
+_LOOK_AT, _DISTANCE, _AZIMUTH, _ELEVATION = 0.15, 1.9, 140.0, -25.0  # height [m], [m], [deg]: the camera at first
+_CLOSING = 5.0  # longest time that closing takes [s]
+
+
+def has_display() -> bool:
+    """Return whether the environment names a display."""
+    return any(os.environ.get(name) for name in DISPLAYS)
+
+
+def require_display() -> None:
+    """Raise `RenderError` unless a window can be opened: MuJoCo's viewer would wait for ever."""
+    if not has_display():
+        raise RenderError(f"no display: neither {' nor '.join(DISPLAYS)} is set; {_INSTEAD}")
+    import glfw  # MuJoCo's own; it warns where there is no display
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = glfw.init()
+    if not opened:
+        named = ", ".join(f"{name}={os.environ[name]}" for name in DISPLAYS if os.environ.get(name))
+        raise RenderError(f"no window can be opened on the display ({named}); unset it, or {_INSTEAD}")
+
+
+def check_render_mode(mode: str | None, known: Sequence[str]) -> None:
+    """Raise `UnknownName` for a render_mode that is not known, `RenderError` for `human` without a display."""
+    if mode not in (None, *known):
+        raise UnknownName("render_mode", mode, known)
+    if mode == "human":
+        require_display()
+
+
+class Clock:
+    """Real time in control steps."""
+
+    def __init__(self, hz: float):
+        self._step, self._due = 1 / hz, 0.0
+
+    def wait(self) -> None:
+        """Wait until a control step has passed since the last call returned; not at all where it is late."""
+        now = time.monotonic()
+        self._due = max(self._due + self._step, now)
+        time.sleep(self._due - now)
+
+
+class Window:
+    """A window that shows one environment. sliders: open the panel on the right, which has them.
+
+    Raises `RenderError` where there is no display.
+    """
+
+    def __init__(self, config: EnvConfig, *, sliders: bool = False):
+        require_display()
+        import mujoco.viewer
+
+        self._view = ViewModel(config.robot, config.task, FILM, config.object, fine=True)
+        self._model, self._data = self._view.model, mujoco.MjData(self._view.model)
+        self._state = np.empty(mujoco.mj_stateSize(self._model, STATE_KIND))
+        self._clock = Clock(config.control_hz)
+        others = threading.enumerate()
+        self._handle: Any = mujoco.viewer.launch_passive(
+            self._model, self._data, show_left_ui=False, show_right_ui=sliders
+        )
+        self._threads = [one for one in threading.enumerate() if one not in others]
+        atexit.register(self.close)  # before MuJoCo's own, which do not wait for its threads and may crash
+        with self._handle.lock():
+            camera = self._handle.cam
+            camera.lookat[:] = [*get_robot(config.robot).workspace.centre, _LOOK_AT]
+            camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
+
+    @property
+    def is_open(self) -> bool:
+        """False once somebody has closed it."""
+        return self._handle.is_running()
+
+    def show(self, data: mujoco.MjData, drawn: Drawn = NOMINAL_VALUES, text: str = "") -> None:
+        """Show the world as `data` has it, then wait for real time. drawn: how it looks. text: in the upper left."""
+        if not self.is_open:
+            return
+        with self._handle.lock():
+            self._view.apply(drawn)
+            mujoco.mj_getState(self._model, data, self._state, STATE_KIND)
+            mujoco.mj_setState(self._model, self._data, self._state, STATE_KIND)
+            mujoco.mj_forward(self._model, self._data)
+        with contextlib.suppress(mujoco.UnexpectedError):  # closed meanwhile
+            if text:
+                self._handle.set_texts((None, None, text, ""))
+            self._handle.sync()
+        self._clock.wait()
+
+    @property
+    def commands(self) -> F64:
+        """Positions of the control sliders, in the actuators' units, (u,): as shown last, or as moved since."""
+        return self._data.ctrl.copy()
+
+    def pull(self, data: mujoco.MjData) -> None:
+        """Apply to `data` the force with which the mouse pulls at a body [N], until the next call."""
+        data.xfrc_applied[:] = 0.0
+        mujoco.mjv_applyPerturbForce(self._model, data, self._handle.perturb)
+
+    def close(self) -> None:
+        """Close it, and wait until it is gone; a second call changes nothing."""
+        atexit.unregister(self.close)
+        self._handle.close()
+        for one in self._threads:
+            one.join(_CLOSING)

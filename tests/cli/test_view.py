@@ -1,0 +1,149 @@
+"""Episodes are watched as they happen: in a file of Rerun's every step is what was simulated."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.experimental import RrdReader
+
+from manip_il.cli.main import main
+from manip_il.data import schema
+from manip_il.engine.jobs import RolloutJob, run_job, run_steps
+from manip_il.evaluation.rerun_log import FRAME
+from manip_il.evaluation.watch import SlidersDriver
+from manip_il.mdp import Episode
+from manip_il.sim.config import CAMERAS, EnvConfig
+
+from ..scenes import started
+
+REACH = ["view", "--task.type=reach"]
+SCALARS, TEXT = "Scalars:scalars", "TextLog:text"
+
+
+@pytest.fixture(autouse=True)
+def _no_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def column(path: Path, entity: str, component: str) -> list[Any]:
+    """What an entity has on every frame, in their order."""
+    rows: dict[int, Any] = {}
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static:
+            batch = chunk.to_record_batch().to_pydict()
+            rows |= {f: v for f, v in zip(batch[FRAME], batch.get(component, []), strict=False) if v is not None}
+    return [rows[frame] for frame in sorted(rows)]
+
+
+def simulated(task: str) -> Iterator[Episode]:
+    """The same episodes, without anybody watching."""
+    return run_job(RolloutJob(EnvConfig("panda", task), "expert", hold=10), [3_000_000, 3_000_001])
+
+
+def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys):
+    path = tmp_path / "reach.rrd"
+    assert main([*REACH, "--n_episodes=2", f"--output={path}"]) == 0
+    out, err = capsys.readouterr()
+    assert "warning: shown without pictures: no OpenGL here" in err
+    episodes = list(simulated("reach"))
+    steps = [len(episode) for episode in episodes]
+    assert out.splitlines() == [
+        f"seed 3000000: solved, {steps[0]} steps",
+        f"seed 3000001: solved, {steps[1]} steps",
+        f"next: rerun {path}",
+    ]
+    for name in (schema.STATE, schema.ACTION, schema.EXECUTED_ACTION):
+        recorded = np.concatenate([episode.columns[name] for episode in episodes])
+        shown = np.array(column(path, name, SCALARS)).astype(recorded.dtype)
+        np.testing.assert_array_equal(shown, recorded)
+    progress = np.array(column(path, schema.PROGRESS, SCALARS)).ravel()
+    recorded = np.concatenate([episode.columns[schema.PROGRESS].ravel() for episode in episodes]).astype(float)
+    np.testing.assert_allclose(progress, recorded, atol=1e-6)
+    error = np.array(column(path, "error", SCALARS)).ravel()
+    assert error[0] > 0.02 > error[steps[0] - 1]
+    events = [line for [line] in column(path, "events", TEXT)]
+    task = "seed 3000000: Move the hand to the green goal."
+    assert events[:2] == [task, f"seed 3000000: solved, {steps[0]} steps"]
+    assert len(events) == 4
+    assert {"/world/goal", f"/{schema.EXPERT_PHASE}"} <= entities(path)
+    assert not any(schema.IMAGES in entity for entity in entities(path))
+
+
+@pytest.mark.gl
+def test_a_file_holds_a_picture_of_every_camera_in_every_step(tmp_path):
+    path = tmp_path / "reach.rrd"
+    assert main([*REACH, "--n_episodes=1", "--env.horizon=10", f"--output={path}"]) == 0
+    steps = len(column(path, schema.STATE, SCALARS))
+    assert steps == 10
+    for camera in CAMERAS:
+        pictures = column(path, schema.IMAGES + camera, "EncodedImage:blob")
+        assert [bytes(np.array(one, np.uint8).ravel()[:2]) for one in pictures] == [b"\xff\xd8"] * steps  # JPEG
+
+
+def test_a_policy_is_watched_and_one_of_another_robot_refused(policy, tmp_path, no_opengl, error):
+    path = tmp_path / "p.rrd"
+    words = ["view", f"--policy.path={policy}", "--n_episodes=1", "--env.horizon=6", f"--output={path}"]
+    assert main(words) == 0
+    executed, labels = (np.array(column(path, name, SCALARS)) for name in (schema.EXECUTED_ACTION, schema.ACTION))
+    assert executed.shape == labels.shape == (6, 8)
+    assert (executed != labels).any(axis=1).all()
+    assert main([*words, "--robot.type=fetch"]) == 1
+    assert "robot differs: the policy has panda" in error()
+
+
+def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
+    class Window:
+        commands = np.zeros(0)
+
+    env, window = started(task="reach"), Window()
+    scene, start = env.scene, env.data.ctrl.copy()
+    job = RolloutJob(EnvConfig("panda", "reach", horizon=30), "expert")
+    window.commands = start + 0.1
+    window.commands[scene.gripper.ctrl] = start[scene.gripper.ctrl]
+    window.commands[scene.gripper.ctrl[0]] = 0.03  # one finger: the other one follows
+    steps = list(run_steps(job, [env], [3_000_000], SlidersDriver(window, env)))
+    begun = steps[0].executed_action[scene.actions.arm]
+    assert not np.isclose(begun, window.commands[scene.arm_ctrl]).any()
+    np.testing.assert_allclose(steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl])
+    np.testing.assert_allclose(env.data.ctrl[scene.gripper.ctrl], 0.03, atol=1e-6)
+    np.testing.assert_allclose(env.data.qpos[scene.arm_q], window.commands[scene.arm_ctrl], atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--policy.type=sliders"], "needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set"),
+        (["--policy.type=sliders", "--output=x.rrd"], "needs a window; leave --output out"),
+        (["--output=x.mp4"], "expected a file, NAME.rrd"),
+        (["--robot.type=fetch_stock"], "cannot be viewed"),
+        (["--n_episodes=0"], "expected at least 1"),
+        (["--policy.type=expert", "--policy.path=x"], "give one of"),
+    ],
+)
+def test_what_cannot_be_watched_is_refused(words: list[str], says: str, here, error):
+    assert main(["view", *words]) == 2
+    assert says in error()
+    assert list(here.iterdir()) == []
+
+
+def test_a_display_that_does_not_answer_is_said_in_one_line(monkeypatch, error):
+    monkeypatch.setenv("DISPLAY", ":77")
+    assert main(REACH) == 1
+    assert "no window can be opened on the display (DISPLAY=:77)" in error()
+
+
+def test_without_rerun_what_to_install_is_said_in_one_line(monkeypatch, tmp_path, no_opengl, error):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main([*REACH, f"--output={tmp_path / 'a.rrd'}"]) == 1
+    assert "rerun is not installed; run: pip install 'rerun-sdk" in error()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,61 @@
+"""`render_mode="human"` shows every step in a window, or says what is missing."""
+
+from __future__ import annotations
+
+import gymnasium
+import pytest
+
+from manip_il.errors import RenderError, UsageError
+from manip_il.sim import env as module
+from manip_il.sim import window as windows
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.window import Clock
+
+from ..scenes import still
+
+
+def test_without_a_display_human_is_refused_in_one_line(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(
+        RenderError, match=r'^no display: .*; use render_mode="rgb_array", or manip-il view --output=.*$'
+    ):
+        gymnasium.make("manip_il/PandaReach-v0", render_mode="human")
+    with pytest.raises(UsageError, match=r"unknown render_mode 'humna' \(did you mean 'human'\?\)"):
+        ManipEnv(render_mode="humna")
+
+
+def test_the_window_shows_the_start_and_every_step_until_it_is_closed(monkeypatch):
+    shown: list[float] = []
+
+    class Window:
+        def __init__(self, config):
+            self.config = config
+
+        def show(self, data, drawn):
+            shown.append(data.time)
+
+        def close(self):
+            shown.append(-1.0)
+
+    monkeypatch.setattr(windows, "require_display", lambda: None)
+    monkeypatch.setattr(module, "Window", Window)
+    env = ManipEnv("panda", "reach", render_mode="human")
+    env.reset(seed=0)
+    for _ in range(2):
+        env.step(still(env))
+    env.close()
+    env.close()
+    assert shown == pytest.approx([0.0, 0.05, 0.1, -1.0])
+
+
+def test_a_clock_keeps_real_time_and_does_not_make_up_for_what_was_late(monkeypatch):
+    now, slept = [100.0], list[float]()
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("time.sleep", slept.append)
+    clock = Clock(20)
+    for taken in (0.0, 0.02, 5.0, 0.01):
+        now[0] += taken
+        clock.wait()
+        now[0] += slept[-1]
+    assert slept == pytest.approx([0.0, 0.03, 0.0, 0.04])
