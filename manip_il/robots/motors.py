@@ -32,7 +32,8 @@ def motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
         joint.damping = np.array([_FINGER_DAMPING if slides else _HINGE_DAMPING, 0, 0])
         joint.armature = _FINGER_ARMATURE if slides else _HINGE_ARMATURE
         joint.frictionloss = 0.0
-        _position_actuator(spec, joint, _FINGER_GAINS if slides else _HINGE_GAINS)
+        kp, kv, force = _FINGER_GAINS if slides else _HINGE_GAINS
+        _position_actuator(spec, joint, (kp, kv, robot.gripper.force or force))
 
 
 def calm(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:

@@ -45,7 +45,8 @@ class EndEffector:
 class GripperConfig:
     """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
 
-    finger_mass: of every finger in place of the model's [kg]. files: of a gripper that has a model of its own, whose
+    finger_mass: of every finger in place of the model's [kg]. force: the most of a driven joint [N or N m], by default 40 N
+    of one that slides and 10 N m of one that turns. files: of a gripper that has a model of its own, whose
     names begin with `gripper/`; position [m] and quaternion (wxyz): of that model in the hand's body.
     """
 
@@ -54,6 +55,7 @@ class GripperConfig:
     open: tuple[float, ...]
     fingers: tuple[str, ...]
     finger_mass: float | None = None
+    force: float | None = None
     files: ModelFiles | None = None
     position: tuple[float, ...] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
@@ -73,12 +75,14 @@ class GripperConfig:
                 )
         mass = tree.get("finger_mass")
         mass = None if mass is None else checks.number(f"{what}.finger_mass", mass, 1e-6, 100)
+        force = tree.get("force")
+        force = None if force is None else checks.number(f"{what}.force", force, 1e-3, 1e4)
         files = ModelFiles.read(f"{what}.", tree, folder) if "model" in tree else None
         if files is not None:
             joints, fingers = (tuple(GRIPPER + name for name in several) for several in (joints, fingers))
         position = numbers(f"{what}.position", tree.get("position", cls.position), 3, FURTHEST)
         quaternion = numbers(f"{what}.quaternion", tree.get("quaternion", cls.quaternion), 4, 1.0)
-        return cls(joints, closed, opened, fingers, mass, files, position, quaternion)
+        return cls(joints, closed, opened, fingers, mass, force, files, position, quaternion)
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,8 @@ class EnvConfig:
         rate = self.control_hz / LIMITS_HZ
         found = {
             "tolerance": limits.tolerance,
-            "success_steps": round(limits.success_steps * rate),
-            "horizon": round(limits.horizon * rate),
+            "success_steps": max(1, round(limits.success_steps * rate)),
+            "horizon": max(1, round(limits.horizon * rate)),
         }
         for name, value in found.items():
             object.__setattr__(self, name, getattr(self, name) or value)

@@ -23,6 +23,7 @@ _OTHERS = {  # of other programs, by their own manuals
         "build-arg", "cap-drop", "cpus", "format", "gpus", "memory", "network", "read-only", "rm", "security-opt",
         "tmpfs", "user",
     },
+    "pip": {"no-deps"},
     "accelerate": {"multi_gpu", "num_processes"},
     "lerobot-dataset-viz": {"episode-index", "output-dir", "repo-id", "root", "save"},
 }  # fmt: skip

@@ -219,16 +219,17 @@ def test_the_world_is_changed_by_as_much_as_the_kind_says(env: ManipEnv, seed: i
     assert changed("open")[2] == pytest.approx(env.scene.gripper.most, abs=1e-6)
 
 
-@pytest.mark.parametrize(("kind", "streak"), [("open", 3), ("closed", 0)])
-def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, kind: str, streak: int):
-    drive_until(env, "descend")  # with open fingers
+@pytest.mark.parametrize("kind", ["open", "closed"])
+def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, kind: str):
+    drive_until(env, "descend")  # with open fingers; one jaw that moves alone is not all open
     env.set_state(replace(env.get_state(), streak=3))
     state = env.get_state()
     perturbed = started(env.config.robot, env.task, conditions=(Perturbation(kind, {SEED: state.step}),))
     perturbed.set_state(state)
     perturbed.begin_step()
-    assert (bits(perturbed) == bits(env)) == (kind == "open")
-    assert perturbed.get_state().streak == streak
+    same = kind == "open" and not env.world.lopsided
+    assert (bits(perturbed) == bits(env)) == same
+    assert perturbed.get_state().streak == (3 if same else 0)
 
 
 def test_a_random_action_is_any_that_a_learner_may_choose(env: ManipEnv):
