@@ -37,13 +37,14 @@ class Sweep:
 
     shares: of the way from closed to open, commanded and measured, rising, (c,). openings: between the pads at rest
     [m], rising, (c,). middles: of the pads along the hand's y [m], (c,); all 0 where both sides move alike. pads: for
-    each finger its geoms' places among the finger's, the nearest to the other one first.
+    each finger its geoms' places among the finger's, the nearest to the other one first; holding: those that may hold.
     """
 
     shares: F64
     openings: F64
     middles: F64
     pads: tuple[tuple[int, ...], ...]
+    holding: tuple[tuple[int, ...], ...]
 
 
 class Gripper:
@@ -61,8 +62,9 @@ class Gripper:
         self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()  # numpy's interp takes 3 us
         fingers = finger_geoms(model, config.fingers, prefix)
         self.geoms = frozenset(geom for finger in fingers for geom in finger)
-        self.pads = tuple(
-            tuple(finger[i] for i in pads) for finger, pads in zip(fingers, self._sweep.pads, strict=True)
+        self.pads, self._holding = (
+            tuple(tuple(finger[i] for i in own) for finger, own in zip(fingers, places, strict=True))
+            for places in (self._sweep.pads, self._sweep.holding)
         )
         self.lopsided = bool(self._sweep.middles.any())
         self.least, self.most = float(self._sweep.openings[0]), float(self._sweep.openings[-1])
@@ -98,7 +100,7 @@ class Gripper:
         # For two boxes that are apart `mj_geomDistance` now and then returns 0, but only within its greatest distance.
         return all(
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads for geom in geoms)
-            for pads in self.pads
+            for pads in self._holding
         )
 
 
@@ -144,8 +146,12 @@ def sweep(robot: Robot) -> Sweep:
         )
     if np.ptp(middles) < _LOPSIDED:
         middles = np.zeros(len(middles))
-    places = tuple(tuple(finger.index(pad) for pad in own) for finger, own in zip(fingers, pads, strict=True))
-    return Sweep(np.array(shares), np.array(openings), middles, places)
+    holding = jaws if middles.any() else pads  # a jaw that turns holds wide things farther from its tip
+    places = [
+        tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
+        for some in (pads, holding)
+    ]
+    return Sweep(np.array(shares), np.array(openings), middles, *places)
 
 
 def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.MjModel, mujoco.MjData]:

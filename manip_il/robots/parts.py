@@ -45,8 +45,8 @@ class EndEffector:
 class GripperConfig:
     """The driven joints, where each stands when the gripper is closed and open, and the bodies that touch things.
 
-    finger_mass: of every finger in place of the model's [kg]. force: the most of a driven joint [N or N m], by default 40 N
-    of one that slides and 10 N m of one that turns. files: of a gripper that has a model of its own, whose
+    finger_mass: of every finger in place of the model's [kg]. force: the most of a driven joint, by default 40 N of one
+    that slides and 10 N m of one that turns [N or N m]. files: of a gripper that has a model of its own, whose
     names begin with `gripper/`; position [m] and quaternion (wxyz): of that model in the hand's body.
     """
 

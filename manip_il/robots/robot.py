@@ -33,8 +33,8 @@ class Robot:
     hand down [rad]. gains, forces, armature: kp of each joint [N m/rad], its greatest torque [N m], and what is added
     to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's nor the
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad]. yaw: where
-    a hand's yaw is zero, along the world's x or straight ahead of the shoulder. colours: red, green and blue of meshes
-    without contacts, by patterns of names, later ones first.
+    a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the model's own, on its
+    hand. colours: red, green and blue of meshes without contacts, by patterns of names, later ones first.
     """
 
     name: str
@@ -50,6 +50,7 @@ class Robot:
     workspace: Workspace
     costs: Costs = UPRIGHT
     yaw: str = "world"
+    wrist_camera: str = ""
     base: tuple[float, ...] | None = None
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP
@@ -107,6 +108,8 @@ class Robot:
         if "hand" not in tree and "ee" not in tree:
             raise missing(str(path), "hand")
         said["hand"] = checks.text("hand", tree["hand"]) if "hand" in tree else said["ee"].body
+        if "wrist_camera" in tree:
+            said["wrist_camera"] = checks.text("wrist_camera", tree["wrist_camera"], checks.LONGEST_NAME)
         if tree.get("base") is not None:
             said["base"] = numbers("base", tree["base"], 3, FURTHEST)
         fixed, colours = (checks.mapping(name, tree.get(name, {})) for name in ("fixed", "colours"))

@@ -16,14 +16,20 @@ from manip_il.robots.motors import calm, motorise
 from manip_il.robots.parts import GRIPPER, GripperConfig
 from manip_il.robots.robot import Robot
 
+WRIST = "wrist"  # the camera that a robot may keep
 
-def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig) -> mujoco.MjSpec:
+
+def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
     """Return a robot's model, its gripper's on its hand, without what a model brings for a world of its own.
 
-    Raises `UsageError` naming the file that MuJoCo cannot read, or the body that is not there; robot: its name.
+    robot: its name. camera: the one on the hand, kept as `wrist`.
+    Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is not there.
     """
     spec = files.load(robot)
-    _strip(spec)
+    if camera:
+        require(robot, "camera", (camera,), spec.cameras)
+        spec.camera(camera).name = WRIST
+    _strip(spec, WRIST if camera else "")
     if gripper.files is None:
         return spec
     require(robot, "body", (hand,), spec.bodies)
@@ -40,7 +46,7 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
 
     Raises `UsageError` naming a joint, body or file that is not there, and what is.
     """
-    spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper)
+    spec = bare_spec(robot.name, robot.files, robot.hand, robot.gripper, robot.wrist_camera)
     require(robot.name, "joint", (*robot.joints, *robot.gripper.joints), spec.joints)
     require(robot.name, "body", (robot.hand, robot.ee.body, *robot.gripper.fingers), spec.bodies)
     linked = linkage(spec, robot)
@@ -132,9 +138,9 @@ def _stand_at(joint: Any, value: float) -> None:
         body.quat = both
 
 
-def _strip(spec: mujoco.MjSpec) -> None:
+def _strip(spec: mujoco.MjSpec, kept: str = "") -> None:
     """Delete what a model brings for a world of its own: motors, mocap bodies, sky, views, gravity and time."""
-    for one in _foreign(spec):
+    for one in _foreign(spec, kept):
         spec.delete(one)
     copy_options(mujoco.MjSpec(), spec)
     for name in [name for name in dir(spec) if name.startswith("nuser_")]:
@@ -147,7 +153,7 @@ def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
         setattr(spec.option, name, getattr(origin.option, name))
 
 
-def _foreign(spec: mujoco.MjSpec) -> Iterator[Any]:
+def _foreign(spec: mujoco.MjSpec, kept: str) -> Iterator[Any]:
     """Yield what is to be deleted, looked up again after every kind: MuJoCo deletes what hangs on the deleted too."""
     yield from list(spec.keys)
     mocaps = {body.name for body in spec.bodies if body.mocap}
@@ -156,7 +162,8 @@ def _foreign(spec: mujoco.MjSpec) -> Iterator[Any]:
     used = {name for material in spec.materials for name in material.textures}
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
     yield from [texture for texture in spec.textures if texture.type == sky or texture.name not in used]
-    for kind in ("actuators", "sensors", "cameras", "lights", "sites"):
+    yield from [camera for camera in spec.cameras if not kept or camera.name != kept]
+    for kind in ("actuators", "sensors", "lights", "sites"):
         yield from list(getattr(spec, kind))
 
 

@@ -30,6 +30,7 @@ _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 _FLOOR = -0.4  # [m]
 _TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
+SEEN = 0.15  # half the width of a workspace that the front camera sees from its usual distance [m]
 _ON_TABLE = 0.02  # of a robot's lowest point from the table's top: it stands there [m]
 _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
@@ -67,7 +68,8 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     _add_table(spec, robot)
     arm = arm_spec(robot)
     _add_pedestal(spec, arm, robot)
-    _add_wrist_camera(arm)
+    if not robot.wrist_camera:
+        _add_wrist_camera(arm)
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_front_camera(spec, robot)
@@ -236,7 +238,8 @@ def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArr
 
 def _add_front_camera(spec: mujoco.MjSpec, robot: Robot) -> None:
     x, y = robot.workspace.centre
-    eye, at = (x + 0.85, y - 0.72, 0.66), (x - 0.10, y, 0.20)
+    scale = robot.workspace.half_width / SEEN
+    eye, at = (x + 0.85 * scale, y - 0.72 * scale, 0.66 * scale), (x - 0.10 * scale, y, 0.20 * scale)
     back = np.subtract(eye, at)
     back = back / np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import TABLE, build_scene, camera_id
+from manip_il.sim.scene import SEEN, TABLE, build_scene, camera_id
 from manip_il.sim.variation import GEOMS, resized
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.integer]
 _CELLS = 22  # grid cells along a mesh's diagonal: what still looks right at 480 x 640 pixels
-_LEAST_CELL = 0.008  # what a pixel spans at 128 x 128 [m]
+_LEAST_CELL = 0.008  # what a pixel spans at 128 x 128; less where the cameras stand nearer [m]
 _PLAIN_FACES = 1_600  # meshes up to here stay as they are
 _PULL = 0.01  # of a cell's mean on its vertex, against that of its faces' planes
 _LEAST_PULL = 1e-12  # [m^2] where a cell has no faces
@@ -120,14 +120,15 @@ class ViewModel:
 
 @cache
 def _with_few_faces(robot: str, task: str, shape: str) -> mujoco.MjModel:
-    model = copy.copy(build_scene(robot, task, shape).model)
+    scene = build_scene(robot, task, shape)
+    model, finest = copy.copy(scene.model), min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL
     for mesh in range(model.nmesh):
         if model.mesh_facenum[mesh] > _PLAIN_FACES:
-            _simplify(model, mesh)
+            _simplify(model, mesh, finest)
     return model
 
 
-def _simplify(model: mujoco.MjModel, mesh: int) -> None:
+def _simplify(model: mujoco.MjModel, mesh: int, finest: float) -> None:
     """Overwrite the first of a mesh's vertices, normals and faces by fewer of them; what follows is never drawn."""
     vertices = _rows(model.mesh_vert, model.mesh_vertadr[mesh], model.mesh_vertnum[mesh])
     normals = _rows(model.mesh_normal, model.mesh_normaladr[mesh], model.mesh_normalnum[mesh])
@@ -135,19 +136,21 @@ def _simplify(model: mujoco.MjModel, mesh: int) -> None:
     face_normals = _rows(model.mesh_facenormal, model.mesh_faceadr[mesh], model.mesh_facenum[mesh])
     normal_of = np.zeros(len(vertices), dtype=np.int64)
     normal_of[faces] = face_normals
-    positions, originals, few = cluster(vertices.astype(np.float64), faces)
+    positions, originals, few = cluster(vertices.astype(np.float64), faces, finest)
     vertices[: len(positions)], normals[: len(positions)] = positions, normals[normal_of[originals]]
     faces[: len(few)] = face_normals[: len(few)] = few
     model.mesh_facenum[mesh] = len(few)
 
 
-def cluster(vertices: F64, faces: Indices) -> tuple[F64, Indices, Indices]:
+def cluster(vertices: F64, faces: Indices, finest: float = _LEAST_CELL) -> tuple[F64, Indices, Indices]:
     """Merge the vertices (v, 3) in each cell of a grid: positions (c, 3), an original vertex each (c,), faces (f, 3).
+
+    finest: least size of a cell [m].
 
     The original is the one nearest to the mean of its cell; its normal shades a coarse mesh like the fine one.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    size = max(float(np.linalg.norm(high - low)) / _CELLS, _LEAST_CELL)
+    size = max(float(np.linalg.norm(high - low)) / _CELLS, finest)
     grid = ((vertices - low) / size).astype(np.int64)
     _, cell, counts = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
     means = _sums(cell, vertices, len(counts)) / counts[:, None]

@@ -28,7 +28,7 @@ from manip_il.learn.train import fit
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import get_robot
 
-from ..tables import every_robot
+from ..tables import every_large_robot, every_robot
 from .tiny_policies import ACT, DIFFUSION, edit_config
 
 every_space = pytest.mark.parametrize("space", ACTION_SPACES)
@@ -102,7 +102,7 @@ def test_joint_spaces_lose_nothing(robot, space):
     np.testing.assert_array_equal(there[:, -1], actions[:, -1])
 
 
-@every_robot
+@every_large_robot
 def test_a_hand_motion_reaches_the_hands_pose_again_but_not_the_joints(robot):
     actions, states = moves(robot, 20)
     hand = conversion(EE_DELTA, robot)
@@ -115,7 +115,7 @@ def test_a_hand_motion_reaches_the_hands_pose_again_but_not_the_joints(robot):
     assert 1e-3 < off < 4 * get_robot(robot).max_joint_step  # the elbow's part
 
 
-@every_robot
+@every_large_robot
 def test_a_hand_motion_is_in_the_worlds_axes_and_a_far_one_is_approached(robot):
     _, states = moves(robot, 1)
     hand, targets = conversion(EE_DELTA, robot), np.zeros((1, states.shape[1]))

@@ -12,7 +12,7 @@ from manip_il.sim.scene import build_scene
 from manip_il.sim.view import ViewModel, cluster
 
 from ..scenes import started
-from ..tables import every_robot
+from ..tables import LARGE, every_robot
 
 
 def ball(rings: int) -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +89,9 @@ def test_few_faces_look_like_all_of_them(robot, monkeypatch):
     render.close()
     for camera in CAMERAS:
         apart = np.abs(few[camera].astype(int) - every[camera]).max(axis=2)
-        assert apart.mean() < 1
-        assert (apart > 40).mean() < 0.005
+        near = 1 if robot in LARGE else 3  # as much nearer cameras stand to a small one
+        assert apart.mean() < near
+        assert (apart > 40).mean() < 0.005 * near**2
 
 
 def test_a_turn_moves_the_lamps_about_the_vertical_and_brightness_scales_them():
