@@ -62,6 +62,7 @@ COMMANDS = {
     "export": Command("manip_il.cli.export:ExportOptions", "export a policy as ONNX or TorchScript"),
     "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
     "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
+    "robot new": Command("manip_il.cli.robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
     "quickstart": Command(
         "manip_il.cli.quickstart:QuickstartOptions", "run a small example: record, clone, DAgger, report"
     ),

@@ -84,6 +84,7 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
             "eval --policy.type=expert --suite=missing.yaml": "--suite=missing.yaml: no such file",
             "certify --policy.path=missing": "no policy in missing",
             "view --policy.path=missing": "no policy in missing",
+            "robot new missing.xml": "missing.xml is not there; expected an MJCF",
             "view --output=missing/a.rrd": "missing does not exist; expected the folder of --output=missing/a.rrd",
             "replay missing --episode=1": "missing does not exist; expected an eval.json",
             "merge a b": "a does not exist; expected an eval.json",

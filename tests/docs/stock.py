@@ -8,6 +8,7 @@ from pathlib import Path
 
 from manip_il.cli.main import main
 
+from ..robots.own import model_of
 from .pages import ROOT, command_of
 from .sizes import small_words
 
@@ -41,6 +42,8 @@ class Stock:
     def bring(self, words: tuple[str, ...], target: Path) -> None:
         """Put what a line reads, and nobody has made there yet, into `target`."""
         for path in inputs(words):
+            if path.endswith(".xml") and not (target / path).exists():
+                (target / path).write_text(model_of())
             name = next((name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None)
             if name is None or (target / name).exists():
                 continue

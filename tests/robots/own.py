@@ -79,6 +79,11 @@ _HINGES = """
 JAWS = {"slides": (_SLIDES, [0.0, 0.0], [0.045, 0.045]), "hinges": (_HINGES, [-0.2, -0.2], [0.6, 0.6])}
 
 
+def model_of(jaws: str = "slides") -> str:
+    """The MJCF."""
+    return ARM.replace("FINGERS", JAWS[jaws][0])
+
+
 def tree_of(jaws: str = "slides") -> dict[str, Any]:
     """What the YAML says."""
     _, closed, opened = JAWS[jaws]
@@ -95,8 +100,7 @@ def tree_of(jaws: str = "slides") -> dict[str, Any]:
 
 def write(folder: Path, name: str = "own", jaws: str = "slides", tree: Any = None, model: str | None = None) -> Path:
     """Write YAML and model; returns the YAML's path."""
-    text = ARM.replace("FINGERS", JAWS[jaws][0]) if model is None else model
-    (folder / "own.xml").write_text(text)
+    (folder / "own.xml").write_text(model_of(jaws) if model is None else model)
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(tree_of(jaws) if tree is None else tree))
     return path

@@ -1,0 +1,217 @@
+"""A first YAML for an MJCF: which body is the hand, what drives the fingers, and where there is room to work."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from manip_il.errors import UsageError
+from manip_il.robots.files import ModelFiles
+from manip_il.robots.geometry import nearest
+from manip_il.robots.gripper import finger_geoms
+from manip_il.robots.robot import Robot
+
+_ARM_GOES_ON = 3  # joints one after another that are more than a finger has
+_JAWS = ("jaw", "finger", "grip", "claw")  # in the name of a single one's body or joint
+_HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # in the name of a body that carries one
+_REACHES, _HALF = 0.5, 0.18  # of the workspace's centre and half width, in lengths of the arm
+_WIDEST, _HIGHEST = 0.15, 0.45  # of a workspace: half its width, its height [m]
+_ROUND = 0.01  # what lengths are rounded to [m]
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Words of a robot's YAML as they look on the model; names are those of the gripper's model.
+
+    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m].
+    """
+
+    hand: str
+    joints: tuple[str, ...]
+    closed: tuple[float, ...]
+    open: tuple[float, ...]
+    fingers: tuple[str, ...]
+    centre: tuple[float, float]
+    half_width: float
+    height: float
+
+
+def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
+    """Look at an MJCF, and at its gripper's where that has one of its own.
+
+    Raises `UsageError` where MuJoCo cannot read them, or no hand or no fingers are found.
+    """
+    spec = ModelFiles(model.absolute()).load(model.stem)
+    if gripper is None:
+        palm, jaws = _palm(spec, model)
+        hand, with_jaws = palm, spec
+    else:
+        with_jaws = ModelFiles(gripper.absolute()).load(gripper.stem)
+        hand, (palm, jaws) = _flange(spec.worldbody), _palm(with_jaws, gripper)
+    driven = _driven(with_jaws, jaws, gripper or model)
+    closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
+    length, base = _length(spec, hand.name)
+    return Suggestion(
+        hand.name,
+        tuple(joint.name for joint in driven),
+        closed,
+        opened,
+        fingers,
+        (_rounded(base[0] + _REACHES * length), _rounded(base[1])),
+        _rounded(min(_WIDEST, _HALF * length)),
+        _rounded(min(_HIGHEST, 3 * _HALF * length)),
+    )
+
+
+def _moves(body: Any) -> bool:
+    return bool(body.joints or body.find_all("joint"))
+
+
+def _depth(body: Any) -> int:
+    """Joints one after another, at most, from a body on."""
+    return len(body.joints) + max((_depth(child) for child in body.bodies), default=0)
+
+
+def _palm(spec: mujoco.MjSpec, path: Path) -> tuple[Any, list[Any]]:
+    """The body at which the chain of joints parts into fingers, and the first body of each; one jaw alone may be."""
+    body = spec.worldbody
+    while True:
+        moving = [child for child in body.bodies if _moves(child)]
+        longest = max(moving, key=_depth, default=None)
+        if longest is None:
+            break
+        if len(moving) > 1 and _depth(longest) < _ARM_GOES_ON:
+            return body, moving
+        body = longest
+    if body.joints and any(word in f"{body.name} {body.joints[0].name}".lower() for word in _JAWS):
+        return body.parent, [body]
+    raise UsageError(
+        f"{path}: its joints do not part into fingers, and the last body, {body.name!r}, is no jaw by its name;"
+        " a gripper with a model of its own is given by --gripper=PATH"
+    )
+
+
+def _flange(body: Any) -> Any:
+    """The body that a gripper is put on: the last of the chain, or what is fixed to it and named so."""
+    while True:
+        moving = [child for child in body.bodies if _moves(child)]
+        if not moving:
+            break
+        body = max(moving, key=_depth)
+    named = [one for one in body.find_all("body") if any(word in one.name.lower() for word in _HANDS)]
+    return named[-1] if named else body
+
+
+def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
+    """The joints of the fingers that motors drive: sliding ones, or else those next to the hand that have motors."""
+    joints = [joint for jaw in jaws for joint in (*jaw.joints, *(one for one in jaw.find_all("joint")))]
+    joints = list({joint.name: joint for joint in joints}.values())
+    slides = [joint for joint in joints if joint.type == mujoco.mjtJoint.mjJNT_SLIDE]
+    motors = {motor.target for motor in spec.actuators}
+    motored = [joint for joint in joints if joint.name in motors]
+    most = max((_depth(jaw) for jaw in jaws), default=0)
+    next_to_hand = [jaw.joints[0] for jaw in jaws if jaw.joints and _depth(jaw) == most]
+    coupled = {name for equality in spec.equalities for name in (equality.name1, equality.name2)}
+    in_step = [joint for joint in next_to_hand if joint.name in coupled]
+    driven = slides or motored or in_step or next_to_hand
+    if not driven or not all(joint.name and joint.range[0] < joint.range[1] for joint in driven):
+        raise UsageError(
+            f"{path}: no joint with a name and a range moves a finger; write the YAML by hand (docs/robots.md)"
+        )
+    return driven
+
+
+def _ends(
+    spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
+    """Where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
+    moving = [
+        jaw.name
+        for jaw in jaws
+        if {joint.name for joint in (*jaw.joints, *jaw.find_all("joint"))} & {j.name for j in driven}
+    ]
+    bodies = moving if len(moving) > 1 else [palm.name, *moving]
+    ranges = [tuple(float(end) for end in joint.range) for joint in driven]
+    model = spec.compile()
+    data, fingers = mujoco.MjData(model), finger_geoms(model, bodies)
+
+    def gap(values: Sequence[float]) -> float:
+        for joint, value in zip(driven, values, strict=True):
+            data.joint(joint.name).qpos[0] = value
+        mujoco.mj_kinematics(model, data)
+        ends = nearest(model, data, fingers)[1]
+        centres = [np.mean([data.geom_xpos[geom] for geom in finger], axis=0) for finger in fingers]
+        return float(np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(centres[1] - centres[0]))
+
+    middle = [sum(ends) / 2 for ends in ranges]
+    opened, closed = list(middle), list(middle)
+    for place, ends in enumerate(ranges):
+        gaps = [gap([*middle[:place], end, *middle[place + 1 :]]) for end in ends]
+        opened[place], closed[place] = ends if gaps[0] > gaps[1] else ends[::-1]
+    gap(closed)
+    pads = nearest(model, data, fingers)[0]
+    touching = tuple(model.body(model.geom_bodyid[pad]).name for pad in pads)
+    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies)
+
+
+def _length(spec: mujoco.MjSpec, hand: str) -> tuple[float, tuple[float, float]]:
+    """Length of the arm from its second joint to the hand [m], and where its base stands, x and y [m]."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    body, places = model.body(hand).id, [data.xpos[model.body(hand).id]]
+    while body:
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        places += [data.xanchor[joint] for joint in range(first, first + count)]
+        body = int(model.body_parentid[body])
+    steps = [float(np.linalg.norm(a - b)) for a, b in itertools.pairwise(places)]
+    return sum(steps[:-1]), (float(places[-1][0]), float(places[-1][1]))
+
+
+def _rounded(length: float) -> float:
+    return round(round(length / _ROUND) * _ROUND, 3)
+
+
+def yaml_of(found: Suggestion, model: str, gripper: str = "") -> str:
+    """Return the YAML of a suggestion, each line with what it means. model, gripper: paths as the YAML has them."""
+    own = f"  model: {gripper} # a gripper with a model of its own, put onto the hand\n" if gripper else ""
+    unit = "# where they are then: [m] where they slide, [rad] where they turn"
+    return f"""\
+# A first YAML, from what the model shows. Look it over, then: manip-il view --robot.type=THIS_FILE (docs/robots.md)
+model: {model}
+hand: {found.hand} # body that carries the gripper
+gripper:
+{own}  joints: {_listed(found.joints)} # what drives the fingers
+  closed: {_listed(found.closed)} {unit}
+  open: {_listed(found.open)}
+  fingers: {_listed(found.fingers)} # bodies that touch things
+workspace: # [m]
+  centre: {_listed(found.centre)} # on the table, x away from the base
+  half_width: {found.half_width:g}
+  height: {found.height:g}
+"""
+
+
+def _listed(values: Sequence[Any]) -> str:
+    return f"[{', '.join(f'{one:.5g}' if isinstance(one, float) else str(one) for one in values)}]"
+
+
+def found_lines(robot: Robot) -> str:
+    """Return what was found on the model as lines of YAML that say nothing until their `#` is taken away."""
+    ee = robot.ee
+    frame = f"position: {_listed(ee.position)}, quaternion: {_listed(ee.quaternion)}, lowest: {ee.lowest:g}"
+    return f"""\
+# Found on the model; what is said instead holds.
+# joints: {_listed(robot.joints)} # base to hand
+# home: {_listed(robot.home)} # hand down, over the workspace [rad]
+# gains: {_listed(robot.gains)} # kp of position control [N m/rad]
+# forces: {_listed(robot.forces)} # greatest torques [N m]
+# armature: {_listed(robot.armature)} # [kg m^2]
+# ee: {{body: {ee.body}, {frame}}} # [m], wxyz
+"""
