@@ -18,6 +18,7 @@ WITH_A_PEG = [(robot, task) for robot, task in GRASPING if task in ("insert", "i
 WITH_CUBES = [scene for scene in GRASPING if scene not in WITH_A_PEG]
 WITH_A_CUBE = [(robot, task) for robot, task in GRASPING if task in ONE_CUBE]
 
+BEYOND = [("so101", "sort")]  # whose bins a small arm does not reach
 LARGE = [robot for robot in ROBOTS if robot != "so101"]  # what needs a table's width is beyond a small one
 
 every_robot = pytest.mark.parametrize("robot", list(ROBOTS))

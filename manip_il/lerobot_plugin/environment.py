@@ -17,18 +17,19 @@ from lerobot.envs import EnvConfig
 
 from manip_il.child_processes import bound_to_this_process
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import UnknownName, shorten_ffmpeg_warning
+from manip_il.errors import UnknownName, UsageError, shorten_ffmpeg_warning
 from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import environment_state_names
-from manip_il.sim.register import ENV_IDS, register_envs
+from manip_il.sim.register import ENV_IDS, TASK_IDS, register_envs
 from manip_il.sim.scene import build_scene
 
 PACKAGE = "manip_il"
 TASKS = {env_id.removeprefix(f"{PACKAGE}/"): names for env_id, names in ENV_IDS.items()}
+ANY_ROBOTS = {env_id.removeprefix(f"{PACKAGE}/"): task for env_id, task in TASK_IDS.items()}
 RENDER_MODES = ("rgb_array", "none")
 _COMMANDS = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train")
 _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE, ACTION: ACTION}
@@ -39,6 +40,7 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE, ACTION: 
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
+    robot: for a task of any robot (`PickPlace-v0`), by name or a YAML; panda where none is said.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode:
@@ -48,6 +50,7 @@ class ManipILEnv(EnvConfig):
     """
 
     task: str | None = "PandaPickPlace-v0"
+    robot: str = ""
     fps: int = option_of(SimConfig, "control_hz")
     observation: str = "state"
     cameras: str = "front,wrist"
@@ -63,7 +66,7 @@ class ManipILEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         for kind, name, known in (
-            ("--env.task", self.task or "", TASKS),
+            ("--env.task", self.task or "", {**TASKS, **ANY_ROBOTS}),
             ("--env.observation", self.observation, OBSERVATIONS),
             ("--env.render_mode", self.render_mode, RENDER_MODES),
         ):
@@ -102,7 +105,12 @@ class ManipILEnv(EnvConfig):
         return {self.type: {0: envs}}
 
     def _simulation(self) -> SimConfig:
-        robot, task = TASKS[self.task or ""]
+        name = self.task or ""
+        robot, task = TASKS.get(name) or (self.robot or SimConfig.robot, ANY_ROBOTS[name])
+        if self.robot and self.robot != robot:
+            raise UsageError(
+                f"--env.robot is {self.robot!r}, and --env.task={name} is {robot}'s; leave one of them out"
+            )
         steps = self.success_steps
         return SimConfig(robot, task, self.fps, self.tolerance, steps, self.episode_length, self.object)
 

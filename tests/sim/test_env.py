@@ -14,7 +14,7 @@ from manip_il.robots.robot import ROBOTS
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.register import ENV_IDS, register_envs
+from manip_il.sim.register import ENV_IDS, TASK_IDS, register_envs
 from manip_il.sim.world import GOAL
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
@@ -58,6 +58,10 @@ def test_every_robot_and_task_has_a_name_in_gymnasium():
     assert {"manip_il/PandaPickPlace-v0", "manip_il/FetchReach-v0"} <= set(ENV_IDS)
     assert sorted(ENV_IDS.values()) == sorted(itertools.product(ROBOTS, TASKS))
     assert set(SCENES) <= set(ENV_IDS.values())
+    assert list(TASK_IDS.values()) == list(TASKS)
+    for env_id, task in TASK_IDS.items():
+        config = gymnasium.make(env_id, robot="fetch").unwrapped.config  # pyright: ignore[reportAttributeAccessIssue]
+        assert (config.robot, config.task) == ("fetch", task)
     for env_id, (robot, task) in ENV_IDS.items():
         env = gymnasium.make(env_id, horizon=6, success_steps=1)
         config = env.unwrapped.config  # pyright: ignore[reportAttributeAccessIssue]
