@@ -36,7 +36,10 @@ SMALL: Sizes = {  # put into every command that has the option
     "workers": 1,
 }
 GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1}  # only where the line gives the option
-OF_COMMAND: dict[str, Sizes] = {"dagger": {"image.height": 32, "image.width": 32}}
+OF_COMMAND: dict[str, Sizes] = {
+    "dagger": {"image.height": 32, "image.width": 32},
+    "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
+}
 OF_POLICY: dict[str, Sizes] = {
     "mlp": {"width": 16},
     "act": {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1},
