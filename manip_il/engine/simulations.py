@@ -6,7 +6,7 @@ Robots of our own stand in scenes that are built of a robot and a task; `SIMULAT
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -21,7 +21,7 @@ from manip_il.rollout import Environment, Labeller
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
-from manip_il.sim.scene import Scene, build_scene
+from manip_il.sim.scene import SCENES_KEPT, Scene, build_scene
 from manip_il.sim.world import World
 from manip_il.stock.simulation import StockSimulation
 from manip_il.stock.table import ROBOT as STOCK
@@ -146,6 +146,6 @@ def _scene(config: EnvConfig) -> Scene:
     return build_scene(config.robot, config.task, config.object, config.physics_step)
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def _world(robot: str, task: str, shape: str) -> World:
     return World(build_scene(robot, task, shape))

@@ -46,14 +46,15 @@ class ModelFiles:
     def load(self, robot: str) -> mujoco.MjSpec:
         """Read the model with its includes and meshes. Raises `UsageError` where MuJoCo cannot; robot: its name."""
         try:
-            text = self._text()
+            text = self._text()  # before MuJoCo: it does not say why a file cannot be read
             if self.includes is None and self.meshes is None:
                 if not self.mend:
                     return mujoco.MjSpec.from_file(str(self.model))
                 spec = mujoco.MjSpec.from_string(text)
                 spec.modelfiledir = str(self.model.parent)
                 return spec
-            spec = mujoco.MjSpec.from_string(text, include=self._included(), assets=self._assets())
+            included = {one.name: one.read_bytes() for one in self._included()}
+            spec = mujoco.MjSpec.from_string(text, include=included, assets=self._assets())
         except (OSError, ValueError) as error:
             raise UsageError(f"robot {robot}: cannot read {self.model}: {' '.join(str(error).split())}") from None
         spec.meshdir = ""
@@ -62,8 +63,7 @@ class ModelFiles:
     def content(self) -> tuple[list[tuple[str, int]], list[bytes]]:
         """Return what identifies them: names and sizes of the meshes, and the texts."""
         files = sorted((name, path.stat().st_size) for name, path in self.mesh_files().items())
-        included = sorted((self.includes or self.model.parent).glob("*.xml"))
-        return files, [one.read_bytes() for one in (self.model, *included)]
+        return files, [one.read_bytes() for one in (self.model, *self._included())]
 
     def mesh_files(self) -> dict[str, Path]:
         """Return the model's meshes by name: of the folder that is given, else those that the model names."""
@@ -81,8 +81,8 @@ class ModelFiles:
             text = text.replace(old, new)
         return text
 
-    def _included(self) -> dict[str, bytes]:
-        return {one.name: one.read_bytes() for one in sorted((self.includes or self.model.parent).glob("*.xml"))}
+    def _included(self) -> list[Path]:
+        return sorted((self.includes or self.model.parent).glob("*.xml"))
 
     def _assets(self) -> dict[str, bytes]:
         return {name: one.read_bytes() for name, one in self.mesh_files().items()}

@@ -175,7 +175,7 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
 
 def _angle_off(robot: Robot, hand: F64, yaw: float) -> float:
-    """How far a hand (3, 3) is from pointing down at a yaw [rad]; one that leans anyway may lean a good deal."""
+    """Return how far a hand (3, 3) is from pointing down at a yaw [rad]; one that leans anyway may lean a good deal."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
     return float(np.arccos(np.clip((np.trace(hand_down(yaw).T @ hand) - 1) / 2, -1.0, 1.0)))

@@ -119,7 +119,7 @@ class Robot:
 
 
 def _joints(tree: Mapping[str, Any], gripper: GripperConfig) -> dict[str, Any]:
-    """What a YAML says of the arm's joints."""
+    """Read what a YAML says of the arm's joints."""
     said: dict[str, Any] = {}
     if "joints" in tree:
         joints = said["joints"] = names("joints", tree["joints"])

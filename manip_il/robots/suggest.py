@@ -130,7 +130,7 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    """Where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
+    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
     moving = [
         jaw.name
         for jaw in jaws

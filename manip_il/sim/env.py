@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import gymnasium
@@ -19,7 +19,7 @@ from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.events import Events
 from manip_il.sim.posture import draw_posture
 from manip_il.sim.render import Picture, pictures
-from manip_il.sim.scene import build_scene
+from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.variation import drawn_in, with_drawn
 from manip_il.sim.window import Window, check_render_mode
 from manip_il.sim.world import Scene, World
@@ -289,7 +289,7 @@ def environment_state(world: World) -> F32:
     return np.concatenate([np.atleast_1d(np.asarray(value)) for value in values]).astype(np.float32)
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def environment_state_names(scene: Scene) -> tuple[str, ...]:
     """Return names of the vector's k entries; lengths in [m]."""
     world = World(scene)

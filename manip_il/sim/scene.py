@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -29,6 +29,7 @@ TABLE = "table"  # the name of its geom
 _TABLE_HALF = (0.45, 0.6, 0.02)  # [m]
 _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from the robot [m]
 _FLOOR = -0.4  # [m]
+SCENES_KEPT = 8  # compiled, a process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
 SEEN = 0.15  # half the width of a workspace that the front camera sees from its usual distance [m]
 _ON_TABLE = 0.02  # of a robot's lowest point from the table's top: it stands there [m]
@@ -37,14 +38,14 @@ _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
 
 
 def build_scene(robot: str, task: str, shape: str = "", step: float = DT_SIM) -> Scene:
-    """Return the scene of a robot and a task, compiled once a process. Raises `UnknownName`, `UsageError`.
+    """Return the scene of a robot and a task, compiled once and kept for a while. Raises `UnknownName`, `UsageError`.
 
     shape: of its object, as `EnvConfig.object`; empty for the task's own. step: of physics [s].
     """
     return _build(robot, task, shape, step)
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def _build(robot: str, task: str, shape: str, step: float) -> Scene:
     the_robot, the_task = get_robot(robot), get_task(task, shape)
     try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from manip_il.sim.conditions import PICTURED, Drawn
 from manip_il.sim.config import CAMERAS, Look
-from manip_il.sim.scene import SEEN, TABLE, build_scene, camera_id
+from manip_il.sim.scene import SCENES_KEPT, SEEN, TABLE, build_scene, camera_id
 from manip_il.sim.variation import GEOMS, resized
 
 F64 = NDArray[np.float64]
@@ -118,7 +118,7 @@ class ViewModel:
             vectors[in_world] = vectors[in_world] @ rotation.T
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def _with_few_faces(robot: str, task: str, shape: str) -> mujoco.MjModel:
     scene = build_scene(robot, task, shape)
     model, finest = copy.copy(scene.model), min(1.0, scene.robot.workspace.half_width / SEEN) * _LEAST_CELL

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -136,7 +136,7 @@ def _grip(world: World) -> Grip:
     return Grip(position, rotation, off, angle, height, world.opening >= width + OPEN_SLACK)
 
 
-@cache
+@lru_cache(8)
 def _farthest(scene: Scene) -> float:
     """Farthest x at which the hand gets to the table [m]."""
     x, y = scene.robot.workspace.centre

@@ -73,7 +73,7 @@ def _across(world: World, direction: F64) -> F64:
 
 
 def _hand(world: World) -> F64:
-    """Where the hand pushes: the middle between its fingers when they are open for that, (3,) [m]."""
+    """Return where the hand pushes: the middle between its fingers when they are open for that, (3,) [m]."""
     return world.ee.position + world.ee.rotation[:, 1] * world.middle(_style(world).opening)
 
 

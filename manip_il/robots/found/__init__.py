@@ -1,4 +1,4 @@
-"""What a robot's YAML need not say, found on its model: joints, motors, the hand's frame, a posture to start from."""
+"""Finds on a robot's model what its YAML need not say: joints, motors, the hand's frame, a posture to start from."""
 
 from __future__ import annotations
 

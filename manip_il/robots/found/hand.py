@@ -72,7 +72,7 @@ def _settled(robot: Robot, share: float) -> tuple[mujoco.MjModel, mujoco.MjData]
 
 
 def _tip(robot: Robot, z: F64) -> float:
-    """How far the closed fingers go from the hand along its axis (3,) [m]."""
+    """Measure how far the closed fingers go from the hand along its axis (3,) [m]."""
     model, data = _settled(robot, 0.0)
     hand = model.body(robot.hand).id
     along = data.xmat[hand].reshape(3, 3) @ z

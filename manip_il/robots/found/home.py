@@ -99,7 +99,7 @@ def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple
 
 
 def _worth(ik: ArmIK, q: F64, limits: F64) -> float:
-    """How good a posture is: margin to the limits, distance from a singular posture, and height of the links."""
+    """Rate a posture by its margin to the limits, distance from a singular posture, and height of the links."""
     margin = float(np.minimum(q - limits[:, 0], limits[:, 1] - q).min())
     singular = ik.smallest_singular_value(q)
     parts = (margin, singular, ik.lowest_link(q))
