@@ -26,8 +26,12 @@ def motorise(robot: Robot, spec: mujoco.MjSpec) -> None:
         joint.damping, joint.stiffness, joint.armature = np.array([_DAMPING, 0, 0]), np.zeros(3), armature
         joint.frictionloss = 0.0  # a servo's own control overcomes it
         _position_actuator(spec, joint, (kp, kp * _KV_PER_KP, force))
-    for name in robot.gripper.joints:
+    for name, ends in zip(
+        robot.gripper.joints, zip(robot.gripper.closed, robot.gripper.open, strict=True), strict=True
+    ):
         joint = spec.joint(name)
+        if joint.range[0] >= joint.range[1]:  # a linkage that runs past its end folds over
+            joint.range = sorted(ends)
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         joint.damping = np.array([_FINGER_DAMPING if slides else _HINGE_DAMPING, 0, 0])
         joint.armature = _FINGER_ARMATURE if slides else _HINGE_ARMATURE

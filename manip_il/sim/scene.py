@@ -17,6 +17,7 @@ from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
 from manip_il.robots.spec import arm_spec, copy_options
+from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
 from manip_il.sim.variation import Object
@@ -68,9 +69,10 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     _add_look(spec)
     _add_table(spec, robot)
     arm = arm_spec(robot)
-    _add_pedestal(spec, arm, robot)
+    arm_alone = arm.copy().compile()
+    _add_pedestal(spec, arm_alone, robot)
     if not robot.wrist_camera:
-        _add_wrist_camera(arm)
+        add_wrist_camera(arm, arm_alone, robot)
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_front_camera(spec, robot)
@@ -207,9 +209,8 @@ def _table_x(robot: Robot) -> float:
     return robot.workspace.centre[0] + _TABLE_BEYOND
 
 
-def _add_pedestal(spec: mujoco.MjSpec, arm: mujoco.MjSpec, robot: Robot) -> None:
+def _add_pedestal(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -> None:
     """From the floor to the robot's lowest point, where that is in the air and does not stand on the table."""
-    model = arm.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     touching = [i for i in range(model.ngeom) if model.geom_contype[i] or model.geom_conaffinity[i]]
@@ -248,18 +249,3 @@ def _add_front_camera(spec: mujoco.MjSpec, robot: Robot) -> None:
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
     spec.worldbody.add_camera(name="front", pos=eye, quat=quat, fovy=45)
-
-
-def _add_wrist_camera(spec: mujoco.MjSpec) -> None:
-    site = spec.site("ee")
-    offset = np.array([0.10, 0.0, -0.08])  # in the ee frame: beside the hand, behind the fingertips [m]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(site.quat) / np.linalg.norm(site.quat))
-    rotation = rotation.reshape(3, 3)
-    # the camera looks along its -z; tilt it towards the fingertips
-    tilt = 0.45
-    back = np.array([np.sin(tilt), 0, -np.cos(tilt)])
-    axes = np.stack([np.array([0.0, 1.0, 0.0]), np.cross(back, [0.0, 1.0, 0.0]), back], axis=1)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, (rotation @ axes).flatten())
-    site.parent.add_camera(name="wrist", pos=np.asarray(site.pos) + rotation @ offset, quat=quat, fovy=70)

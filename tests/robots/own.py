@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+EXAMPLES = sorted((Path(__file__).parents[2] / "configs" / "robots").glob("*.yaml"))
+
 # Five joints: turn, shoulder, elbow, wrist, and the hand's own turn. At zero it stands upright.
 ARM = """
 <mujoco model="own">

@@ -17,9 +17,8 @@ from manip_il.robots.rotations import angle_across, angle_off_vertical
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import EnvConfig
 
-from .own import ARM, JAWS, tree_of, write
+from .own import ARM, EXAMPLES, JAWS, tree_of, write
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "configs" / "robots").glob("*.yaml"))
 SEEDS = stream_seeds("validation", 4)
 every_example = pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 
