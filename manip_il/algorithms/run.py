@@ -174,7 +174,7 @@ class Run:
         return round_folder(self.folder, round_)
 
     def _repo_id(self, round_: int) -> str:
-        return f"local/{self.config.env.robot}_{self.config.env.task}_round_{round_}"
+        return f"local/{self.config.env.name}_round_{round_}"
 
     def _is_recorded(self, round_: int) -> bool:
         return (self._folder(round_) / DATASET).is_dir()

@@ -60,5 +60,5 @@ def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, en
             break
         count = max(count + 1, math.ceil(count * labels / frames))
         stages.start("cloning with as many labels, record", max(0, count - len(found)))
-    name = f"local/{config.env.robot}_{config.env.task}_demonstrations"
+    name = f"local/{config.env.name}_demonstrations"
     record(found, journals, folder / "dataset", job, Recording(name, True, count, provenance(job)))

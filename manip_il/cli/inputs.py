@@ -139,7 +139,7 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.sim.env import EnvConfig
 
     if not is_known(spec.robot, spec.task):
-        warn([f"{root} is for {spec.robot} {spec.task}, which is not known here"])
+        warn([f"{root} is for {spec.robot} {spec.task}, which is not known here by name: scenes are not compared"])
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(str(root), spec, "this program", env_spec(env))

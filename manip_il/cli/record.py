@@ -109,7 +109,7 @@ class RecordOptions(common.EnvOptions):
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _repo_id(self) -> str:
-        return self.dataset.repo_id or f"local/{self.robot.type}_{self.task.type}"
+        return self.dataset.repo_id or f"local/{self.env_config().name}"
 
     def _folders(self) -> tuple[Path, Path]:
         root = self.dataset.root or Path("datasets") / self._repo_id().partition("/")[2]

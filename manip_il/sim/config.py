@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.option import option
@@ -74,6 +75,11 @@ class EnvConfig:
         }
         for name, value in found.items():
             object.__setattr__(self, name, getattr(self, name) or value)
+
+    @property
+    def name(self) -> str:
+        """Robot and task as one word, the robot by its file's name."""
+        return f"{Path(self.robot).stem}_{self.task}"
 
     @property
     def physics_steps(self) -> int:

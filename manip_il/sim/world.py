@@ -31,6 +31,7 @@ T = TypeVar("T")
 STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _BESIDE, _NEAR = (-0.02, 0.07), 0.08  # of what stands around an object, in height and sideways: a hand may meet it [m]
 _MOST_TURNS = 4  # that look alike, to either side
+_AT_REST = 0.03, 0.5  # of an object that hardly moves [m/s], [rad/s]
 GOAL = "goal"  # the mocap body that shows where things are to go
 
 
@@ -264,6 +265,12 @@ class World:
     def kind(self, name: str) -> int:
         """Return MuJoCo's geom type of an object."""
         return int(self.model.geom_type[self.scene.objects[name].geom])
+
+    def at_rest(self, name: str) -> bool:
+        """Return whether an object hardly moves: under 3 cm and half a radian a second."""
+        at = self.scene.objects[name].v
+        velocity = self.data.qvel[at : at + 6].tolist()
+        return math.hypot(*velocity[:3]) < _AT_REST[0] and math.hypot(*velocity[3:]) < _AT_REST[1]
 
     def touched(self, name: str) -> bool:
         """Return whether every finger touches an object."""

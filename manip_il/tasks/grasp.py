@@ -33,6 +33,8 @@ BESIDE_JAW, NEARER = 0.008, 0.002  # of an object from a jaw that stands as the 
 BY_JAW = 0.004  # the same as `FUNNEL_RADIUS`, of a hand of which one jaw alone moves [m]
 NARROW = 0.024  # opening beyond the object's width where a neighbour is in the way of a hand that is wide open [m]
 CROWDED = 3.0  # how much farther the hand turns for a grasp whose fingers have room [rad]
+MAX_TILT = 0.3  # of the object off a face: wait over it until it rests [rad]
+CLOSING = (0.022, 0.015, 0.022)  # object's centre in the ee frame, x y z, once the fingers have begun to close [m]
 LEAN = 0.5  # of a hand that reaches as far as it can [rad]
 _LEAST_ROOM = 0.002  # of an open gripper around an object [m]
 _QUARTER = math.pi / 2
@@ -44,13 +46,14 @@ class Lie(NamedTuple):
 
     grasps: yaw of a hand that points down [rad], and the object's width between its fingers and length across them [m],
     for each way it can be grasped. tall: its height [m]. tilt: off the nearest way in which it rests [rad]. folds: how
-    many of its yaws look alike, 0 for all.
+    many of its yaws look alike, 0 for all. level: of the grasps those whose fingers meet upright sides.
     """
 
     grasps: tuple[tuple[float, float, float], ...]
     tall: float
     tilt: float
     folds: int
+    level: slice = slice(None)
 
     @property
     def yaw(self) -> float:
@@ -62,8 +65,9 @@ class Grasp(NamedTuple):
     """An object as the hand sees it.
 
     offset: its centre in the `ee` frame, off the middle between pads that hold it [m]. width, length, half: of it
-    between the fingers, across them, and half its height [m]. tilt: off the nearest face [rad]. yaw: of a hand that
-    points down to grasp it; angle: how far the hand is from that [rad].
+    between the fingers, across them, and half its height [m]. settled: it rests on a face, or leans on something and
+    does not move, or the fingers are around it. yaw: of a hand that points down to grasp it; angle: how far the hand
+    is from that [rad].
     at: where `ee` grasps it [m]. wide: how far the fingers open on the way to it [m]. open_enough: they pass on both
     sides of it. off: how far the hand is from being over it, with its angle [m]. funnel: how high over the object it
     must be for that [m]; height: the same, but no higher than to clear its top. lean: how much the hand leans to get to
@@ -74,7 +78,7 @@ class Grasp(NamedTuple):
     width: float
     length: float
     half: float
-    tilt: float
+    settled: bool
     yaw: float
     angle: float
     at: tuple[float, float, float]
@@ -123,12 +127,13 @@ def _grasp(world: World, name: str) -> Grasp:
     crowding = 1.0 if world.lopsided else _crowding(yaw, world.most_opening, neighbours)
     narrower = max(0.0, room - NARROW) * crowding
     across, along, ahead = (a * dx + b * dy + c * dz for a, b, c in ee.rotation.T.tolist())
+    offset = across, along - world.middle(width), ahead
     return Grasp(
-        offset=(across, along - world.middle(width), ahead),
+        offset=offset,
         width=width,
         length=length,
         half=half,
-        tilt=lie.tilt,
+        settled=lie.tilt < MAX_TILT or is_inside(offset, CLOSING) or world.at_rest(name),
         yaw=yaw,
         angle=angle,
         at=(at_x, at_y, max(z, world.lowest, z + half - DEEPEST)),
@@ -161,7 +166,7 @@ def _nearest(
     it by any turn, and does not stand still in the middle. position: of the object (3,) [m]. widest: what the fingers
     go around [m]. neighbours: ways to what stands around the object; a grasp between whose fingers they are comes last.
     """
-    grasps, at, ahead = lie.grasps, world.hand_yaw, world.ahead(position)
+    grasps, at, ahead = lie.grasps[lie.level], world.hand_yaw, world.ahead(position)
     if world.faces_ahead:
         at = world.turned(position)
         grasps = [
@@ -223,8 +228,10 @@ def _box_lie(rotation: F64, extents: Sequence[float]) -> Lie:
     if quarters % 2:
         length, width = width, length
     grasps = ((yaw, width, length), (yaw - _QUARTER, length, width), (yaw + _QUARTER, length, width))
-    folds = 4 if length == width else 2
-    return Lie(grasps, extents[up], math.acos(min(1.0, heights[up])), folds)
+    folds, tilt, level = 4 if length == width else 2, math.acos(min(1.0, heights[up])), slice(None)
+    if tilt >= MAX_TILT:  # it stands on an edge: the fingers meet the two sides that are upright
+        level = slice(0, 1) if (heights[side] > heights[other]) != bool(quarters % 2) else slice(1, 3)
+    return Lie(grasps, extents[up], tilt, folds, level)
 
 
 def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
@@ -234,3 +241,8 @@ def _beyond_lean(angle: float, hand: F64, lean: float) -> float:
     tilt = math.acos(min(1.0, max(-1.0, -float(hand[2, 2]))))
     free = min(tilt, lean * LEAN)
     return math.sqrt(max(0.0, angle * angle - free * free))
+
+
+def is_inside(offset: Sequence[float], box: tuple[float, float, float]) -> bool:
+    """Return whether an offset (3,) [m] is within half lengths [m]."""
+    return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]

@@ -8,7 +8,7 @@ learner can fit. Whether an object is held is read off the fingers that touch it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.world import World
-from manip_il.tasks.grasp import HOVER, grasp_of
+from manip_il.tasks.grasp import CLOSING, HOVER, grasp_of, is_inside
 from manip_il.tasks.task import Rung, Target
 
 F64 = NDArray[np.float64]
@@ -27,9 +27,7 @@ CLEAR = 0.03  # of the hand over the object's top: the fingertips are above it [
 RISE_FIRST = 0.03  # this far under the funnel, the hand only rises [m]
 AT_GRASP = (0.015, 0.015, 0.015)  # object's centre in the ee frame, x y z: start to close [m]
 AT_GRASP_ANGLE = 0.3  # [rad]
-CLOSING = (0.022, 0.015, 0.022)  # the same once they have begun to close [m]
 IN_HAND = (0.009, 0.020, 0.011)  # object's centre in the ee frame, in x and z beyond half its size: in the hand [m]
-MAX_TILT = 0.3  # of the object off a face: wait over it until it has settled [rad]
 RELEASE = 0.03  # how far the fingers open about an object to let it go, beyond its width, where there is so much [m]
 FREED = 0.4  # share of that at which it is free
 AT_GOAL = 0.01  # [m]
@@ -66,14 +64,14 @@ def held(world: World, name: str) -> bool:
     if math.dist(world.pose(name).position.tolist(), world.ee.position.tolist()) > math.hypot(half + x, y, half + z):
         return False  # without the work of how it could be grasped
     g = grasp_of(world, name)
-    return _inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
+    return is_inside(g.offset, (g.length / 2 + x, y, g.half + z)) and world.touched(name)
 
 
 def at_grasp(world: World, name: str) -> bool:
     """Return whether closing the fingers now would hold the object; with hysteresis once they have begun to close."""
     g = grasp_of(world, name)
     box = AT_GRASP if g.open_enough else CLOSING
-    return _inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.tilt < MAX_TILT
+    return is_inside(g.offset, box) and g.angle < AT_GRASP_ANGLE and g.settled
 
 
 def approach(world: World, name: str, hover: float = 0.0) -> Target:
@@ -84,7 +82,7 @@ def approach(world: World, name: str, hover: float = 0.0) -> Target:
     g, (ee_x, ee_y, ee_z) = grasp_of(world, name), world.ee.position.tolist()
     x, y, z = g.at
     height = max(g.height, min(hover, g.funnel))
-    height = height if g.open_enough and g.tilt < MAX_TILT else max(height, g.half + CLEAR)
+    height = height if g.open_enough and g.settled else max(height, g.half + CLEAR)
     too_low = z + height - ee_z
     sideways = min(1.0, max(0.0, 1.0 - too_low / RISE_FIRST))
     position = np.array([ee_x + sideways * (x - ee_x), ee_y + sideways * (y - ee_y), z + height])
@@ -131,7 +129,7 @@ def grasp_rungs(which: Which, hover: float = 0.0) -> tuple[Rung, ...]:
 
     def near(world: World) -> bool:
         g = grasp_of(world, which(world))
-        return (max(g.height, g.half + CLEAR) if g.tilt >= MAX_TILT else g.height) < g.half + HOVER
+        return (g.height if g.settled else max(g.height, g.half + CLEAR)) < g.half + HOVER
 
     def approaching(world: World) -> Target:
         return approach(world, which(world), hover)
@@ -199,7 +197,3 @@ def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> floa
 def nearness(rest: float) -> float:
     """Return 1 within `AT_GOAL` [m], and less the longer the way still to go is."""
     return _HALFWAY / (_HALFWAY + max(0.0, rest - AT_GOAL))
-
-
-def _inside(offset: Sequence[float], box: tuple[float, float, float]) -> bool:
-    return abs(offset[0]) <= box[0] and abs(offset[1]) <= box[1] and abs(offset[2]) <= box[2]

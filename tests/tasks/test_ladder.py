@@ -16,12 +16,11 @@ from hypothesis import strategies as st
 from manip_il.robots.reach import Reach
 from manip_il.robots.rotations import angle_ahead, angle_between, angle_from_down, hand_down
 from manip_il.sim.world import Pose
-from manip_il.tasks.grasp import FUNNEL_RADIUS, HOVER, LEAN, OPEN_SLACK, grasp_of, lie_of
+from manip_il.tasks.grasp import FUNNEL_RADIUS, HOVER, LEAN, MAX_TILT, OPEN_SLACK, grasp_of, lie_of
 from manip_il.tasks.ladder import (
     AT_GOAL,
     AT_GRASP_ANGLE,
     CLEAR,
-    MAX_TILT,
     Lift,
     carry,
     carry_progress,
@@ -60,6 +59,7 @@ class Placed:
     leans: bool = False
     lopsided: bool = False
     faces_ahead: bool = False
+    resting: bool = False
 
     @property
     def hand_yaw(self) -> float:
@@ -88,6 +88,9 @@ class Placed:
 
     def touched(self, name: str) -> bool:
         return self.touching
+
+    def at_rest(self, name: str) -> bool:
+        return self.resting
 
     def remember(self, key: Any, work_out: Callable[[], Any]) -> Any:
         return work_out()
@@ -167,7 +170,7 @@ def test_hovering_and_waiting_count_from_the_top_whatever_the_objects_size(edge:
     raised = max(0.0, LOWEST - edge / 2)  # a low cube is gripped above its middle
     hovering = at(-0.2, 0.1, 0.2, edge=edge)
     assert rung(hovering)[1].position[2] == pytest.approx(top(hovering) + HOVER + raised)
-    for waiting in (at(0, 0, 0.1, edge=edge, tilt=MAX_TILT + 0.1), at(0, 0, 0.1, edge=edge, opening=0.0)):
+    for waiting in (tipped(0.1, MAX_TILT + 0.1, edge=edge), at(0, 0, 0.1, edge=edge, opening=0.0)):
         assert rung(waiting)[1].position[2] == pytest.approx(top(waiting) + CLEAR + raised)
 
 
@@ -284,8 +287,28 @@ def test_a_hand_lets_go_before_it_rises():
     assert let_go(grips, "object", 0.1).opening == let_go(free, "object", 0.1).opening > EDGE
 
 
-def test_over_an_object_that_has_not_settled_the_hand_waits():
-    assert rung(at(0, 0, 0, tilt=MAX_TILT + 0.1))[0] != "grasp"
+def tipped(z: float, tilt: float, turn: float = 0.0, **changes: Any) -> Placed:
+    """The hand over a cube that stands on an edge, turned as a grasp of its upright sides wants it."""
+    world = at(0, 0, z, yaw=np.pi / 2, **changes)
+    rotation = about((0, 0, 1), turn)
+    hand = Pose(world.ee.position, rotation @ world.ee.rotation)
+    return replace(world, ee=hand, cube=Pose(world.cube.position, rotation @ about((1, 0, 0), tilt)))
+
+
+def test_over_an_object_that_tips_over_the_hand_waits_and_between_the_fingers_it_is_grasped():
+    tipping, between = (tipped(z, MAX_TILT + 0.1) for z in (0.03, 0))
+    assert rung(tipping)[1].position[2] > tipping.ee.position[2]
+    assert rung(between)[0] == "grasp"
+
+
+@given(st.floats(MAX_TILT + 0.02, np.pi / 2 - MAX_TILT - 0.02), st.floats(-np.pi, np.pi), widths)
+def test_an_object_that_leans_on_something_is_gripped_by_its_upright_sides(tilt: float, turn: float, edge: float):
+    leaning = tipped(0.06, tilt, turn, edge=edge, resting=True)
+    over = replace(leaning, ee=Pose(leaning.ee.position, rung(leaning)[1].rotation))
+    name, target = rung(over)
+    assert name == "descend"
+    assert target.position[2] < top(leaning)
+    assert abs(float(target.rotation[:, 1] @ leaning.cube.rotation[:, 0])) == pytest.approx(1.0)
 
 
 def test_at_the_goal_the_fingers_stay_closed():

@@ -1,0 +1,32 @@
+"""The commands take a robot by the path of its YAML, in a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.data.lerobot_read import read_spec
+
+from ..robots.own import write
+
+REACH = ("--task.type=reach", "--workers=1")
+SHORT = ("--demonstrations=2", "--episodes_per_round=1", "--rounds=1", "--validation_episodes=1", "--steps=2")
+
+
+@pytest.mark.slow
+def test_it_is_recorded_learnt_evaluated_and_improved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "arms").mkdir()
+    write(tmp_path / "arms", "mine")
+    monkeypatch.chdir(tmp_path)
+    robot = "--robot.type=arms/mine.yaml"
+    assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
+    assert read_spec(Path("datasets/mine_reach")).robot == "mine"
+    assert main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
+    words = ["eval", robot, *REACH, "--policy.path=run", "--eval.n_episodes=1", "--eval.films=0", "--output_dir=test"]
+    assert main(words) == 0
+    assert json.loads(Path("test/eval.json").read_text())["robot"] == "arms/mine.yaml"
+    assert main(["dagger", robot, *REACH, *SHORT, "--output_dir=dagger"]) == 0
+    assert (tmp_path / "dagger" / "best").is_dir()
