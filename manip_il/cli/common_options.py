@@ -94,7 +94,7 @@ class EnvGroup:
     tolerance: float = option_of(EnvConfig, "tolerance")
     horizon: int = option_of(EnvConfig, "horizon")
     control_hz: int | None = option(
-        None, f"control steps a second; by default the policy's, else {EnvConfig.control_hz}"
+        None, "control steps a second; by default the policy's, else the robot's own, 30 of so101, 20 of others"
     )
     success_steps: int = option_of(EnvConfig, "success_steps")
 
@@ -120,8 +120,7 @@ class EnvGroup:
                 raise UsageError(f"--task.type={task} is with --robot.type={robot}; expected {stock.ROBOT}")
             get_robot(robot)
             get_task(task)
-        usual = stock.CONTROL_HZ if is_stock else EnvConfig.control_hz
-        hz = (meta.fps if meta else usual) if self.control_hz is None else self.control_hz
+        hz = (meta.fps if meta else 0) if self.control_hz is None else self.control_hz
         env = EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon, shape)
         if env.object:
             build_scene(robot, task, env.object)  # which finds an object that is too wide

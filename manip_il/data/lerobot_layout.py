@@ -80,7 +80,7 @@ def info_json(
         "video_files_size_in_mb": file_sizes[1],
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if videos else None,
-        "robot_type": spec.robot,
+        "robot_type": spec.lerobot_type,
         "splits": {"train": f"0:{episodes}"},
     }
 

@@ -134,7 +134,7 @@ def read_spec(root: Path) -> s.RobotTaskSpec:
     info = _read_info(root)
     try:
         return s.RobotTaskSpec(
-            robot=str(info["robot_type"]),
+            **s.robot_of(str(info["robot_type"])),
             task=UNKNOWN_TASK,
             fps=int(info["fps"]),
             joint_names=tuple(info["features"][s.ACTION]["names"]),
@@ -169,7 +169,7 @@ def dataset_info(root: Path) -> DatasetInfo:
         success, at_end = len(np.unique(index[flags])), int(flags[last].sum())
     return DatasetInfo(
         root=root,
-        robot=str(info["robot_type"]),
+        robot=spec.robot if spec else s.robot_of(str(info["robot_type"]))["robot"],
         task=spec.task if spec else UNKNOWN_TASK,
         instruction=spec.instruction if spec else _instruction(root),
         fps=int(info["fps"]),

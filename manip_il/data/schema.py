@@ -31,6 +31,10 @@ ROUND = "round"
 BETA = "beta"
 
 OWN_OBJECT = "the task's own"  # what an empty name of an object means
+OPENINGS = "joint position targets [rad], gripper opening command [m]"
+SERVOS = "joint position targets [deg], gripper position command [0 to 100]"  # as LeRobot's recorder has them
+JOINT_TARGETS = (OPENINGS, SERVOS)
+LEROBOT_TYPES = {"so_follower": "so101"}  # robots of another name here, by their `robot_type`
 VERSION = 2  # of these columns and what they mean: 2 has progress, whole states and named phases
 MOST_FRAMES = 1_000_000  # of an episode
 MOST_FPS = 10_000  # control steps a second
@@ -40,6 +44,7 @@ LONGEST_SIDE = 8192  # of a picture [pixels]
 MOST_PIXELS = 4096 * 4096  # of a picture
 _LONGEST_LIST = 200  # of names in a message [characters]
 _LARGEST_STATE = 1_000_000  # numbers in a `sim_state`
+_MAY_LACK = ("object", "robot_type")  # of a spec as JSON
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,12 @@ class RobotTaskSpec:
     sim_state_size: int  # m
     instruction: str  # LeRobot's `task` text
 
-    action_meaning: str = "joint position targets [rad], gripper opening command [m]"
+    action_meaning: str = OPENINGS
     cameras: tuple[str, ...] = ()
     image_size: tuple[int, int] = (0, 0)  # height, width [pixels] of every camera; (0, 0) without cameras
     phases: tuple[str, ...] = ()  # what `expert_phase` counts: none, then the rungs of the task's ladder
     object: str = ""  # shape and size of what the task moves; empty for the task's own
+    robot_type: str = ""  # the robot as LeRobot calls it; empty where that is `robot`
     schema: int = VERSION
 
     def __post_init__(self) -> None:
@@ -72,7 +78,7 @@ class RobotTaskSpec:
         for what in ("joint_names", "environment_state_names", "phases"):
             for one in checks.array(what, getattr(self, what), MOST_NAMES):
                 checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
-        for what in ("instruction", "action_meaning", "object"):
+        for what in ("instruction", "action_meaning", "object", "robot_type"):
             checks.text(what, getattr(self, what))
         for camera in checks.array("cameras", self.cameras, MOST_CAMERAS):
             checks.name("a camera", camera)
@@ -81,9 +87,9 @@ class RobotTaskSpec:
         check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the spec as JSON types; without an object where it is the task's own."""
+        """Return the spec as JSON types; without object and robot_type where they are empty."""
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        return {key: value for key, value in values.items() if value or key != "object"}
+        return {key: value for key, value in values.items() if value or key not in _MAY_LACK}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
@@ -99,9 +105,21 @@ class RobotTaskSpec:
         return cls(**values)
 
     @property
+    def lerobot_type(self) -> str:
+        """Name of the robot in LeRobot's `meta/info.json`."""
+        return self.robot_type or self.robot
+
+    @property
     def image_keys(self) -> dict[str, str]:
         """Column -> camera."""
         return {IMAGES + camera: camera for camera in self.cameras}
+
+
+def robot_of(robot_type: str) -> dict[str, str]:
+    """Return what a spec says of a robot by LeRobot's name of it."""
+    if robot_type not in LEROBOT_TYPES:
+        return {"robot": robot_type}
+    return {"robot": LEROBOT_TYPES[robot_type], "robot_type": robot_type, "action_meaning": SERVOS}
 
 
 def check_picture_size(what: str, size: object, least: int = 1) -> tuple[int, int]:

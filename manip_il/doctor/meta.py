@@ -103,7 +103,7 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
     except (OSError, ValueError, TypeError, RecursionError, ManipError) as problem:
         yield error(layout.OURS, f"cannot be read: {problem}")
         return
-    for what, said, found in (("fps", spec.fps, info.fps), ("robot_type", spec.robot, info.robot)):
+    for what, said, found in (("fps", spec.fps, info.fps), ("robot_type", spec.lerobot_type, info.robot)):
         if said != found:
             yield error(layout.INFO, f"{what} is {found!r}; {layout.OURS} says {said!r}")
     wanted = layout.all_features(spec)

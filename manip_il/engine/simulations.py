@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.schema import SERVOS, RobotTaskSpec
 from manip_il.expert import Expert
 from manip_il.mdp import STATE_EXTRAS, State
 from manip_il.robots import ROBOTS
 from manip_il.robots.action_space import ActionSpace
+from manip_il.robots.robot import Robot
 from manip_il.rollout import Environment, Labeller
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, EnvConfig
@@ -110,6 +111,7 @@ class Scenes:
             instruction=task.instruction,
             phases=phases(task),
             object=config.object,
+            **_in_lerobot(scene.robot),
             cameras=cameras.names if cameras else (),
             image_size=(cameras.height, cameras.width) if cameras else (0, 0),
         )
@@ -140,6 +142,13 @@ def is_known(robot: str, task: str) -> bool:
 def simulation_of(robot: str) -> Simulation:
     """Return the simulation of a robot."""
     return SIMULATIONS.get(robot, _SCENES)
+
+
+def _in_lerobot(robot: Robot) -> dict[str, Any]:
+    """What a spec says of a robot whose numbers are its servos'."""
+    if robot.lerobot is None:
+        return {}
+    return {"action_meaning": SERVOS, "robot_type": robot.lerobot.robot_type}
 
 
 def _scene(config: EnvConfig) -> Scene:

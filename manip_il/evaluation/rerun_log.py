@@ -124,7 +124,7 @@ class RerunLog:
         curves = [
             layout.StateTimelineView(origin=schema.EXPERT_PHASE, name="phase"),
             layout.TimeSeriesView(contents=[schema.PROGRESS, ERROR], name="progress, error [m]"),
-            layout.TimeSeriesView(origin=schema.STATE, name="joints [rad], opening [m]", plot_legend=no_legend),
+            layout.TimeSeriesView(origin=schema.STATE, name="joints and gripper", plot_legend=no_legend),
             layout.TimeSeriesView(origin=schema.EXECUTED_ACTION, name="executed action", plot_legend=no_legend),
             layout.TextLogView(origin=EVENTS, name="episodes"),
         ]

@@ -22,6 +22,8 @@ The measured state is the frame's own. An action of a plan is thus converted in 
 the joints measured there, so that plans of many actions (ACT's chunks, diffusion's horizons) are converted exactly,
 too; what learns them sees target minus state of each frame of the window.
 
+Robots whose YAML says `lerobot` have degrees and 0 to 100 in s and a; their hand's motion is in [m] and [rad], too.
+
 `mlp` and `cnn` learn `joint_delta` by default, inside of their network (`MLPNetwork`), which holds the measured joints
 anyway and so goes into an exported file whole; `joint_target` is the same network without the sum. What a network
 cannot hold is in the checkpoint's processors (`action_steps`): both deltas of LeRobot's policies, every `ee_delta`.
@@ -36,7 +38,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
@@ -103,7 +105,7 @@ class JointDelta:
 
 @dataclass(frozen=True)
 class HandDelta:
-    """Motion of `ee` [m, rad] that a joint target means, and the opening [m]; robot: a name in `ROBOTS`."""
+    """Motion of `ee` [m, rad] that a joint target means, and the gripper as it is; robot: a name in `ROBOTS`."""
 
     robot: str
     space: str = EE_DELTA
@@ -112,8 +114,8 @@ class HandDelta:
         """Return motions of the hand (N, n) of actions (N, n), by forward kinematics."""
         ik, targets = _arm_ik(self.robot), np.zeros_like(actions)
         for target, action, state in zip(targets, actions, states, strict=True):
-            position, rotation = ik.ee_pose(state[ARM])
-            wanted, turned = ik.ee_pose(action[ARM])
+            position, rotation = ik.ee_pose(self._to_radians(state[ARM]))
+            wanted, turned = ik.ee_pose(self._to_radians(action[ARM]))
             target[_POSITION], target[_ROTATION] = wanted - position, rotation_vector(turned @ rotation.T)
             target[GRIPPER] = action[GRIPPER]
         return targets
@@ -122,11 +124,22 @@ class HandDelta:
         """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
         ik, actions = _arm_ik(self.robot), np.empty_like(targets)
         for action, target, state in zip(actions, targets, states, strict=True):
-            q, motion = np.asarray(state[ARM], np.float64), np.asarray(target, np.float64)
+            q, motion = self._to_radians(state[ARM]), np.asarray(target, np.float64)
             position, rotation = ik.ee_pose(q)
             turned = rotation_matrix(motion[_ROTATION]) @ rotation
-            action[ARM], action[GRIPPER] = ik.solve(q, position + motion[_POSITION], turned), target[GRIPPER]
+            joints = ik.solve(q, position + motion[_POSITION], turned)
+            action[ARM], action[GRIPPER] = np.degrees(joints) if self._in_degrees else joints, target[GRIPPER]
         return actions
+
+    @property
+    def _in_degrees(self) -> bool:
+        from manip_il.robots.robot import get_robot
+
+        return get_robot(self.robot).lerobot is not None
+
+    def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
+        """Joints (n - 1,) [rad] in double precision of an action's or a state's."""
+        return np.radians(joints, dtype=np.float64) if self._in_degrees else np.asarray(joints, np.float64)
 
 
 JOINT_DELTAS = JointDelta()
@@ -157,8 +170,8 @@ def conversion_for(space: str, spec: RobotTaskSpec) -> Conversion:
     here with these joints, where that matters, and what `conversion` raises.
     """
     found = conversion(space, spec.robot)
-    if space != JOINT_TARGET and spec.action_meaning != RobotTaskSpec.action_meaning:
-        needed = RobotTaskSpec.action_meaning
+    if space != JOINT_TARGET and spec.action_meaning not in JOINT_TARGETS:
+        needed = " or ".join(JOINT_TARGETS)
         raise MismatchError("meaning of the action", "the dataset", spec.action_meaning, space, needed)
     if isinstance(found, HandDelta):
         from manip_il.robots.robot import get_robot

@@ -22,7 +22,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, JOINT_TARGETS, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.batches import Augment
 from manip_il.learn.fit_config import JOINT_TARGET, MLP, NOT_OURS, OWN_SPACE, FitConfig, check_convertible
@@ -284,7 +284,7 @@ class LeRobotFit:
 def _action_space(policy: PreTrainedConfig, config: FitConfig, meaning: str) -> str:
     """The action space of a fit, also put into the configuration of a policy that has it there."""
     wanted, start = config.action_space, config.init_from or config.policy.get("path")
-    if wanted is None and "action_space" not in config.policy and meaning != RobotTaskSpec.action_meaning:
+    if wanted is None and "action_space" not in config.policy and meaning not in JOINT_TARGETS:
         wanted = JOINT_TARGET
     known = start is not None and (Path(start) / CONFIG).is_file()  # else the weights are missing, too, which is said
     before = read_interface(Path(start)).space if start is not None and known else None

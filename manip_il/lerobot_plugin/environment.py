@@ -72,6 +72,7 @@ class ManipILEnv(EnvConfig):
         ):
             if name not in known:
                 raise UnknownName(kind, name, known)
+        self.fps = self._simulation().control_hz
         self.features = self._features()
         self.features_map = {key: _RENAMED.get(key, key) for key in self.features}
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.robots.servos import ServoUnits
 
 F64 = NDArray[np.float64]
 
@@ -19,7 +20,8 @@ class ActionSpace:
 
     low, high: what commands are clipped to, infinite where a joint turns freely. scale: the longest step of a joint
     target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
-    measured from where the joint is; the gripper's is not. Raises `ManipError` where lengths differ.
+    measured from where the joint is; the gripper's is not. units: of a robot with servos: all of these, every action and
+    measured state are then in degrees and, the gripper's, from 0 to 100. Raises `ManipError` where lengths differ.
     """
 
     names: tuple[str, ...]
@@ -27,6 +29,7 @@ class ActionSpace:
     high: F64
     scale: F64
     relative: NDArray[np.bool_]
+    units: ServoUnits | None = None
 
     def __post_init__(self) -> None:
         lengths = {name: len(getattr(self, name)) for name in ("names", "low", "high", "scale", "relative")}
@@ -47,10 +50,18 @@ class ActionSpace:
         return int(np.flatnonzero(~self.relative)[0])
 
     def join(self, arm: F64, opening: float) -> F64:
-        """Return the action of joint values (n - 1,) [rad] and an opening [m]."""
+        """Return the action, or measured state, (n,) of joint values (n - 1,) [rad] and an opening [m]."""
+        return self._together(arm, opening) if self.units is None else self._together(*self.units.of(arm, opening))
+
+    def split(self, action: F64) -> tuple[F64, float]:
+        """Return joint values (n - 1,) [rad] and opening [m] of an action (n,)."""
+        arm, gripper = action[self.arm], action[self.gripper]
+        return (arm, gripper) if self.units is None else self.units.back(arm, gripper)
+
+    def _together(self, arm: F64, gripper: float) -> F64:
         action = np.empty(len(self.names))
         action[self.arm] = arm
-        action[self.gripper] = opening
+        action[self.gripper] = gripper
         return action
 
     def clip(self, action: NDArray[np.floating], step: int) -> F64:
@@ -63,7 +74,7 @@ class ActionSpace:
         return np.minimum(np.maximum(action, self.low), self.high)
 
     def random_near(self, state: NDArray[np.floating], rng: np.random.Generator) -> F64:
-        """Draw joint targets within the longest step of the measured joints in `state` (n,), and any opening."""
+        """Draw joint targets within the longest step of the measured joints in `state` (n,), the gripper anywhere."""
         drawn = rng.uniform(-1, 1, len(self.arm)) * self.scale[self.arm]
-        opening = rng.uniform(self.low[self.gripper], self.high[self.gripper])
-        return self.join(np.asarray(state, dtype=np.float64)[self.arm] + drawn, opening)
+        gripper = rng.uniform(self.low[self.gripper], self.high[self.gripper])
+        return self._together(np.asarray(state, dtype=np.float64)[self.arm] + drawn, gripper)

@@ -82,6 +82,11 @@ class Gripper:
         share = np.interp(opening, self._sweep.openings, self._sweep.shares)
         return self._closed + share * self._travel
 
+    @property
+    def driven(self) -> tuple[F64, F64]:
+        """Openings [m], rising, and where the first of the driven joints is then [rad or m]; (c,) both."""
+        return self._sweep.openings, self._closed[0] + self._sweep.shares * self._travel[0]
+
     def middle(self, opening: float) -> float:
         """Return where the middle between the pads is along the hand's y, at an opening [m]; 0 where all fingers move.
 

@@ -15,6 +15,7 @@ from manip_il.robots import ROBOTS
 from manip_il.robots.files import KEYS, ModelFiles
 from manip_il.robots.parts import Costs, EndEffector, GripperConfig, Workspace
 from manip_il.robots.reading import FURTHEST, missing, names, numbers, tree_of
+from manip_il.robots.servos import RATE, LeRobotConfig
 
 SUFFIXES = (".yaml", ".yml")
 JOINT_STEP = 0.1  # the longest step of a joint target from the measured joint [rad]
@@ -34,7 +35,8 @@ class Robot:
     to its inertia [kg m^2]. base: of the root body [m]. fixed: where joints stand that are neither the arm's nor the
     gripper's [rad or m]. max_joint_step: the longest step of a joint target from the measured joint [rad]. yaw: where
     a hand's yaw is zero, along the world's x or straight ahead of the shoulder. wrist_camera: the model's own, on its
-    hand. colours: red, green and blue of meshes without contacts, by patterns of names, later ones first.
+    hand. colours: red, green and blue of meshes without contacts, by patterns of names, later ones first. lerobot: how
+    LeRobot's recorder writes it, where its servos' numbers are wanted in place of [rad] and [m].
     """
 
     name: str
@@ -55,11 +57,22 @@ class Robot:
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     max_joint_step: float = JOINT_STEP
     colours: Mapping[str, tuple[float, ...]] = field(default_factory=dict, hash=False)
+    lerobot: LeRobotConfig | None = None
+
+    def __post_init__(self) -> None:
+        named, wanted = len(self.joint_names), len(self.joints) + 1
+        if named != wanted:
+            raise ManipError(f"lerobot.names has {named} names; expected {wanted}: the arm's joints', the gripper's")
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of `observation.state` and `action`: arm joints, then the gripper."""
-        return (*self.joints, "gripper")
+        return self.lerobot.names if self.lerobot is not None else (*self.joints, "gripper")
+
+    @property
+    def fps(self) -> int:
+        """Control steps a second, where nothing else is said."""
+        return self.lerobot.fps if self.lerobot is not None else RATE
 
     @property
     def leans(self) -> bool:
@@ -67,8 +80,9 @@ class Robot:
         return self.costs.orientation == self.costs.leaning
 
     def content(self) -> bytes:
-        """Return what identifies the robot: its fields, its model with all includes, its meshes' names and sizes."""
-        said = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in ("files", "colours")}
+        """Return what decides how the robot moves: fields, its model with all includes, its meshes' names and sizes."""
+        apart = ("files", "colours", "lerobot")
+        said = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in apart}
         said["gripper"] = {**vars(self.gripper), "files": None}
         parts = [one.content() for one in (self.files, self.gripper.files) if one is not None]
         texts = [text for _, several in parts for text in several]
@@ -112,6 +126,8 @@ class Robot:
             said["wrist_camera"] = checks.text("wrist_camera", tree["wrist_camera"], checks.LONGEST_NAME)
         if tree.get("base") is not None:
             said["base"] = numbers("base", tree["base"], 3, FURTHEST)
+        if "lerobot" in tree:
+            said["lerobot"] = LeRobotConfig.read("lerobot", tree["lerobot"])
         fixed, colours = (checks.mapping(name, tree.get(name, {})) for name in ("fixed", "colours"))
         said["fixed"] = {name: checks.number(f"fixed: {name}", value, -100, 100) for name, value in fixed.items()}
         said["colours"] = {name: numbers(f"colours: {name}", value, 3, 1.0, 0.0) for name, value in colours.items()}

@@ -26,7 +26,7 @@ class EnvConfig:
 
     robot: str = option("panda", " or ".join([*ROBOTS, stock.ROBOT]))
     task: str = option("pick_place", ", ".join(NAMES))
-    control_hz: int = option(20, "control steps a second")
+    control_hz: int = option(0, "control steps a second; 0: the robot's own, 30 of so101, 20 of others")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
     success_steps: int = option(
         0, "consecutive control steps within the tolerance that count as success; 0: the task's own"
@@ -40,6 +40,10 @@ class EnvConfig:
         if self.robot == stock.ROBOT:
             stock.take_limits(self)
         self._take_object()
+        if not self.control_hz:
+            from manip_il.robots.robot import get_robot  # here, as help needs no robot
+
+            object.__setattr__(self, "control_hz", get_robot(self.robot).fps)
         if not 1 <= self.control_hz <= MOST_HZ:
             raise UsageError(f"control_hz is {self.control_hz}; expected 1 to {MOST_HZ}")
         self._take_limits()

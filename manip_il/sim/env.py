@@ -33,8 +33,8 @@ _JOINT_JITTER = 0.03  # of every arm joint at the start [rad]
 class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
     """Joint-position control of one arm on one task.
 
-    Action: joint position targets [rad] and gripper opening command [m], (n,), float32. Observation: a dict of
-    `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
+    Action: joint position targets and gripper command in the units of `ActionSpace`, (n,), float32. Observation: a dict
+    of `agent_pos` (n,), `environment_state` (k,) and, with cameras, `pixels` {camera: uint8 (H, W, 3)}.
     Reward is 1 while the task is solved, else 0. An episode ends at the horizon only (truncated), so that
     "solved once" and "solved at the end" can both be read. conditions: what episodes differ in from the nominal world,
     in turn by their seeds; `drawn` has the present one's values. The state is the true one, whatever is observed.
@@ -167,8 +167,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         executed = action if self._events is None else self._events.action(action, self._step)
         action = scene.actions.clip(executed, self._step)
         data = world.data
-        data.ctrl[scene.arm_ctrl] = action[scene.actions.arm]
-        data.ctrl[scene.gripper.ctrl] = scene.gripper.command(action[scene.actions.gripper])
+        data.ctrl[scene.arm_ctrl], opening = scene.actions.split(action)
+        data.ctrl[scene.gripper.ctrl] = scene.gripper.command(opening)
         mujoco.mj_step(world.model, data, self.config.physics_steps)
         world.update()  # positions as of now, not of the last physics step's start
         self._step += 1
@@ -278,7 +278,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
 
 def joint_state(world: World) -> F32:
-    """Return measured joint positions [rad] and gripper opening [m], float32 (n,)."""
+    """Return measured joint positions and gripper opening in the units of the robot's actions, float32 (n,)."""
     scene, data = world.scene, world.data
     return scene.actions.join(data.qpos[scene.arm_q], world.opening).astype(np.float32)
 

@@ -60,12 +60,12 @@ def random_action(action: F64, world: World, rng: np.random.Generator) -> F64:
 def opposite_action(action: F64, world: World, rng: np.random.Generator) -> F64:
     """Return the joint step of `action` (n,) mirrored about the measured joints, and the opposite gripper command."""
     mirrored = 2 * _measured(world) - action
-    return np.where(world.scene.actions.relative, mirrored, _opposite_opening(action, world))
+    return np.where(world.scene.actions.relative, mirrored, _opposite_end(action, world))
 
 
 def wrong_gripper(action: F64, world: World, rng: np.random.Generator) -> F64:
     """Return `action` (n,) with the opposite gripper command."""
-    return np.where(world.scene.actions.relative, action, _opposite_opening(action, world))
+    return np.where(world.scene.actions.relative, action, _opposite_end(action, world))
 
 
 def move_object(world: World, rng: np.random.Generator, distance: tuple[float, float], height: float = 0.0) -> bool:
@@ -100,7 +100,7 @@ def jolt_joints(world: World, rng: np.random.Generator, largest: float) -> bool:
     Draws in which something would stand inside something else are drawn again; returns whether one was found.
     """
     scene, data = world.scene, world.data
-    low, high = scene.actions.low[scene.actions.arm], scene.actions.high[scene.actions.arm]
+    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
     before = data.qpos.copy()
     for _ in range(_MAX_DRAWS):
         q = before[scene.arm_q] + rng.uniform(-largest, largest, len(scene.arm_q))
@@ -241,14 +241,15 @@ def _ends(value: Any) -> tuple[Any, Any]:
 
 
 def _measured(world: World) -> F64:
-    """Joint positions [rad] and opening [m], (n,)."""
+    """Measured state in the units of actions, (n,)."""
     return world.scene.actions.join(world.data.qpos[world.scene.arm_q], world.opening)
 
 
-def _opposite_opening(action: F64, world: World) -> float:
-    """The end of the gripper's range that the command in `action` is farther from [m]."""
-    gripper = world.scene.gripper
-    return gripper.most if action[world.scene.actions.gripper] < (gripper.least + gripper.most) / 2 else gripper.least
+def _opposite_end(action: F64, world: World) -> float:
+    """The end of the gripper's range that the command in `action` is farther from, in the units of actions."""
+    actions = world.scene.actions
+    low, high = actions.low[actions.gripper], actions.high[actions.gripper]
+    return high if action[actions.gripper] < (low + high) / 2 else low
 
 
 def _settle(world: World) -> None:

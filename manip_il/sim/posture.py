@@ -19,7 +19,7 @@ def draw_posture(world: World, rng: np.random.Generator, largest: float) -> None
     stays where it was if no such posture is drawn.
     """
     scene, data = world.scene, world.data
-    low, high = scene.actions.low[scene.actions.arm], scene.actions.high[scene.actions.arm]
+    low, high = (scene.actions.split(end)[0] for end in (scene.actions.low, scene.actions.high))
     before = data.qpos[scene.arm_q].copy()
     _stand(world, before)
     touching = _arm_contacts(world)

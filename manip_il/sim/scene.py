@@ -16,6 +16,7 @@ from manip_il.robots.geometry import outline
 from manip_il.robots.gripper import Gripper
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.rotations import angle_across, yaw_ahead
+from manip_il.robots.servos import ServoUnits
 from manip_il.robots.spec import arm_spec, copy_options
 from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
@@ -159,7 +160,14 @@ def _action_space(robot: Robot, joints: list[mujoco._structs._MjModelJointViews]
     limits = np.array([joint.range if joint.limited[0] else [-np.inf, np.inf] for joint in joints])
     low, high = np.vstack([limits, [gripper.least, gripper.most]]).T
     scale = np.array([robot.max_joint_step] * len(joints) + [gripper.most - gripper.least])
-    return ActionSpace(robot.joint_names, low, high, scale, np.array([True] * len(joints) + [False]))
+    relative, units = np.array([True] * len(joints) + [False]), None
+    if robot.lerobot is not None:
+        openings, driven = gripper.driven
+        units = ServoUnits(openings, robot.lerobot.percent(driven))
+        ends = np.sort(units.percents[[0, -1]])
+        low, high, scale = (np.degrees(one) for one in (low, high, scale))
+        low[-1], high[-1], scale[-1] = *ends, np.ptp(ends)
+    return ActionSpace(robot.joint_names, low, high, scale, relative, units)
 
 
 def _add_look(spec: mujoco.MjSpec) -> None:

@@ -180,7 +180,7 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             f"{expert} --suite=hard": "unknown suite 'hard'",
             f"{expert} --suite=nominall": "did you mean 'nominal'?",
             f"{expert} --env.tolerance=2": "tolerance is 2.0",
-            f"{expert} --env.control_hz=0": "control_hz is 0; expected 1 to 500",
+            f"{expert} --env.control_hz=-1": "control_hz is -1; expected 1 to 500",
             f"{expert} --until_width=2": "--until_width is 2.0; expected between 0 and 1",
             f"{expert} --eval.n_episodes=0": "--eval.n_episodes is 0",
             f"{expert} --eval.films=-1": "--eval.films is -1",

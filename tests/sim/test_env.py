@@ -194,7 +194,7 @@ def test_a_rate_that_two_milliseconds_divide_keeps_them(hz: int):
 @pytest.mark.parametrize(
     "setting",
     [
-        *({"control_hz": 0}, {"control_hz": 501}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
+        *({"control_hz": -1}, {"control_hz": 501}, {"tolerance": -0.01}, {"tolerance": float("nan")}),
         *({"success_steps": -1}, {"horizon": -1}, {"horizon": 4}),
     ],
 )

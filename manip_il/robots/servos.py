@@ -1,0 +1,68 @@
+"""Numbers of a robot's servos as LeRobot's recorder writes them: joints in degrees, the gripper from 0 to 100."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il import checks
+from manip_il.errors import ManipError
+from manip_il.robots.reading import names, numbers, tree_of
+
+F64 = NDArray[np.float64]
+RATE = 20  # control steps a second of a robot that says no other
+_MOST_HZ = 500
+_FURTHEST = 10.0  # of a gripper's joint [rad]
+
+
+@dataclass(frozen=True)
+class LeRobotConfig:
+    """A robot as LeRobot's recorder knows it.
+
+    robot_type: in `meta/info.json`. names: of its servos, the arm's from base to hand, then the gripper's. gripper:
+    where the gripper's driven joint stands at 0 and at 100 [rad]. fps: frames a second.
+    """
+
+    robot_type: str
+    names: tuple[str, ...]
+    gripper: tuple[float, ...]
+    fps: int = RATE
+
+    @classmethod
+    def read(cls, what: str, tree: Any) -> Self:
+        """Make it of what YAML holds; `ManipError` names what is wrong."""
+        tree = tree_of(what, tree, cls)
+        gripper = numbers(f"{what}.gripper", tree["gripper"], 2, _FURTHEST)
+        if gripper[0] == gripper[1]:
+            raise ManipError(f"{what}.gripper is {gripper[0]:g} rad at 0 and at 100; expected two places")
+        robot_type = checks.name(f"{what}.robot_type", tree["robot_type"])
+        fps = checks.whole(f"{what}.fps", tree.get("fps", cls.fps), 1, _MOST_HZ)
+        return cls(robot_type, names(f"{what}.names", tree["names"]), gripper, fps)
+
+    def percent(self, joint: F64) -> F64:
+        """Return the gripper's numbers, 0 to 100, where its driven joint stands at `joint` [rad]."""
+        at_0, at_100 = self.gripper
+        return 100 * (joint - at_0) / (at_100 - at_0)
+
+
+@dataclass(frozen=True, eq=False)
+class ServoUnits:
+    """The way from [rad] and [m] to degrees and 0 to 100, and back.
+
+    openings: of the gripper [m], rising, (c,). percents: its servo's numbers there, 0 to 100, (c,).
+    """
+
+    openings: F64
+    percents: F64
+
+    def of(self, arm: F64, opening: float) -> tuple[F64, float]:
+        """Return degrees (n - 1,) and the gripper's number, 0 to 100, of joints (n - 1,) [rad] and an opening [m]."""
+        return np.degrees(arm), float(np.interp(opening, self.openings, self.percents))
+
+    def back(self, arm: F64, percent: float) -> tuple[F64, float]:
+        """Return joints (n - 1,) [rad] and opening [m] of degrees (n - 1,) and the gripper's number, 0 to 100."""
+        order = slice(None, None, 1 if self.percents[0] < self.percents[-1] else -1)  # as `interp` takes them
+        return np.radians(arm), float(np.interp(percent, self.percents[order], self.openings[order]))
