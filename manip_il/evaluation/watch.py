@@ -66,7 +66,7 @@ class SlidersDriver:
         self._window, self._env = window, env
 
     def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """Return joint targets and gripper command (n,) in the units of actions; an episode begins with those that it starts from."""
+        """Return joint targets and gripper command (n,); an episode begins with those that it starts from."""
         scene, before = self._env.scene, self._env.data.ctrl
         [turn] = turns
         commands = before if turn.step == 0 else self._window.commands

@@ -20,8 +20,8 @@ class ActionSpace:
 
     low, high: what commands are clipped to, infinite where a joint turns freely. scale: the longest step of a joint
     target from the measured joint [rad], the whole opening of the gripper [m]. relative: whether a learner's target is
-    measured from where the joint is; the gripper's is not. units: of a robot with servos: all of these, every action and
-    measured state are then in degrees and, the gripper's, from 0 to 100. Raises `ManipError` where lengths differ.
+    measured from where the joint is; the gripper's is not. units: of a robot with servos: all of these, every action
+    and measured state are then in degrees and, the gripper's, from 0 to 100. Raises `ManipError` where lengths differ.
     """
 
     names: tuple[str, ...]
