@@ -1,0 +1,148 @@
+"""SO-101 speaks as the real one does in LeRobot: its names, degrees, 0 to 100, 30 frames a second."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
+from manip_il.engine.environments import env_actions, env_spec
+from manip_il.errors import ManipError
+from manip_il.robots.robot import ROBOTS, get_robot
+from manip_il.robots.servos import LeRobotConfig, ServoUnits
+from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.env import ManipEnv, joint_state
+from manip_il.sim.scene import build_scene
+
+from ..scenes import started
+from ..so_follower import Camera, arm, recorders_features
+
+JAW = "gripper"
+STEP = 360 / 4096  # of a servo [deg]
+OUT_OF_STEP = 1.01 * STEP
+
+
+@pytest.fixture
+def real(monkeypatch: pytest.MonkeyPatch) -> Any:
+    return arm(monkeypatch, limits(), {"front": Camera(48, 64)})
+
+
+def limits() -> dict[str, tuple[float, float]]:
+    """Of the model's joints [rad], whose names are the servos'."""
+    robot, model = get_robot("so101"), build_scene("so101", "reach").model
+    return {name: tuple(model.joint(f"robot/{name}").range) for name in (*robot.joints, JAW)}
+
+
+def stand(real: Any, env: ManipEnv) -> None:
+    """Put the real arm's servos where the simulated joints are."""
+    real.bus.stand({name: float(env.data.joint(f"robot/{name}").qpos[0]) for name in limits()})
+
+
+def test_features_are_those_that_lerobots_recorder_makes(real):
+    spec = env_spec(EnvConfig("so101", "pick_place", object="box:0.025"), CameraConfig(("front",), 48, 64))
+    ours, theirs = features(spec), recorders_features(real)
+    for key, feature in theirs.items():
+        assert {**ours[key], "info": None} == {**feature, "shape": tuple(feature["shape"]), "info": None}, key
+    assert list(theirs) == [ACTION, STATE, "observation.images.front"]
+    assert (spec.lerobot_type, spec.robot, spec.fps) == (real.name, "so101", 30)
+
+
+def test_a_measured_state_is_what_the_real_arms_servos_read(real):
+    env = started("so101", "pick_place", seed=3, object="box:0.025")
+    rng, actions = np.random.default_rng(0), env.scene.actions
+    for _ in range(20):
+        env.advance(actions.random_near(joint_state(env.world), rng))
+        stand(real, env)
+        read = real.get_observation()
+        ours = dict(zip(actions.names, joint_state(env.world).tolist(), strict=True))
+        assert list(ours) == [name for name in read if name.endswith(".pos")]
+        for name in ours:
+            assert abs(ours[name] - read[name]) < OUT_OF_STEP, name
+
+
+def test_the_real_arm_goes_where_an_action_sends_the_simulated_one(real):
+    actions = env_actions(EnvConfig("so101", "reach"))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        action = rng.uniform(actions.low, actions.high)
+        real.send_action(dict(zip(actions.names, action.tolist(), strict=True)))
+        joints, opening = actions.split(action)
+        wanted = [*joints, *build_scene("so101", "reach").gripper.command(opening)]
+        steps = [real.bus.steps[name] for name in limits()]
+        np.testing.assert_allclose((np.array(steps) - 2047.5) * 360 / 4096, np.degrees(wanted), atol=2 * STEP)
+
+
+def test_units_there_and_back_are_the_same_joints_and_opening():
+    scene, rng = build_scene("so101", "reach"), np.random.default_rng(0)
+    actions, gripper = scene.actions, scene.gripper
+    for _ in range(50):
+        joints, opening = rng.uniform(-1.5, 1.5, 5), rng.uniform(gripper.least, gripper.most)
+        back, again = actions.split(actions.join(joints, opening))
+        np.testing.assert_allclose(back, joints, atol=1e-12)
+        assert again == pytest.approx(opening, abs=1e-9)
+    closed = actions.join(np.zeros(5), gripper.least)
+    assert closed[-1] == 0
+    assert actions.join(np.zeros(5), gripper.most)[-1] == pytest.approx(100 * (1.2 + 0.1745) / 1.9199)
+    assert actions.clip(np.full(6, 100.0), 0)[-1] == actions.high[-1]  # the simulated jaw opens to 72
+
+
+def test_a_gripper_whose_numbers_fall_as_it_opens_comes_back_too():
+    units = ServoUnits(np.array([0.0, 0.02, 0.05]), np.array([100.0, 40.0, 0.0]))
+    for opening in (0.0, 0.01, 0.03, 0.05):
+        assert units.back(*units.of(np.zeros(2), opening))[1] == pytest.approx(opening)
+
+
+def test_robots_with_a_name_of_lerobots_are_known_by_it():
+    named = {one.lerobot.robot_type: name for name in ROBOTS if (one := get_robot(name)).lerobot is not None}
+    assert named == LEROBOT_TYPES
+    assert {name: EnvConfig(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
+    assert env_spec(EnvConfig("so101", "reach")).action_meaning == SERVOS
+
+
+def test_a_robot_named_otherwise_moves_alike_and_keeps_its_map_of_reach():
+    robot = get_robot("so101")
+    assert replace(robot, lerobot=None).content() == robot.content()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"names": ["a", "b"]}, "lerobot.names has 2 names; expected 6"),
+        ({"gripper": [0.5, 0.5]}, "lerobot.gripper is 0.5 rad at 0 and at 100; expected two places"),
+        ({"gripper": [0.5]}, "lerobot.gripper has 1 numbers; expected 2"),
+        ({"fps": 0}, "lerobot.fps is 0"),
+        ({"robot_type": ""}, "lerobot.robot_type"),
+        ({"nmaes": []}, "did you mean 'names'"),
+    ],
+)
+def test_a_mistake_in_the_section_is_one_line(changes: dict[str, Any], words: str):
+    tree = {"robot_type": "so_follower", "names": list("abcdef"), "gripper": [-0.1745, 1.7454], "fps": 30}
+    with pytest.raises(ManipError, match=words) as refused:
+        replace(get_robot("so101"), lerobot=LeRobotConfig.read("lerobot", tree | changes))
+    assert "\n" not in str(refused.value)
+
+
+def test_both_models_of_the_arm_have_the_same_zeros():
+    """The Robot Studio's own model says what a calibrated arm's zeros are; ours is another one."""
+    ours = mujoco.MjModel.from_xml_path(str(get_robot("so101").files.model))
+    theirs = mujoco.MjModel.from_xml_path(str(get_robot("so101").files.model.parents[1] / "SO101/so101_new_calib.xml"))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        places, joints = [], {name: rng.uniform(-1, 1) for name in limits()}
+        for model in (ours, theirs):
+            data = mujoco.MjData(model)
+            for name, angle in joints.items():
+                data.joint(name).qpos[0] = angle
+            mujoco.mj_kinematics(model, data)
+            jaw, base = data.body("moving_jaw_so101_v1"), data.body("base")
+            places.append(np.concatenate([jaw.xpos - base.xpos, jaw.xmat]))
+        np.testing.assert_allclose(places[0], places[1], atol=1e-6)
+
+
+def test_no_other_robot_has_units_of_its_own():
+    for name in ("panda", "fetch"):
+        assert build_scene(name, "reach").actions.units is None
