@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ from ..so_follower import Camera, arm, record, recorders_features
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]  # records pictures
 HEIGHT, WIDTH = 48, 64
+SMALL_ACT = {"chunk_size": 5, "n_action_steps": 5, "dim_model": 32, "n_heads": 2, "n_encoder_layers": 1}
+SMALL_ACT |= {"dim_feedforward": 32, "pretrained_backbone_weights": "null"}
+AS_LEROBOT = "--dataset.rgb_encoder.vcodec=libsvtav1"  # its recorder has this codec, and merges one codec only
 KEPT = {ACTION, STATE, "observation.images.front"}
 
 
@@ -44,7 +48,7 @@ def real(monkeypatch: pytest.MonkeyPatch) -> Any:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("simulated") / "simulated"
     words = ["--robot.type=so101", "--task.type=reach", "--cameras=front", "--dataset.num_episodes=2", "--workers=1"]
-    words += [f"--image.height={HEIGHT}", f"--image.width={WIDTH}", f"--dataset.root={root}"]
+    words += [f"--image.height={HEIGHT}", f"--image.width={WIDTH}", f"--dataset.root={root}", AS_LEROBOT]
     assert main(["record", *words]) == 0
     return root
 
@@ -75,13 +79,11 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
         np.testing.assert_array_equal(merged[key][: len(first[key])], first[key])
         assert merged[key].shape == (len(first[key]) + 40, 6)
     assert np.abs(merged[STATE][-1] - np.array(list(real.get_observation().values())[:6])).max() < 1e-4
-    assert len(LeRobotDataset("someone/both", root=both)[-1]["observation.images.front"]) == 3
+    assert len(LeRobotDataset("someone/both", root=both, video_backend="pyav")[-1]["observation.images.front"]) == 3
     command("lerobot-train", *act_words(both, tmp_path / "run", steps=2), "--batch_size=4")
 
 
 def test_a_dataset_without_our_file_is_still_of_the_robot_that_we_know(simulated, tmp_path):
-    import shutil
-
     root = shutil.copytree(simulated, tmp_path / "copy")
     (root / "meta/manip_il.json").unlink()
     found, before = read_spec(root), read_spec(simulated)
@@ -91,8 +93,9 @@ def test_a_dataset_without_our_file_is_still_of_the_robot_that_we_know(simulated
 
 @pytest.mark.parametrize("policy", ["act", "cnn"])
 def test_a_policy_of_ours_drives_the_real_arm_as_lerobot_rollout_asks_it(real, simulated, policy, tmp_path):
-    small = ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.n_encoder_layers=1"] if policy == "act" else []
-    words = [f"--policy.type={policy}", *small, "--observation=images", "--steps=2", "--batch_size=4"]
+    small = SMALL_ACT if policy == "act" else {}
+    own = [f"--policy.{name}={value}" for name, value in small.items()]
+    words = [f"--policy.type={policy}", *own, "--observation=images", "--steps=2", "--batch_size=4"]
     assert main(["train", f"--dataset.root={simulated}", *words, f"--output_dir={tmp_path / 'run'}"]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
 
