@@ -79,7 +79,8 @@ def test_noise_is_on_joints_and_object_and_all_that_follows_from_them(robot: str
             assert vector(shown, "object_from_ee") == pytest.approx(apart, abs=1e-6)
             assert np.array_equal(vector(shown, "goal"), vector(seen, "goal"))
             assert not np.array_equal(vector(shown, "ee"), vector(seen, "ee"))
-    assert np.std(joints) == pytest.approx(0.01, rel=0.1)
+    noise = 0.01 if plain.scene.actions.units is None else np.degrees(0.01)
+    assert np.std(joints) == pytest.approx(noise, rel=0.1)
     assert np.std(cubes) == pytest.approx(0.02, rel=0.1)
 
 

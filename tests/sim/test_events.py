@@ -45,7 +45,7 @@ def arm(env: ManipEnv) -> np.ndarray:
 
 
 def opening(env: ManipEnv) -> float:
-    return float(env.observe().state[env.scene.actions.gripper])
+    return env.world.opening
 
 
 def deepest(env: ManipEnv) -> float:
@@ -142,8 +142,7 @@ def test_noise_is_a_share_of_the_actions_range(env: ManipEnv):
     actions = env.scene.actions
     rng, action = np.random.default_rng(0), np.linspace(-1, 1, len(actions))
     draws = np.array([noisy(action, env.world, 0.1, rng) - action for _ in range(4_000)])
-    gripper = env.scene.gripper
-    expected = 0.1 * actions.join(2 * actions.scale[actions.arm], gripper.most - gripper.least)
+    expected = 0.1 * np.where(actions.relative, 2, 1) * actions.scale
     np.testing.assert_allclose(draws.std(axis=0), expected, rtol=0.06)  # five standard errors
     assert np.abs(draws.mean(axis=0) / expected).max() < 0.08
 
@@ -233,14 +232,14 @@ def test_what_changes_nothing_leaves_the_state_bit_for_bit(env: ManipEnv, kind: 
 
 
 def test_a_random_action_is_any_that_a_learner_may_choose(env: ManipEnv):
-    actions, gripper, q = env.scene.actions, env.scene.gripper, arm(env)
+    actions, q = env.scene.actions, env.observe().state[env.scene.actions.arm]
     drawn = np.array([wrong(env, "random", np.zeros(len(actions)), seed) for seed in range(200)])
-    steps, openings = drawn[:, actions.arm] - q, drawn[:, actions.gripper]
-    longest, room = env.scene.robot.max_joint_step, gripper.most - gripper.least
-    assert np.abs(steps).max() <= longest
-    assert (np.abs(steps).max(axis=0) > 0.95 * longest).all()
-    assert gripper.least <= openings.min() < gripper.least + 0.05 * room
-    assert gripper.most - 0.05 * room < openings.max() <= gripper.most
+    steps = (drawn[:, actions.arm] - q) / actions.scale[actions.arm]
+    assert np.abs(steps).max() <= 1 + 1e-6
+    assert (np.abs(steps).max(axis=0) > 0.95).all()
+    shares = (drawn[:, actions.gripper] - actions.low[actions.gripper]) / actions.scale[actions.gripper]
+    assert 0 <= shares.min() < 0.05
+    assert 0.95 < shares.max() <= 1
 
 
 @pytest.mark.parametrize(("command", "opposite"), [(0.0, 1.0), (0.4, 1.0), (0.6, 0.0), (1.0, 0.0)])
