@@ -98,7 +98,7 @@ def _policies_options() -> set[str]:
 
 @cache
 def _lerobots_options() -> set[str]:
-    """Of lerobot-train, lerobot-eval and lerobot-edit-dataset."""
+    """Of lerobot-train, lerobot-eval, lerobot-edit-dataset, and the programs for a real arm."""
     from lerobot.configs.eval import EvalPipelineConfig
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.scripts import lerobot_edit_dataset
@@ -110,7 +110,18 @@ def _lerobots_options() -> set[str]:
     kinds = [kind for kind in vars(lerobot_edit_dataset).values() if isinstance(kind, type)]
     edits = [kind for kind in kinds if dataclasses.is_dataclass(kind) and kind.__name__.endswith("Config")]
     found |= {f"operation.{field.name}" for kind in edits for field in dataclasses.fields(kind)}
-    return found | {"env.discover_packages_path"}
+    return found | _of_a_real_arm() | {"env.discover_packages_path"}
+
+
+def _of_a_real_arm() -> set[str]:
+    from lerobot.robots.so_follower import SOFollowerRobotConfig
+    from lerobot.rollout.configs import RolloutConfig
+    from lerobot.scripts.lerobot_record import RecordConfig
+    from lerobot.teleoperators.so_leader import SOLeaderTeleopConfig
+
+    found = _leaves(RolloutConfig) | _leaves(RecordConfig) | {"robot.type", "teleop.type", "strategy.type"}
+    parts = {"robot": SOFollowerRobotConfig, "teleop": SOLeaderTeleopConfig}
+    return found | {f"{part}.{field.name}" for part, kind in parts.items() for field in dataclasses.fields(kind)}
 
 
 def _leaves(kind: type, prefix: str = "") -> set[str]:

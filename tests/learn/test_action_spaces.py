@@ -25,8 +25,10 @@ from manip_il.learn.fit_policy import PolicyTrainer
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.learn.samples import WithActions
 from manip_il.learn.train import fit
+from manip_il.robots import robot as robots
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import get_robot
+from manip_il.robots.servos import LeRobotConfig
 
 from ..tables import every_large_robot, every_robot
 from .tiny_policies import ACT, DIFFUSION, edit_config
@@ -251,3 +253,18 @@ def test_lerobots_own_training_has_no_kinematics(table, root):
         make_policy(make_policy_config("mlp", action_space=EE_DELTA), ds_meta=meta)
     policy: Any = make_policy(make_policy_config("mlp", action_space=JOINT_TARGET), ds_meta=meta)
     np.testing.assert_array_equal(policy.model.target_high, table[ACTION].max(0))
+
+
+def test_a_hand_moves_alike_whatever_units_its_joints_have(monkeypatch: pytest.MonkeyPatch):
+    panda = get_robot("panda")
+    names = tuple(f"{name}.pos" for name in panda.joint_names)
+    actions, states = moves("panda", 5)
+    plain = conversion(EE_DELTA, "panda")
+    wanted = plain.encode(actions, states)
+    in_degrees = np.array([180 / np.pi] * len(panda.joints) + [1.0])
+    with monkeypatch.context() as patch:
+        patch.setattr(robots, "get_robot", lambda name: replace(panda, lerobot=LeRobotConfig("arm", names, (0.0, 1.0))))
+        found = plain.encode(actions * in_degrees, states * in_degrees)
+        back = plain.decode(found, states * in_degrees)
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    np.testing.assert_allclose(back, plain.decode(wanted, states) * in_degrees, atol=1e-6)
