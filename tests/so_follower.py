@@ -66,7 +66,7 @@ class Camera:
 def arm(monkeypatch: Any, limits: dict[str, tuple[float, float]], cameras: dict[str, Camera] | None = None) -> Any:
     """A connected arm, calibrated to joints' limits [rad] in the model, as docs/real-robot.md asks for."""
     monkeypatch.setattr(so_follower, "FeetechMotorsBus", Bus)
-    robot = SOFollower(SOFollowerRobotConfig(port="none", id="none"))
+    robot: Any = SOFollower(SOFollowerRobotConfig(port="none", id="none"))
     robot.cameras = cameras or {}
     ends = {name: [round(MIDDLE + end * TURN / (2 * np.pi)) for end in limits[name]] for name in robot.bus.motors}
     ends["wrist_roll"] = [0, 4095]  # as LeRobot calibrates it

@@ -29,8 +29,10 @@ from ..so_follower import Camera, arm, record, recorders_features
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]  # records pictures
 HEIGHT, WIDTH = 48, 64
-SMALL_ACT = {"chunk_size": 5, "n_action_steps": 5, "dim_model": 32, "n_heads": 2, "n_encoder_layers": 1}
-SMALL_ACT |= {"dim_feedforward": 32, "pretrained_backbone_weights": "null"}
+SMALL_ACT = {
+    **{"chunk_size": 5, "n_action_steps": 5, "dim_model": 32, "n_heads": 2, "n_encoder_layers": 1},
+    **{"dim_feedforward": 32, "pretrained_backbone_weights": "null"},
+}
 AS_LEROBOT = "--dataset.rgb_encoder.vcodec=libsvtav1"  # its recorder has this codec, and merges one codec only
 KEPT = {ACTION, STATE, "observation.images.front"}
 
@@ -79,7 +81,8 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
         np.testing.assert_array_equal(merged[key][: len(first[key])], first[key])
         assert merged[key].shape == (len(first[key]) + 40, 6)
     assert np.abs(merged[STATE][-1] - np.array(list(real.get_observation().values())[:6])).max() < 1e-4
-    assert len(LeRobotDataset("someone/both", root=both, video_backend="pyav")[-1]["observation.images.front"]) == 3
+    read: Any = LeRobotDataset("someone/both", root=both, video_backend="pyav")
+    assert read[len(read) - 1]["observation.images.front"].shape == (3, HEIGHT, WIDTH)
     command("lerobot-train", *act_words(both, tmp_path / "run", steps=2), "--batch_size=4")
 
 

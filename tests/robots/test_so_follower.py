@@ -12,6 +12,7 @@ import pytest
 from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
 from manip_il.engine.environments import env_actions, env_spec
 from manip_il.errors import ManipError
+from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots.robot import ROBOTS, get_robot
 from manip_il.robots.servos import LeRobotConfig, ServoUnits
 from manip_il.sim.config import CameraConfig, EnvConfig
@@ -101,6 +102,7 @@ def test_robots_with_a_name_of_lerobots_are_known_by_it():
     assert named == LEROBOT_TYPES
     assert {name: EnvConfig(name).control_hz for name in ROBOTS} == {"panda": 20, "fetch": 20, "so101": 30}
     assert env_spec(EnvConfig("so101", "reach")).action_meaning == SERVOS
+    assert ManipILEnv(task="Reach-v0", robot="so101").fps == 30
 
 
 def test_a_robot_named_otherwise_moves_alike_and_keeps_its_map_of_reach():
@@ -128,8 +130,9 @@ def test_a_mistake_in_the_section_is_one_line(changes: dict[str, Any], words: st
 
 def test_both_models_of_the_arm_have_the_same_zeros():
     """The Robot Studio's own model says what a calibrated arm's zeros are; ours is another one."""
-    ours = mujoco.MjModel.from_xml_path(str(get_robot("so101").files.model))
-    theirs = mujoco.MjModel.from_xml_path(str(get_robot("so101").files.model.parents[1] / "SO101/so101_new_calib.xml"))
+    ours = mujoco.MjSpec.from_file(str(get_robot("so101").files.model)).compile()
+    calibrated = get_robot("so101").files.model.parents[1] / "SO101/so101_new_calib.xml"
+    theirs = mujoco.MjSpec.from_file(str(calibrated)).compile()
     rng = np.random.default_rng(0)
     for _ in range(5):
         places, joints = [], {name: rng.uniform(-1, 1) for name in limits()}
