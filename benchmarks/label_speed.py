@@ -15,7 +15,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import mink
 import numpy as np
 import qpsolvers
 from _machine import describe_machine
@@ -89,17 +88,17 @@ def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
 def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
     """The quadratic program that a label solves, caught on its way to the solver; None where it needs none."""
     caught: list[qpsolvers.Problem] = []
-    plain = mink.build_ik
+    plain = ik.daqp.solve
 
-    def catch(*args: Any) -> qpsolvers.Problem:
-        caught.append(plain(*args))
-        return caught[-1]
+    def catch(*args: Any) -> Any:
+        caught.append(qpsolvers.Problem(*args[:4]))
+        return plain(*args)
 
-    ik.mink.build_ik = catch
+    ik.daqp.solve = catch
     try:
         expert.label(state)
     finally:
-        ik.mink.build_ik = plain
+        ik.daqp.solve = plain
     return caught[0] if caught else None
 
 

@@ -160,22 +160,22 @@ def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:
 
     An angle counts as a length.
     """
-    yaw, q, limits = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits
+    yaw, q, (low, high) = ik.ahead(position), np.asarray(robot.home, dtype=np.float64), ik.limits.T
     down, miss = hand_down(yaw), np.inf
     for _ in range(_STEPS):
         ee, rotation = ik.ee_pose(q)
-        miss = float(np.linalg.norm(position - ee) + _ANGLE * _angle_off(robot, rotation, yaw))
+        miss = float(np.linalg.norm(position - ee) + _ANGLE * _angle_off(robot, rotation, yaw, down))
         if miss < _NEAR:
             break
-        step = ik.step(position, down, robot.max_joint_step)
-        if step is None or np.abs(step[0]).max() < 1e-5:
+        dq = ik.displacement(position, down, robot.max_joint_step)
+        if dq is None or np.abs(dq).max() < 1e-5:
             break
-        q = np.clip(q + step[0], limits[:, 0], limits[:, 1])
+        q = np.minimum(np.maximum(q + dq, low), high)
     return miss, q
 
 
-def _angle_off(robot: Robot, hand: F64, yaw: float) -> float:
-    """Return how far a hand (3, 3) is from pointing down at a yaw [rad]; one that leans anyway may lean a good deal."""
+def _angle_off(robot: Robot, hand: F64, yaw: float, down: F64) -> float:
+    """Return how far a hand (3, 3) is from `down` at a yaw [rad]; one that leans anyway may lean a good deal."""
     if robot.leans:
         return off_yaw(hand, yaw) + max(0.0, angle_off_vertical(hand) - _MOST_LEAN)
-    return float(np.arccos(np.clip((np.trace(hand_down(yaw).T @ hand) - 1) / 2, -1.0, 1.0)))
+    return float(np.arccos(min(1.0, max(-1.0, ((down.T @ hand).trace() - 1) / 2))))

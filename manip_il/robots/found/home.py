@@ -89,10 +89,10 @@ def _descend(ik: ArmIK, q: F64, target: F64, rotation: F64, soft: bool) -> tuple
         off = rotation_vector(rotation @ turned.T)
         angle = abs(float(off[2])) if soft else float(np.linalg.norm(off))
         miss = float(np.linalg.norm(target - position)) + _ANGLE_AS_LENGTH * angle
-        step = ik.step(target, rotation, _LONGEST)
-        if step is None or np.abs(step[0]).max() < 1e-4:
+        dq = ik.displacement(target, rotation, _LONGEST)
+        if dq is None or np.abs(dq).max() < 1e-4:
             break
-        q = q + step[0]
+        q = q + dq
     free = counted[:, 0] == -np.pi
     q = np.where(free, (q + np.pi) % (2 * np.pi) - np.pi, q)
     return np.clip(q, *ik.limits.T), miss

@@ -1,0 +1,60 @@
+"""Inverse kinematics solves the quadratic program that mink builds of its tasks and limits, bit for bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import daqp
+import mink
+import numpy as np
+import pytest
+
+from manip_il.robots import ik
+from manip_il.robots.ik import ArmIK
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.rotations import hand_down
+from manip_il.robots.spec import arm_model
+
+from ..tables import every_robot
+
+
+def problem_of_mink(robot: Robot, q: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> list[np.ndarray]:
+    """Matrices and vectors of the program as mink's own tasks and limits make it."""
+    model = arm_model(robot)
+    configuration, home = mink.Configuration(model), np.zeros(model.nq)
+    address = [model.joint(name).qposadr[0] for name in robot.joints]
+    home[address] = robot.home
+    frame = mink.FrameTask("ee", "site", 1.0, robot.costs.orientation, lm_damping=ik._LM_DAMPING)
+    frame.set_target(ik._se3(position, rotation))
+    posture = mink.PostureTask(model, cost=robot.costs.posture)
+    posture.set_target(home)
+    there = np.zeros(model.nq)
+    there[address] = q
+    configuration.update(there)
+    limits = [mink.ConfigurationLimit(model)]
+    problem = mink.build_ik(configuration, [frame, posture], 1.0, ik._DAMPING, limits)
+    return [np.asarray(one) for one in (problem.P, problem.q, problem.G, problem.h)]
+
+
+def test_the_program_of_ones_own_arm_is_minks(own: Robot, monkeypatch: pytest.MonkeyPatch):
+    compare(own, monkeypatch)
+
+
+@every_robot
+def test_the_program_is_minks(robot: str, monkeypatch: pytest.MonkeyPatch):
+    compare(get_robot(robot), monkeypatch)
+
+
+def compare(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    solved: list[Any] = []
+    plain = daqp.solve
+    monkeypatch.setattr(ik.daqp, "solve", lambda *problem: solved.append(problem) or plain(*problem))
+    arm, rng = ArmIK(robot), np.random.default_rng(0)
+    for _ in range(20):
+        q = np.asarray(robot.home) + rng.uniform(-0.3, 0.3, len(robot.home))
+        position = np.array([*robot.workspace.centre, 0.1]) + rng.uniform(-0.1, 0.1, 3)
+        rotation = hand_down(rng.uniform(-1, 1))
+        arm.ee_pose(q)
+        assert arm.displacement(position, rotation, 0.1) is not None
+        for ours, theirs in zip(solved[-1], problem_of_mink(robot, q, position, rotation), strict=False):
+            np.testing.assert_array_equal(ours, theirs)
