@@ -28,6 +28,7 @@ _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
 _PAD = 0.004  # what is this much farther from the other finger than the nearest is no pad [m]
 _LOPSIDED = 0.004  # the middle of the pads moves by more where only one of two fingers moves [m]
+_STILL = 1e-4  # a finger that moves by less is not driven [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
 
 
@@ -132,6 +133,9 @@ def sweep(robot: Robot) -> Sweep:
         mujoco.mj_step(model, data, _SETTLE)
         shares.append(float(((data.qpos[q] - closed) / travel).mean()))
         poses.append(data.qpos.copy())
+    geoms = [geom for finger in fingers for geom in finger]
+    places = [_at(model, data, pose)[1].geom_xpos[geoms] for pose in (poses[0], poses[-1])]
+    _require_moved(robot, *places)
     jaws = _apart(*_at(model, data, poses[-1]), fingers)
     if not all(jaws):
         raise UsageError(
@@ -163,6 +167,16 @@ def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.M
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     return model, data
+
+
+def _require_moved(robot: Robot, before: F64, after: F64) -> None:
+    """Raise `UsageError` where no finger is moved by the driven joints."""
+    if np.abs(after - before).max() < _STILL:
+        joints, fingers = (", ".join(map(repr, names)) for names in (robot.gripper.joints, robot.gripper.fingers))
+        raise UsageError(
+            f"robot {robot.name}: gripper.joints ({joints}) from gripper.closed to gripper.open move none of "
+            f"gripper.fingers ({fingers}); name the joints that drive the fingers"
+        )
 
 
 def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[list[int]]:

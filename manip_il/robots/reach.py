@@ -114,15 +114,27 @@ class Reach:
 @cache
 def reach_of(robot: Robot) -> Reach:
     """Return a robot's map: read where it is kept, else computed (some seconds) and kept."""
-    name = f"{robot.name}.reach.{_key(robot)}.npz"
-    cached = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
-    for path in (HERE / name, cached):
-        with contextlib.suppress(*_BROKEN), np.load(path, allow_pickle=False) as kept:
-            return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
+    kept = kept_reach(robot)
+    if kept is not None:
+        return kept
     reach = _solve(robot)
     with contextlib.suppress(OSError):  # a map that cannot be kept is computed again
-        _keep(reach, cached)
+        _keep(reach, _places(robot)[-1])
     return reach
+
+
+def kept_reach(robot: Robot) -> Reach | None:
+    """Return a robot's map from where it is kept; None where it is not."""
+    for path in _places(robot):
+        with contextlib.suppress(*_BROKEN), np.load(path, allow_pickle=False) as kept:
+            return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
+    return None
+
+
+def _places(robot: Robot) -> tuple[Path, Path]:
+    """Where a map may lie: beside the YAML of a robot that ships, and in the cache."""
+    name = f"{robot.name}.reach.{_key(robot)}.npz"
+    return HERE / name, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
 
 
 def _keep(reach: Reach, path: Path) -> None:

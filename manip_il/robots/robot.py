@@ -91,6 +91,7 @@ class Robot:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
+        said: dict[str, Any] = {}
         try:
             said = cls._said(path, read_yaml(path, "a robot's YAML"))
             lacking = [name for name in FOUND if name not in said]
@@ -99,6 +100,9 @@ class Robot:
 
                 said = complete(said)
             return cls(**said)
+        except ValueError as error:  # MuJoCo's, of a model that it reads and does not compile
+            why = " ".join(str(error).split())
+            raise UsageError(f"{path}: MuJoCo cannot compile {said['files'].model}: {why}") from None
         except ManipError as error:
             named = str(path) in str(error) or f"robot {path.stem}" in str(error)
             raise UsageError(str(error) if named else f"{path}: {error}") from None

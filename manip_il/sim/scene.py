@@ -21,6 +21,7 @@ from manip_il.robots.spec import arm_spec, copy_options
 from manip_il.robots.wrist_camera import add_wrist_camera
 from manip_il.sim import variation
 from manip_il.sim.config import DT_SIM
+from manip_il.sim.home import require_free_home
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
 from manip_il.tasks.table import get_task
@@ -56,7 +57,9 @@ def _build(robot: str, task: str, shape: str, step: float) -> Scene:
         model = spec.compile()
     except ValueError as error:
         why = " ".join(str(error).split())
-        raise UsageError(f"robot {the_robot.name} and task {the_task.name} make no scene: {why}") from None
+        raise UsageError(
+            f"robot {the_robot.name} and task {the_task.name} make no scene of {the_robot.files.model}: {why}"
+        ) from None
     return _index(the_robot, the_task, model, shape)
 
 
@@ -96,6 +99,7 @@ def _index(robot: Robot, task: Task, model: mujoco.MjModel, shape: str) -> Scene
     objects = _objects(model)
     gripper = Gripper(robot, model, PREFIX)
     _check_objects(robot, task, model, objects, gripper)
+    require_free_home(robot, model, PREFIX)
     return Scene(
         robot=robot,
         task=task.name,
