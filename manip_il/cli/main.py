@@ -63,6 +63,7 @@ COMMANDS = {
     "mcap export": Command("manip_il.cli.mcap:McapExportOptions", "convert a dataset to MCAP files, for Foxglove etc."),
     "mcap import": Command("manip_il.cli.mcap:McapImportOptions", "convert MCAP files to a dataset, by a mapping file"),
     "robot new": Command("manip_il.cli.robot:RobotNewOptions", "write a first YAML for an arm's MJCF"),
+    "robot check": Command("manip_il.cli.robot:RobotCheckOptions", "measure what an arm can do, before recording"),
     "quickstart": Command(
         "manip_il.cli.quickstart:QuickstartOptions", "run a small example: record, clone, DAgger, report"
     ),

@@ -1,18 +1,27 @@
-"""`manip-il robot new`: a first YAML for an arm of one's own."""
+"""`manip-il robot new`: a first YAML for an arm of one's own; `manip-il robot check`: what that arm can do."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.inputs import require_folder
-from manip_il.cli.progress import say, warn
-from manip_il.errors import ManipError, UsageError
+from manip_il.cli.options import command_line, to_plain
+from manip_il.cli.outputs import open_output, require_new
+from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.trials import read_condition
+from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import option
+from manip_il.tasks import NAMES
+
+if TYPE_CHECKING:
+    from manip_il.evaluation.robot_check.check import RobotCheck
 
 SUFFIXES = (".yaml", ".yml")
+PAGE = "check.html"
+_NOISE = "random_actions"  # of the suites
 
 
 @dataclass
@@ -60,3 +69,68 @@ class RobotNewOptions:
 
     def _target(self) -> Path:
         return self.output or self.model.with_suffix(".yaml")
+
+
+@dataclass
+class RobotCheckOptions:
+    """Measure what an arm can do, before anything is recorded; writes check.html and check.json.
+
+    Joints and gripper as they move, pictures of the arm with its frame and cameras, where it reaches, and the expert at
+    every task, as it is and with a tenth of the steps random; and what to change where something does not work. Exits
+    with 1 where a task cannot be done.
+    """
+
+    example: ClassVar[str] = "manip-il robot check my_arm.yaml --tasks=reach,pick_place --output_dir=runs/my_arm"
+    robot: str = option(MISSING, "its YAML, or the name of one that ships", positional=True)
+    tasks: list[str] = option(list, f"of {', '.join(NAMES)}; by default all")
+    episodes: int = option(50, "of the expert at each task, and as many with random actions; 0 for none")
+    output_dir: Path = option(Path("runs/robot_check"), f"folder of {PAGE}")
+    overwrite: bool = option(False, "replace an existing check")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong, and a robot that cannot be used."""
+        from manip_il.seeding import stream_seeds
+
+        if self.episodes < 0:
+            raise UsageError(f"--episodes is {self.episodes}; expected 0 or more")
+        stream_seeds("validation", self.episodes)
+        if odd := next((task for task in self.tasks if task not in NAMES), None):
+            raise UnknownName("task in --tasks:", odd, NAMES)
+        require_new(self.output_dir, overwrite=self.overwrite)
+        from manip_il.robots.robot import get_robot
+
+        get_robot(self.robot)
+
+    def run(self) -> None:
+        """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
+        from manip_il.engine.engine import Engine
+        from manip_il.evaluation.robot_check.check import FILE_NAME, check_robot
+        from manip_il.evaluation.robot_check.page import check_report
+
+        tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
+        with open_output(self) as folder:
+            with Stages(f"nothing, in {folder}") as stages, Engine(None) as engine:
+                found = check_robot(self.robot, tasks, self.episodes, read_condition(_NOISE), engine, stages)
+            found.write(folder / FILE_NAME)
+            report = check_report(found, command_line("robot check", self), to_plain(self))
+            report.write(folder / PAGE)
+        self._say(found)
+        say(f"page: {folder / PAGE}")
+        if found.failed:
+            names = ", ".join(task.name for task in found.failed)
+            raise ManipError(f"{self.robot} cannot do {len(found.failed)} of {len(tasks)} tasks: {names}; see above")
+
+    def _say(self, found: RobotCheck) -> None:
+        from manip_il.evaluation.robot_check.advice import advice
+        from manip_il.evaluation.robot_check.page import home_line, joint_table, motors_line, task_table, verdict
+        from manip_il.evaluation.tables import print_table
+
+        print_table(joint_table(found))
+        say(motors_line(found))
+        say(f"The gripper opens to {1000 * found.hand.most:.1f} mm. {home_line(found)}")
+        if found.no_pictures:
+            say(f"No pictures: {found.no_pictures}")
+        print_table(task_table(found))
+        say(verdict(found))
+        for line in advice(found):
+            say(f"change: {line}")

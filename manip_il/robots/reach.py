@@ -118,8 +118,7 @@ def reach_of(robot: Robot) -> Reach:
     if kept is not None:
         return kept
     reach = _solve(robot)
-    with contextlib.suppress(OSError):  # a map that cannot be kept is computed again
-        _keep(reach, _places(robot)[-1])
+    keep_reach(robot, reach)
     return reach
 
 
@@ -137,12 +136,15 @@ def _places(robot: Robot) -> tuple[Path, Path]:
     return HERE / name, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
 
 
-def _keep(reach: Reach, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def keep_reach(robot: Robot, reach: Reach) -> None:
+    """Write a robot's map to the cache; one that cannot be kept is computed again."""
+    path = _places(robot)[-1]
     partial = path.with_suffix(f".{os.getpid()}")
-    with partial.open("wb") as stream:
-        np.savez_compressed(stream, origin=reach.origin, errors=reach.errors.astype(np.float32))
-    partial.replace(path)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as stream:
+            np.savez_compressed(stream, origin=reach.origin, errors=reach.errors.astype(np.float32))
+        partial.replace(path)
 
 
 def _key(robot: Robot) -> str:
@@ -152,19 +154,38 @@ def _key(robot: Robot) -> str:
 
 
 def _solve(robot: Robot) -> Reach:
+    return joined(robot, [errors_at(robot, 0, 1)])
+
+
+def errors_at(robot: Robot, part: int, parts: int) -> F64:
+    """Return how far the hand ends from every `parts`-th point of the map's grid, from number `part` on, (k,) [m]."""
     from manip_il.robots.ik import ArmIK  # mink takes long to import, and a kept map needs none
 
-    space, ik = robot.workspace, ArmIK(robot)
-    half = space.half_width + _BEYOND
-    origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
-    shape = tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
-    errors, body = np.empty(shape), Body(robot)
-    for index in np.ndindex(*shape):
-        point = origin + _CELL * np.array(index)
+    (origin, shape), ik, body = _grid(robot), ArmIK(robot), Body(robot)
+    points = [origin + _CELL * np.array(index) for index in list(np.ndindex(*shape))[part::parts]]
+    errors = np.empty(len(points))
+    for place, point in enumerate(points):
         point[2] = max(point[2], robot.ee.lowest)  # no hand gets to the table itself
         miss, q = _miss(robot, ik, point)
-        errors[index] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
-    return Reach(origin, errors.astype(np.float32).astype(np.float64))
+        errors[place] = miss + (_BLOCKED if miss < _BLOCKED and body.meets_itself(q) else 0.0)
+    return errors
+
+
+def joined(robot: Robot, parts: Sequence[F64]) -> Reach:
+    """Return the map of all parts of `errors_at`, each (k,) [m]."""
+    origin, shape = _grid(robot)
+    errors = np.empty(math.prod(shape))
+    for part, some in enumerate(parts):
+        errors[part :: len(parts)] = some
+    return Reach(origin, errors.reshape(shape).astype(np.float32).astype(np.float64))
+
+
+def _grid(robot: Robot) -> tuple[F64, tuple[int, ...]]:
+    """The map's origin (3,) [m], and its points along x, y and z."""
+    space = robot.workspace
+    half = space.half_width + _BEYOND
+    origin = np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
+    return origin, tuple(round(size / _CELL) + 1 for size in (2 * half, 2 * half, space.height + _ABOVE))
 
 
 def _miss(robot: Robot, ik: ArmIK, position: F64) -> tuple[float, F64]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import atexit
 import os
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,6 +21,24 @@ from manip_il.sim.view import ViewModel
 Picture = NDArray[np.uint8]
 _FINER = 2  # drawn so much finer each way, then averaged: cheaper than OpenGL's antialiasing, which repeats the meshes
 _MAX_GEOMS = 1_000
+
+
+class Line(NamedTuple):
+    """A line drawn into a picture: its ends (3,) in the world [m], red, green, blue and opacity, its thickness [m]."""
+
+    start: NDArray[np.float64]
+    end: NDArray[np.float64]
+    colour: tuple[float, float, float, float]
+    thickness: float
+
+
+class Overview(NamedTuple):
+    """A look from outside: at a point (3,) [m] from a distance [m], the way that it looks about z and up [deg]."""
+
+    at: NDArray[np.float64]
+    distance: float
+    azimuth: float
+    elevation: float
 
 
 def pictures(
@@ -39,6 +58,24 @@ def pictures(
     renderer = _process.renderer(robot, task, cameras.look, shape)
     renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
+
+
+def marked_picture(
+    robot: str,
+    task: str,
+    data: mujoco.MjData,
+    camera: str | Overview,
+    size: tuple[int, int],
+    look: Look,
+    lines: Sequence[Line],
+) -> Picture:
+    """Return what a camera, or somebody outside, sees of the physics in `data`, with lines drawn into it.
+
+    size: height and width [pixels]. RGB, uint8 (height, width, 3). Raises what `pictures` raises.
+    """
+    renderer = _process.renderer(robot, task, look, "")
+    renderer.pose(data, NOMINAL_VALUES)
+    return renderer.picture(camera, size, lines)
 
 
 def close() -> None:
@@ -69,12 +106,16 @@ class _Renderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
-    def picture(self, camera: str, size: tuple[int, int]) -> Picture:
+    def picture(self, camera: str | Overview, size: tuple[int, int], lines: Sequence[Line] = ()) -> Picture:
         height, width = (_FINER * side for side in size)
         self._make_room(height, width)
-        self._camera.fixedcamid = self._cameras[camera]
+        seen_by = self._camera if isinstance(camera, str) else _free_camera(camera)
+        if isinstance(camera, str):
+            seen_by.fixedcamid = self._cameras[camera]
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._camera, everything, self._scene)
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen_by, everything, self._scene)
+        for line in lines:
+            _add_line(self._scene, line)
         fine = np.empty((height, width, 3), dtype=np.uint8)
         view = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(view, self._scene, self._context)
@@ -89,6 +130,22 @@ class _Renderer:
         have_height, have_width = self._context.offHeight, self._context.offWidth
         if height > have_height or width > have_width:
             mujoco.mjr_resizeOffscreen(max(width, have_width), max(height, have_height), self._context)
+
+
+def _free_camera(view: Overview) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:] = view.at
+    camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
+    return camera
+
+
+def _add_line(scene: Any, line: Line) -> None:
+    kind, geom = mujoco.mjtGeom.mjGEOM_CAPSULE, scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(line.colour, np.float32))
+    mujoco.mjv_connector(geom, kind, line.thickness, line.start, line.end)
+    geom.emission, geom.category = 0.6, mujoco.mjtCatBit.mjCAT_DECOR  # seen in the dark, and without a shadow
+    scene.ngeom += 1
 
 
 class _Process:
