@@ -90,18 +90,18 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def _require_moved(robot: Robot, spec: mujoco.MjSpec) -> None:
-    """Raise `UsageError` for a joint of the arm that does not move the frame `ee`, or one of the gripper's that does."""
+    """Raise `UsageError` for a joint of the arm that does not move `ee`, or one of the gripper's that moves the hand."""
     moving = _above(spec.body(robot.ee.body))
     if still := [name for name in robot.joints if name not in moving]:
         raise UsageError(
-            f"robot {robot.name}: joint {still[0]!r} does not move 'ee', which is in body {robot.ee.body!r}; those that "
-            f"do: {', '.join(moving) or 'none'}; look at joints, ee.body and hand"
+            f"robot {robot.name}: joint {still[0]!r} does not move 'ee', which is in body {robot.ee.body!r}; those "
+            f"that do: {', '.join(moving) or 'none'}; look at joints, ee.body and hand"
         )
     above = _above(spec.body(robot.hand))
     if arms := [name for name in robot.gripper.joints if name in above]:
         raise UsageError(
-            f"robot {robot.name}: {arms[0]!r} of gripper.joints moves the whole hand, {robot.hand!r}; expected the joints "
-            "that drive the fingers"
+            f"robot {robot.name}: {arms[0]!r} of gripper.joints moves the whole hand, {robot.hand!r}; expected the "
+            "joints that drive the fingers"
         )
 
 

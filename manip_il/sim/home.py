@@ -15,7 +15,7 @@ Pair = tuple[str, str]
 
 
 def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: NDArray[np.float64]) -> dict[Pair, float]:
-    """Return the pairs of bodies that overlap with the arm in a posture (arm,) [rad], the gripper open, and how deep [m].
+    """Return the pairs of bodies that overlap in a posture of the arm (arm,) [rad], the gripper open, and how deep [m].
 
     Pairs of the robot's own, and of it and what stands fixed in the world, which goes by the name of its geom.
     prefix: of the robot's names in a scene's model.

@@ -48,8 +48,8 @@ def _of_joint(joint: JointFacts) -> Iterator[str]:
         )
     if joint.overshoot > SWINGS:
         yield (
-            f"{joint.name} goes {100 * joint.overshoot:.0f} % beyond a step: lower its {joint.kp:.3g} in gains, or raise its "
-            "number in armature."
+            f"{joint.name} goes {100 * joint.overshoot:.0f} % beyond a step: lower its {joint.kp:.3g} in gains, "
+            "or raise its number in armature."
         )
 
 

@@ -66,7 +66,7 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """What `manip-il robot check` found. name: the robot's, as it was given. overlaps: pairs of links that always do."""
+    """A robot as it was measured. name: as it was given. overlaps: pairs of links that overlap in any posture."""
 
     name: str
     robot: Robot
@@ -105,7 +105,7 @@ class RobotCheck:
 
 
 class Watch(Protocol):
-    """Who is told how far a check is."""
+    """Listener that is told how far a check is."""
 
     def start(self, description: str, total: int) -> None:
         """Begin a part of so many steps."""

@@ -21,8 +21,8 @@ _RISE = (0.1, 0.9)  # shares of a step between which its rise is timed
 class JointFacts:
     """One joint of the arm; of a joint that slides, m and N stand for rad and N m.
 
-    limits: [rad], None where it turns freely. home [rad]. kp [N m/rad], kv [N m s/rad], force: the greatest [N m]. rise:
-    from a tenth to nine tenths of the longest step of its target [s], None where it does not get there in a second.
+    limits: [rad], None where it turns freely. home [rad]. kp [N m/rad], kv [N m s/rad], force: the greatest [N m].
+    rise: from a tenth to nine tenths of the longest step of its target [s], None where it does not get there in a second.
     overshoot: beyond that step, as its share. sag: off home under `LOAD` in the hand [rad].
     """
 

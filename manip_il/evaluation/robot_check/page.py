@@ -76,14 +76,11 @@ def home_line(check: RobotCheck) -> str:
 def motors_line(check: RobotCheck) -> str:
     """Return in a sentence what drives the joints."""
     count = len(check.arm.own_motors)
-    own = (
-        f"The model's own {count} motor{'s are' if count != 1 else ' is'} replaced"
-        if count
-        else "The model has no motors"
-    )
-    how = "by position control" if count else "and gets position control"
+    motors = "The model has no motors and gets position control"
+    if count:
+        motors = f"The model's own {count} motor{'s are' if count > 1 else ' is'} replaced by position control"
     return (
-        f"{own} {how}: torque = kp (target - joint) - kv velocity, at most `force`; gravity is compensated. "
+        f"{motors}: torque = kp (target - joint) - kv velocity, at most `force`; gravity is compensated. "
         f"Rise and overshoot: of a step of {check.arm.step:g} rad from home, the longest that a label takes. "
         f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.arm.sag:.1f} mm."
     )
@@ -117,13 +114,14 @@ class CheckReport(Report):
         """Sentences by the part of the page that they are in."""
         check, reach = self.check, self.check.reach
         return {
-            "tasks": "Starts: of those drawn, how many find a place within reach. Random actions: a tenth of the control "
-            "steps, the gripper's too. Intervals are Wilson's.",
+            "tasks": "Starts: of those drawn, how many find a place within reach. Random actions: a tenth of the "
+            "control steps, the gripper's too. Intervals are Wilson's score intervals.",
             "joints": motors_line(check),
             "home": home_line(check),
             "chain": f"The hand is {check.robot.hand}; ee is a frame of {check.robot.ee.body}.",
-            "reach": f"The hand, pointing down, gets to {100 * reach.table:.0f} % of the workspace on the table, leaning "
-            f"to {100 * reach.leaning:.0f} %, and to {100 * reach.air:.0f} % of the room above it. Starts are drawn from there.",
+            "reach": f"The hand, pointing down, gets to {100 * reach.table:.0f} % of the workspace on the table, "
+            f"leaning to {100 * reach.leaning:.0f} %, and to {100 * reach.air:.0f} % of the room above it. "
+            "Starts are drawn from there.",
         }
 
     @cached_property
@@ -135,7 +133,7 @@ class CheckReport(Report):
 
     @cached_property
     def cells(self) -> list[tuple[float, float, float, float, bool]]:
-        """What the hand reaches on the table: left, top, width, height [px], and whether upright."""
+        """Cells of the table that the hand reaches: left, top, width, height [px], and whether upright."""
         found = []
         for run in self.check.reach.rows:
             (left, low), (right, top) = self._project([(run.x, run.y), (run.x + run.dx, run.y + run.dy)])
