@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
-from manip_il.cli.progress import Stages, say, warn
+from manip_il.cli.progress import progress, say, warn
 from manip_il.cli.trials import read_condition
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import option
@@ -109,8 +109,9 @@ class RobotCheckOptions:
 
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
         with open_output(self) as folder:
-            with Stages(f"nothing, in {folder}") as stages, Engine(None) as engine:
-                found = check_robot(self.robot, tasks, self.episodes, read_condition(_NOISE), engine, stages)
+            with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar, Engine(None) as engine:
+                noise = read_condition(_NOISE)
+                found = check_robot(self.robot, tasks, self.episodes, noise, engine, lambda _: bar.advance())
             found.write(folder / FILE_NAME)
             report = check_report(found, command_line("robot check", self), to_plain(self))
             report.write(folder / PAGE)

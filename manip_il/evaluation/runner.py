@@ -29,7 +29,7 @@ def evaluate(
     job: RolloutJob,
     seeds: Sequence[int],
     name: str,
-    on_result: Callable[[EpisodeResult], None] | None = None,
+    on_result: Callable[[EpisodeResult], object] | None = None,
     *,
     suite: str = NOMINAL.name,
     done: Mapping[int, EpisodeResult] | None = None,

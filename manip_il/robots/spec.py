@@ -90,7 +90,7 @@ def require(robot: str, kind: str, names: Sequence[str], there: Sequence[Any]) -
 
 
 def _require_moved(robot: Robot, spec: mujoco.MjSpec) -> None:
-    """Raise `UsageError` for a joint of the arm that does not move `ee`, or one of the gripper's that moves the hand."""
+    """Raise `UsageError` for a joint of the arm that does not move `ee`, or one of the gripper's that does."""
     moving = _above(spec.body(robot.ee.body))
     if still := [name for name in robot.joints if name not in moving]:
         raise UsageError(

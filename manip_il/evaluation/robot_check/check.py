@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from manip_il.tasks.table import get_task
 FILE_NAME = "check.json"
 SOLVES = 0.9  # share of clean episodes that the expert solves, of a task that can be done
 _PROCESSES = 2  # that work out a map
+OnResult = Callable[[EpisodeResult], object]
 _PLAIN = "reach"  # the task of the scene in which the arm itself is looked at
 
 
@@ -89,6 +90,7 @@ class RobotCheck:
             "robot": self.name,
             "hand": self.robot.hand,
             "joints": [dataclasses.asdict(joint) for joint in self.arm.joints],
+            "bodies": self.arm.bodies,
             "own_motors": self.arm.own_motors,
             "step": self.arm.step,
             "sag": self.arm.sag,
@@ -104,23 +106,12 @@ class RobotCheck:
         write_file(path, json.dumps(self.to_json(), indent=2).encode())
 
 
-class Watch(Protocol):
-    """Listener that is told how far a check is."""
-
-    def start(self, description: str, total: int) -> None:
-        """Begin a part of so many steps."""
-        ...
-
-    def episode(self, episode: EpisodeResult) -> None:
-        """Count an episode that has ended."""
-        ...
-
-
 def check_robot(
-    name: str, tasks: Sequence[str], episodes: int, noise: Condition, engine: Engine, watch: Watch
+    name: str, tasks: Sequence[str], episodes: int, noise: Condition, engine: Engine, on_result: OnResult
 ) -> RobotCheck:
     """Measure a robot, by its name or YAML, with tasks. episodes: of each task, clean and as many under `noise`.
 
+    on_result: called with every episode's result as it ends.
     Raises `UsageError` where the robot itself cannot be used.
     """
     robot, scene = get_robot(name), build_scene(name, _PLAIN)
@@ -131,7 +122,7 @@ def check_robot(
         checked = [_begin(name, task) for task in tasks]
     reach = reach_facts(robot)
     checked = [_with_starts(name, task) for task in reversed(checked)][::-1]  # the last scenes are kept still
-    checked = [_with_episodes(name, task, episodes, noise, engine, watch) for task in checked]
+    checked = [_with_episodes(name, task, episodes, noise, engine, on_result) for task in checked]
     return RobotCheck(name, robot, arm, hand, overlaps, reach, tuple(checked), pictures, why)
 
 
@@ -176,14 +167,13 @@ def _with_starts(name: str, task: TaskCheck) -> TaskCheck:
 
 
 def _with_episodes(
-    name: str, task: TaskCheck, episodes: int, noise: Condition, engine: Engine, watch: Watch
+    name: str, task: TaskCheck, episodes: int, noise: Condition, engine: Engine, on_result: OnResult
 ) -> TaskCheck:
     if not episodes or not task.has_starts:
         return task
     seeds, found = stream_seeds("validation", episodes), list[ExpertFacts]()
     for condition in (NOMINAL, noise):
-        watch.start(f"{task.name}, {condition.name}", episodes)
-        found.append(expert_facts(engine, name, task.name, seeds, condition, watch.episode))
+        found.append(expert_facts(engine, name, task.name, seeds, condition, on_result))
     return dataclasses.replace(task, clean=found[0], noisy=found[1])
 
 

@@ -28,7 +28,7 @@ def expert_facts(
     task: str,
     seeds: Sequence[int],
     condition: Condition,
-    on_result: Callable[[EpisodeResult], None] | None = None,
+    on_result: Callable[[EpisodeResult], object],
 ) -> ExpertFacts:
     """Run the expert on seeds under a condition."""
     job = RolloutJob(EnvConfig(robot, task), "expert", hold=HOLD, label="last", conditions=(condition,))

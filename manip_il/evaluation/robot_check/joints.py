@@ -22,7 +22,7 @@ class JointFacts:
     """One joint of the arm; of a joint that slides, m and N stand for rad and N m.
 
     limits: [rad], None where it turns freely. home [rad]. kp [N m/rad], kv [N m s/rad], force: the greatest [N m].
-    rise: from a tenth to nine tenths of the longest step of its target [s], None where it does not get there in a second.
+    rise: from a tenth to nine tenths of the longest step of its target [s], None where that takes over a second.
     overshoot: beyond that step, as its share. sag: off home under `LOAD` in the hand [rad].
     """
 
@@ -42,10 +42,12 @@ class JointFacts:
 class ArmFacts:
     """Joints base to hand. own_motors: names of the model's own actuators, which position control replaces.
 
+    bodies: from the base to the one of the frame `ee`.
     step: of a joint's target in its response [rad]. sag: of the hand under `LOAD` [m].
     """
 
     joints: tuple[JointFacts, ...]
+    bodies: tuple[str, ...]
     own_motors: tuple[str, ...]
     step: float
     sag: float
@@ -58,7 +60,7 @@ def arm_facts(scene: Scene) -> ArmFacts:
     joints = tuple(_joint(scene, place, sags[place]) for place in range(len(robot.joints)))
     files = [one for one in (robot.files, robot.gripper.files) if one is not None]
     motors = tuple(motor.name for one in files for motor in one.load(robot.name).actuators)
-    return ArmFacts(joints, motors, robot.max_joint_step, sag)
+    return ArmFacts(joints, _chain(scene), motors, robot.max_joint_step, sag)
 
 
 def at_home(scene: Scene) -> mujoco.MjData:
@@ -123,7 +125,7 @@ def _first(there: NDArray[np.bool_]) -> int | None:
     return int(np.argmax(there)) if there.any() else None
 
 
-def chain(scene: Scene) -> tuple[str, ...]:
+def _chain(scene: Scene) -> tuple[str, ...]:
     """Return the names of the bodies from the base to the frame `ee`'s."""
     model, names = scene.model, list[str]()
     body = int(model.site_bodyid[scene.ee_site])

@@ -118,7 +118,8 @@ class CheckReport(Report):
             "control steps, the gripper's too. Intervals are Wilson's score intervals.",
             "joints": motors_line(check),
             "home": home_line(check),
-            "chain": f"The hand is {check.robot.hand}; ee is a frame of {check.robot.ee.body}.",
+            "chain": f"Bodies from the base: {', '.join(check.arm.bodies)}. The hand is {check.robot.hand}; "
+            f"ee, between the fingertips, is a frame of {check.robot.ee.body}.",
             "reach": f"The hand, pointing down, gets to {100 * reach.table:.0f} % of the workspace on the table, "
             f"leaning to {100 * reach.leaning:.0f} %, and to {100 * reach.air:.0f} % of the room above it. "
             "Starts are drawn from there.",
