@@ -100,7 +100,7 @@ def to_plain(value: Any) -> Any:
 
 def command_line(name: str, options: Any) -> str:
     """Return the command with every option that is not its default, to copy."""
-    words = ["manip-il", name]
+    words = ["manip-il", *name.split()]
     for known in options_of(type(options)):
         value = value_of(options, known.name)
         if known.positional:

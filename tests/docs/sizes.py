@@ -38,6 +38,7 @@ SMALL: Sizes = {  # put into every command that has the option
 GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1}  # only where the line gives the option
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
+    "robot check": {"episodes": 1},
     "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
 }
 OF_POLICY: dict[str, Sizes] = {

@@ -113,6 +113,20 @@ MISTAKES = {
     "a fixed joint of the arm's": (but(fixed={"elbow": 1.0}), ["'fixed' of robot own", "'elbow'"]),
     "a fixed joint that is none": (but(fixed={"torso": 1.0}), ["'fixed' of robot own", "'torso'"]),
     "a fixed place that is none": (but(fixed={"torso": "up"}), ["fixed: torso is 'up'", "expected a finite number"]),
+    "a frame that the joints do not move": (
+        inside("ee", body="tower"),
+        ["joint 'shoulder' does not move 'ee'", "'tower'", "those that do: turn"],
+    ),
+    "a home in the table": (but(home=[0, 1.6, 1.0, 1.0, 0]), ["at home 'fore' and 'table' overlap by"]),
+    "a home in itself": (but(home=[0, -1.4, 2.8, 2.7, 0]), ["at home 'fore' and 'hand' overlap by"]),
+    "a home beyond a limit": (but(home=[0, 3.6, 1.0, 1.0, 0]), ["home has 3.6 for joint 'shoulder'", "-1.5 to 2.2"]),
+    "a gripper's joint that moves the hand": (
+        but(
+            **{name: tree_of()[name][:4] for name in ("joints", "home", "gains")},
+            gripper=tree_of()["gripper"] | {"joints": ["roll"], "closed": [0.0], "open": [0.5]},
+        ),
+        ["'roll' of gripper.joints moves the whole hand, 'hand'"],
+    ),
     "a step that is a leap": (but(max_joint_step=3), ["max_joint_step is 3", "from 0.001 to 1"]),
     "a workspace as large as a hall": (inside("workspace", half_width=5), ["workspace.half_width is 5", "to 2"]),
     "a colour with alpha": (but(colours={"*": [1, 1, 1, 1]}), ["colours: * has 4 numbers", "expected 3"]),
@@ -169,6 +183,27 @@ def test_a_model_that_mujoco_cannot_read_is_one_line(model: str, tmp_path: Path)
     line = refusal(write(tmp_path, model=text))
     for word in words:
         assert word in line
+
+
+@pytest.mark.parametrize("model", ["a mesh that is not there", "a body without mass"])
+def test_a_model_that_does_not_compile_is_named_with_its_file_however_short_the_yaml(model: str, tmp_path: Path):
+    text, words = MODELS[model]
+    short = {name: tree_of()[name] for name in ("model", "gripper", "workspace")} | {"hand": "hand"}
+    path = write(tmp_path, tree=short, model=text)
+    for tree in (short, tree_of()):
+        line = refusal(write(tmp_path, "own", tree=tree, model=text))
+        assert str(path.with_name("own.xml")) in line
+        assert words[-1] in line
+        get_robot.__globals__["_read"].cache_clear()
+
+
+def test_a_driven_joint_that_moves_no_finger_is_one_line(tmp_path: Path):
+    lid = """<body name="lid" pos="0.05 0 0"><joint name="lid" type="slide" axis="1 0 0" range="0 0.05"/>
+             <geom size="0.005" mass="0.01"/></body><body name="left" """
+    tree = inside("gripper", joints=["lid"], closed=[0.0], open=[0.05])
+    fixed = MODEL.replace('<joint name="left" ', '<joint name="left" stiffness="1e6" ')
+    line = refusal(write(tmp_path, tree=tree, model=fixed.replace('<body name="left" ', lid, 1)))
+    assert "gripper.joints ('lid') from gripper.closed to gripper.open move none of gripper.fingers" in line
 
 
 @pytest.mark.parametrize("text", ["joints: [", "a: &a [1]\nb: *a\n", "\tjoints: 3", ""])

@@ -55,7 +55,9 @@ def hand_table(check: RobotCheck) -> Table:
     hand = check.hand
     command = f"command of {hand.joints[0]}"
     rows = zip(hand.commands, hand.openings, strict=True)
-    return Table((command, "opening [mm]"), tuple((f"{at:.4g}", f"{1000 * opening:.1f}") for at, opening in rows))
+    return Table(
+        (command, "opening [mm]"), tuple((f"{round(at, 4) + 0.0:g}", f"{1000 * opening:.1f}") for at, opening in rows)
+    )
 
 
 def task_table(check: RobotCheck) -> Table:
@@ -80,7 +82,7 @@ def motors_line(check: RobotCheck) -> str:
     if count:
         motors = f"The model's own {count} motor{'s are' if count > 1 else ' is'} replaced by position control"
     return (
-        f"{motors}: torque = kp (target - joint) - kv velocity, at most `force`; gravity is compensated. "
+        f"{motors}: torque = kp (target - joint) - kv velocity, at most the force; gravity is compensated. "
         f"Rise and overshoot: of a step of {check.arm.step:g} rad from home, the longest that a label takes. "
         f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.arm.sag:.1f} mm."
     )

@@ -53,8 +53,8 @@ def looks(scene: Scene, name: str) -> tuple[Look, ...]:
     fields = {one: [*drawn[one], *_field_of_view(scene, data, one)] for one in CAMERAS}
     views: list[tuple[str, str | Overview, list[Line], str]] = [
         ("outside", _from_outside(scene, data), [*ee, *space, *itertools.chain(*fields.values())], "from outside"),
-        ("front", "front", [*ee, *space, *fields["wrist"]], "the camera front"),
-        ("wrist", "wrist", near, "the camera wrist"),
+        ("front", "front", [*ee, *space, *fields["wrist"]], "what camera front sees"),
+        ("wrist", "wrist", near, "what camera wrist sees"),
     ]
     return tuple(
         Look(key, words, encode_picture(marked_picture(name, scene.task, data, camera, SIZE, FILM, lines), "jpeg"))

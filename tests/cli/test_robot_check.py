@@ -1,0 +1,107 @@
+"""`manip-il robot check`: one page of what an arm can do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.errors import RenderError
+from manip_il.evaluation.robot_check import check
+from manip_il.robots.reach import Reach, keep_reach
+from manip_il.robots.robot import get_robot
+
+from ..robots.own import tree_of, write
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An arm of a user's own whose map is kept, as working it out takes long."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return with_map(write(tmp_path))
+
+
+def with_map(path: Path) -> Path:
+    keep_reach(get_robot(str(path)), Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21))))
+    return path
+
+
+@pytest.fixture
+def no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise RenderError("no off-screen OpenGL")
+
+    monkeypatch.setattr(check, "looks", refuse)
+
+
+def test_without_opengl_the_page_says_so(own: Path, tmp_path: Path, no_opengl: None, capsys):
+    out = tmp_path / "out"
+    assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=0", f"--output_dir={out}"]) == 0
+    said = capsys.readouterr().out
+    assert "No pictures: no off-screen OpenGL" in said
+    assert "own has starts for reach; the expert was not asked." in said
+    page, found = (out / "check.html").read_text(), json.loads((out / "check.json").read_text())
+    assert "No pictures: no off-screen OpenGL" in page
+    assert "data:image" not in page
+    assert [joint["name"] for joint in found["joints"]] == tree_of()["joints"]
+    assert found["tasks"] == [
+        {
+            "task": "reach",
+            "done": True,
+            "widths": {},
+            "refused": "",
+            "starts": {"found": 50, "drawn": 50, "why": ""},
+            "clean": None,
+            "noisy": None,
+        }
+    ]
+
+
+def test_a_task_that_cannot_be_done_ends_with_1(own: Path, tmp_path: Path, no_opengl: None, capsys):
+    tree = tree_of()
+    tree["gripper"]["open"] = [0.02, 0.02]
+    path, out = with_map(write(tmp_path, "narrow", tree=tree)), tmp_path / "out"
+    words = ["--quiet", "robot", "check", str(path), "--tasks=reach,lift", "--episodes=0", f"--output_dir={out}"]
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert "narrow can do 1 of 2 tasks; it cannot do lift." in said.out
+    assert "--task.object=box:0.025" in said.out
+    assert "cannot do 1 of 2 tasks: lift" in said.err
+    assert (out / "check.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["pnada"], "did you mean 'panda'"),
+        (["panda", "--tasks=reahc"], "did you mean 'reach'"),
+        (["panda", "--episodes=-1"], "--episodes is -1"),
+        (["no.yaml"], "no.yaml"),
+        ([], "ROBOT"),
+    ],
+)
+def test_a_wrong_word_is_one_line_and_2(words: list[str], line: str, tmp_path: Path, capsys):
+    assert main(["robot", "check", *words, f"--output_dir={tmp_path / 'out'}"]) == 2
+    said = capsys.readouterr().err
+    assert line in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_robot_that_makes_no_scene_is_2(own: Path, tmp_path: Path, capsys):
+    path = write(tmp_path, "low", tree=tree_of() | {"home": [0, 1.6, 1.0, 1.0, 0]})
+    assert main(["--quiet", "robot", "check", str(path), f"--output_dir={tmp_path / 'out'}"]) == 2
+    assert "at home 'fore' and 'table' overlap" in capsys.readouterr().err
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_the_page_of_an_arm_has_pictures_and_episodes(own: Path, tmp_path: Path, capsys):
+    out = tmp_path / "out"
+    assert main(["--quiet", "robot", "check", str(own), "--tasks=reach", "--episodes=2", f"--output_dir={out}"]) == 0
+    assert "2 of 2" in capsys.readouterr().out
+    assert (out / "check.html").read_text().count("data:image/jpeg") == 3
+    assert json.loads((out / "check.json").read_text())["tasks"][0]["clean"]["successes"] == 2

@@ -1,0 +1,163 @@
+"""What `robot check` measures of joints, hand, reach and starts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.robot_check import starts
+from manip_il.evaluation.robot_check.advice import advice
+from manip_il.evaluation.robot_check.check import RobotCheck, TaskCheck
+from manip_il.evaluation.robot_check.episodes import ExpertFacts
+from manip_il.evaluation.robot_check.hand import hand_facts, widths
+from manip_il.evaluation.robot_check.joints import ArmFacts, arm_facts
+from manip_il.evaluation.robot_check.page import check_report, task_table, verdict
+from manip_il.evaluation.robot_check.starts import ReachFacts, StartFacts, reach_facts, start_facts
+from manip_il.robots import reach
+from manip_il.robots.reach import Reach
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.seeding import stream_seeds
+from manip_il.sim.home import meeting_at
+from manip_il.sim.scene import PREFIX, build_scene
+from manip_il.tasks.table import TASKS
+
+from ..tables import every_robot
+from .own import tree_of, write
+
+EVERYWHERE = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
+
+
+@every_robot
+def test_every_joint_gets_to_its_target_and_stays(robot: str):
+    facts = arm_facts(build_scene(robot, "reach"))
+    assert [joint.name for joint in facts.joints] == list(get_robot(robot).joints)
+    assert all(joint.rise is not None and 0.03 < joint.rise < 0.2 for joint in facts.joints)
+    assert all(joint.overshoot < 0.1 for joint in facts.joints)
+    assert 0 < facts.sag < 0.005
+    assert facts.bodies[-1] == get_robot(robot).ee.body
+
+
+def test_a_joint_with_a_quarter_of_the_gain_sags_four_times_as_far(tmp_path: Path):
+    weak = tree_of() | {"gains": [gain / 4 for gain in tree_of()["gains"]]}
+    strong, weak = (
+        arm_facts(build_scene(str(write(tmp_path, name, tree=tree)), "reach"))
+        for name, tree in (("strong", tree_of()), ("weak", weak))
+    )
+    for one, other in zip(strong.joints, weak.joints, strict=True):
+        if one.sag > 1e-4:
+            assert other.sag == pytest.approx(4 * one.sag, rel=0.1)
+    assert weak.sag > 3 * strong.sag
+
+
+def test_the_models_own_motors_are_named(own: Robot, tmp_path: Path):
+    assert arm_facts(build_scene(str(write(tmp_path)), "reach")).own_motors == ("motor",)
+
+
+@every_robot
+def test_a_hand_opens_with_its_command(robot: str):
+    facts = hand_facts(get_robot(robot))
+    assert (np.diff(facts.openings) > 0).all()
+    assert facts.most == build_scene(robot, "reach").gripper.most
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_a_task_grasps_has_a_width(task: str):
+    found = widths(TASKS[task])
+    assert set(found) == set(TASKS[task].grasped)
+    assert all(0.01 < width < 0.1 for width in found.values())
+
+
+@every_robot
+def test_at_home_nothing_overlaps(robot: str):
+    scene = build_scene(robot, "reach")
+    assert meeting_at(scene.robot, scene.model, PREFIX, np.asarray(scene.robot.home)) == {}
+
+
+def test_parts_that_overlap_are_named_and_how_deep(tmp_path: Path):
+    scene = build_scene(str(write(tmp_path)), "reach")
+    found = meeting_at(scene.robot, scene.model, PREFIX, np.array([0, 1.6, 1.0, 1.0, 0]))
+    assert ("fore", "table") in found
+    assert 0.01 < found["fore", "table"] < 0.1
+
+
+def test_a_map_in_parts_is_the_whole_map(own: Robot, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(reach, "_BEYOND", -0.05)  # a map of a few points
+    monkeypatch.setattr(reach, "_STEPS", 30)
+    parts = [reach.errors_at(own, part, 3) for part in range(3)]
+    assert reach.joined(own, parts).errors.tobytes() == reach._solve(own).errors.tobytes()
+
+
+def test_shares_of_a_workspace_are_those_of_its_points(own: Robot, monkeypatch: pytest.MonkeyPatch):
+    errors = np.zeros((41, 41, 21))
+    errors[29:] = 1.0  # nothing is reached beyond x = 0.4, the workspace's centre, but for a cell
+    monkeypatch.setattr(starts, "reach_of", lambda robot: Reach(np.array([-1.0, -1.0, 0.0]), errors))
+    facts = reach_facts(own)
+    assert facts.table == pytest.approx(0.5, abs=0.05)
+    assert facts.air == pytest.approx(facts.table, abs=0.01)
+    assert facts.half_width == 0
+    assert all(run.x + run.dx < 0.6 for run in facts.rows)
+
+
+def test_starts_are_drawn_until_a_few_find_no_place(own: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    scene, seeds = build_scene(str(write(tmp_path)), "reach"), stream_seeds("validation", 20)
+    monkeypatch.setattr("manip_il.sim.world.reach_of", lambda robot: EVERYWHERE)
+    facts = start_facts(scene, seeds)
+    assert (facts.found, facts.drawn, facts.why) == (20, 20, "")
+    assert len(facts.goals) == 20
+    monkeypatch.setattr("manip_il.sim.world.reach_of", lambda robot: Reach(EVERYWHERE.origin, EVERYWHERE.errors + 1))
+    facts = start_facts(scene, seeds)
+    assert (facts.found, facts.drawn) == (0, 3)
+    assert "none of 1000 places" in facts.why
+
+
+def a_check(own: Robot, *tasks: TaskCheck, **changes: float) -> RobotCheck:
+    facts = ReachFacts(changes.get("table", 1.0), 1.0, 1.0, changes.get("half_width", 0.12), ())
+    arm = ArmFacts((), ("base", "hand"), (), 0.1, changes.get("sag", 0.0))
+    return RobotCheck("own.yaml", own, arm, hand_facts(own), (), facts, tasks)
+
+
+FOUND = StartFacts(50, 50, "", (), ())
+SOLVED, FAILED = ExpertFacts(Proportion(10, 10), {}), ExpertFacts(Proportion(7, 10), {"close": 2, "reach": 1})
+TASK_CHECKS = {
+    "solved": (TaskCheck("lift", {"object": 0.05}, "", FOUND, SOLVED, FAILED), True, []),
+    "not asked": (TaskCheck("lift", {"object": 0.05}, "", FOUND), True, []),
+    "failed": (
+        TaskCheck("lift", {"object": 0.05}, "", FOUND, FAILED, FAILED),
+        False,
+        ["lift: the expert fails in 3 of 10", "2 of them in the phase close", "--robot.type=own.yaml --task.type=lift"],
+    ),
+    "too wide": (
+        TaskCheck("lift", {"object": 0.12}, "it is 0.12 m wide"),
+        False,
+        ["120 mm wide", "--task.object=box:0.05", "gripper.open"],
+    ),
+    "too wide, its own": (TaskCheck("stack", {"object": 0.12}, "wide"), False, ["gripper.open, or leave the task out"]),
+    "no room": (
+        TaskCheck("sort", {}, "", replace(FOUND, found=3, drawn=6)),
+        False,
+        ["sort: 3 of 6 starts find no place", "workspace.half_width"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TASK_CHECKS)
+def test_what_cannot_be_done_is_said_with_what_to_change(case: str, own: Robot):
+    task, done, words = TASK_CHECKS[case]
+    check = a_check(own, task)
+    assert task.done == done
+    assert ("cannot" in verdict(check)) == (not done)
+    assert len(advice(check)) == (not done)
+    assert all(word in " ".join(advice(check)) for word in words)
+    assert task_table(check).kinds == ("expert" if done else "cloning",)
+    assert task.name in check_report(check, "manip-il robot check", {}).render()
+    assert check.to_json()["tasks"][0]["done"] == done
+
+
+def test_a_workspace_beyond_reach_gets_a_width_that_is_within(own: Robot):
+    assert "half_width: 0.09 in place of 0.12" in " ".join(advice(a_check(own, table=0.7, half_width=0.09)))
+    assert "workspace.centre, (0.4, 0)" in " ".join(advice(a_check(own, table=0.3, half_width=0.0)))
+    assert advice(a_check(own)) == ()
