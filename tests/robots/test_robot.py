@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,7 @@ def test_a_driven_joint_that_moves_no_finger_is_one_line(tmp_path: Path):
     lid = """<body name="lid" pos="0.05 0 0"><joint name="lid" type="slide" axis="1 0 0" range="0 0.05"/>
              <geom size="0.005" mass="0.01"/></body><body name="left" """
     tree = inside("gripper", joints=["lid"], closed=[0.0], open=[0.05])
-    fixed = MODEL.replace('<joint name="left" ', '<joint name="left" stiffness="1e6" ')
+    fixed = re.sub(r'<joint name="(left|right)"[^>]*>', "", MODEL)
     line = refusal(write(tmp_path, tree=tree, model=fixed.replace('<body name="left" ', lid, 1)))
     assert "gripper.joints ('lid') from gripper.closed to gripper.open move none of gripper.fingers" in line
 
