@@ -39,7 +39,10 @@ def meeting_at(robot: Robot, model: mujoco.MjModel, prefix: str, posture: NDArra
 
 
 def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
-    """Raise `UsageError` for a `home` beyond a joint's limits, or in which parts overlap that are apart at zero."""
+    """Raise `UsageError` for a `home` beyond a joint's limits, or in which parts overlap.
+
+    Two of the robot's own may overlap where they do so at zero, too: many models have such neighbours.
+    """
     for name, value in zip(robot.joints, robot.home, strict=True):
         joint = model.joint(prefix + name)
         low, high = joint.range
@@ -51,7 +54,8 @@ def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
     meeting = meeting_at(robot, model, prefix, np.asarray(robot.home))
     if not meeting:
         return
-    always = meeting_at(robot, model, prefix, np.zeros(len(robot.joints)))  # links that overlap however they stand
+    bodies = {model.body(body).name.removeprefix(prefix) for body in range(1, model.nbody)}
+    always = {pair for pair in meeting_at(robot, model, prefix, np.zeros(len(robot.joints))) if bodies.issuperset(pair)}
     for (one, other), depth in sorted(meeting.items(), key=lambda item: -item[1]):
         if (one, other) not in always:
             raise UsageError(

@@ -26,7 +26,7 @@ from manip_il.sim.scene import PREFIX, build_scene
 from manip_il.tasks.table import TASKS
 
 from ..tables import every_robot
-from .own import tree_of, write
+from .own import model_of, tree_of, write
 
 EVERYWHERE = Reach(np.array([-1.0, -1.0, 0.0]), np.zeros((41, 41, 21)))
 
@@ -82,6 +82,13 @@ def test_parts_that_overlap_are_named_and_how_deep(tmp_path: Path):
     found = meeting_at(scene.robot, scene.model, PREFIX, np.array([0, 1.6, 1.0, 1.0, 0]))
     assert ("fore", "table") in found
     assert 0.01 < found["fore", "table"] < 0.1
+
+
+def test_neighbours_that_overlap_in_any_posture_are_no_fault_of_home(tmp_path: Path):
+    long = model_of().replace('size="0.03" fromto="0 0 0.05', 'size="0.03" fromto="0 0 -0.15')  # into the base
+    scene = build_scene(str(write(tmp_path, model=long)), "reach")
+    found = meeting_at(scene.robot, scene.model, PREFIX, np.asarray(scene.robot.home))
+    assert set(found) == {("base", "upper")}
 
 
 def test_a_map_in_parts_is_the_whole_map(own: Robot, monkeypatch: pytest.MonkeyPatch):

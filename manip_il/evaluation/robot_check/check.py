@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -67,7 +67,7 @@ class TaskCheck:
 
 @dataclass(frozen=True)
 class RobotCheck:
-    """A robot as it was measured. name: as it was given. overlaps: pairs of links that overlap in any posture."""
+    """A robot as it was measured. name: as it was given. overlaps: pairs of links at home, and in any posture."""
 
     name: str
     robot: Robot
@@ -135,7 +135,8 @@ def _reach_under_way(robot: Robot) -> Generator[None]:
     with bound_to_this_process(), _pool() as pool:
         parts = [pool.submit(errors_at, robot, part, _PROCESSES) for part in range(_PROCESSES)]
         yield
-        keep_reach(robot, joined(robot, [part.result() for part in parts]))
+        with contextlib.suppress(BrokenExecutor):  # one was killed: then it is worked out here
+            keep_reach(robot, joined(robot, [part.result() for part in parts]))
 
 
 def _pool() -> ProcessPoolExecutor:
