@@ -82,7 +82,8 @@ def motors_line(check: RobotCheck) -> str:
     if count:
         motors = f"The model's own {count} motor{'s are' if count > 1 else ' is'} replaced by position control"
     return (
-        f"{motors}: torque = kp (target - joint) - kv velocity, at most the force; gravity is compensated. "
+        f"{motors}: torque = kp (target - joint) - kv velocity, at most the force; gravity is compensated. kp is in "
+        "N m/rad, kv in N m s/rad, force in N m. "
         f"Rise and overshoot: of a step of {check.arm.step:g} rad from home, the longest that a label takes. "
         f"Sag: off home with {LOAD:g} kg in the hand, which sinks by {1000 * check.arm.sag:.1f} mm."
     )
