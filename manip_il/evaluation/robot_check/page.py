@@ -91,7 +91,7 @@ def motors_line(check: RobotCheck) -> str:
 
 @dataclass(frozen=True)
 class StartMap:
-    """A task's starts over what the hand reaches, seen from above. why: there are none."""
+    """Starts of a task from above. words: how many there are; objects, goals: where, x and y [px]."""
 
     name: str
     done: bool
