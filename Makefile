@@ -39,7 +39,8 @@ demo: setup  ## the whole story, small: runs/quickstart/report.html
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
 # A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
-TWO := -n 2 --dist loadfile --no-loadscope-reorder
+# A worker that dies ends the run: what comes after it would wait for ever.
+TWO := -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 test: setup .venv/.robots  ## every test
 	@.ci/system browser sshd
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(TWO)

@@ -23,7 +23,7 @@ from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option, option_of
-from manip_il.sim.config import Look
+from manip_il.sim.config import Look, scene_name
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -109,7 +109,7 @@ class RecordOptions(common.EnvOptions):
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
     def _repo_id(self) -> str:
-        return self.dataset.repo_id or f"local/{self.env_config().name}"
+        return self.dataset.repo_id or f"local/{scene_name(self.robot.type, self.task.type)}"
 
     def _folders(self) -> tuple[Path, Path]:
         root = self.dataset.root or Path("datasets") / self._repo_id().partition("/")[2]

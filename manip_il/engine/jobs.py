@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -21,6 +21,7 @@ from manip_il.mdp import Actor, Episode, State, Transition
 from manip_il.rollout import Driver, Labeller, Rules, rollout
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.shape import draws_shape
 
 if TYPE_CHECKING:  # torch only where a learner drives
@@ -254,6 +255,6 @@ def _without_pictures(transition: Transition) -> Transition:
     return replace(transition, observation=replace(transition.observation, images={}), final=final)
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def _expert(config: EnvConfig) -> Labeller:
     return simulation_of(config.robot).expert(config)

@@ -83,7 +83,7 @@ class EnvConfig:
     @property
     def name(self) -> str:
         """Robot and task as one word, the robot by its file's name."""
-        return f"{Path(self.robot).stem}_{self.task}"
+        return scene_name(self.robot, self.task)
 
     @property
     def physics_steps(self) -> int:
@@ -94,6 +94,11 @@ class EnvConfig:
     def physics_step(self) -> float:
         """Time of one of them: `DT_SIM`, or a little less where that does not divide a control step [s]."""
         return 1 / (self.control_hz * self.physics_steps)
+
+
+def scene_name(robot: str, task: str) -> str:
+    """Return robot and task as one word, the robot by its file's name."""
+    return f"{Path(robot).stem}_{task}"
 
 
 CAMERAS = ("front", "wrist")

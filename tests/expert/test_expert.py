@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from manip_il.expert import Expert
 from manip_il.mdp import Label, State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
-from manip_il.sim.scene import build_scene
+from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.pick_place import OBJECT
@@ -29,7 +29,7 @@ DRIVERS = ("expert", "random", "varied")  # the last is the expert with cubes of
 STEEPEST = 50.0  # change of a joint target per change of the object's position [rad/m]
 
 
-@cache
+@lru_cache(SCENES_KEPT)
 def expert_of(robot: str, task: str) -> Expert:
     return Expert(build_scene(robot, task))
 
@@ -47,7 +47,7 @@ def written(label: Label) -> bytes:
     return label.action.tobytes() + np.float64(label.residual).tobytes() + bytes([label.phase, label.valid])
 
 
-world_of = cache(World)
+world_of = lru_cache(SCENES_KEPT)(World)
 
 
 def world_in(scene: Scene, state: State) -> World:

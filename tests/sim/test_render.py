@@ -81,7 +81,8 @@ def test_the_front_camera_sees_the_green_goal_and_the_red_cube(env: ManipEnv):
 @with_every_robot
 def test_the_wrist_camera_moves_with_the_hand_and_the_front_camera_does_not(env: ManipEnv):
     before = env.observe().images
-    turned = still(env, 0.04) + 0.3 * np.eye(len(env.scene.actions))[env.scene.actions.arm[0]]
+    first_joint = np.eye(len(env.scene.arm_ctrl))[0]
+    turned = env.scene.actions.join(env.data.ctrl[env.scene.arm_ctrl] + 0.3 * first_joint, 0.04)
     for _ in range(10):
         env.advance(turned)
     after = env.observe().images

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from types import SimpleNamespace
 
 import mujoco
@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manip_il.errors import UsageError
-from manip_il.robots.robot import ROBOTS, get_robot
+from manip_il.robots.robot import get_robot
 from manip_il.seeding import rng_for
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.scene import build_scene
+from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.pick_place import OBJECT
@@ -24,15 +24,19 @@ from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import Start
 
 from ..scenes import SEED, half_height
-from ..tables import GRASPING, SCENES, WITH_A_PEG, WITH_CUBES, every_robot, every_scene, every_scene_that_grasps
+from ..tables import WITH_A_PEG, every_robot, every_scene, every_scene_that_grasps, every_scene_with_cubes
 
 seeds = st.integers(0, 2**40)
 edges = st.sampled_from([None, 0.03, 0.07])  # of a cube, None for the model's own [m]
 
 
-@cache
+@lru_cache(SCENES_KEPT)
+def _world(robot: str, task: str) -> World:
+    return World(build_scene(robot, task))
+
+
 def world_of(robot: str, task: str, edge: float | None = None) -> World:
-    world = World(build_scene(robot, task))
+    world = _world(robot, task)
     world.vary(with_drawn(world.scene.nominal, {} if edge is None else {"size": edge}))
     return world
 
@@ -45,30 +49,33 @@ def position(drawn: Start, name: str) -> np.ndarray:
     return drawn.poses[name][0]
 
 
-@given(st.sampled_from(SCENES), edges, seeds)
-@settings(max_examples=200)
-def test_everything_that_is_drawn_is_within_reach(scene: tuple[str, str], edge: float | None, seed: int):
-    world = world_of(*scene, edge)
+@every_scene
+@given(edge=edges, seed=seeds)
+@settings(max_examples=20)
+def test_everything_that_is_drawn_is_within_reach(robot: str, task: str, edge: float | None, seed: int):
+    world = world_of(robot, task, edge)
     poses = start(world, seed).poses
     assert (GOAL in poses) == world.has_goal
-    assert set(TASKS[scene[1]].objects) <= set(poses)
+    assert set(TASKS[task].objects) <= set(poses)
     for name, (at, quaternion) in poses.items():
         if name == GOAL or name in world.scene.objects:
             assert world.reach.has(at), f"{name} at {at}"
         assert np.linalg.norm(quaternion) == pytest.approx(1)
 
 
-@given(st.sampled_from(GRASPING), edges, seeds)
-def test_an_object_rests_on_the_table_and_not_under_the_hand(scene: tuple[str, str], edge: float | None, seed: int):
-    world = world_of(*scene, edge)
+@every_scene_that_grasps
+@given(edge=edges, seed=seeds)
+@settings(max_examples=20)
+def test_an_object_rests_on_the_table_and_not_under_the_hand(robot: str, task: str, edge: float | None, seed: int):
+    world = world_of(robot, task, edge)
     space, drawn = world.scene.robot.workspace, start(world, seed)
-    for name in get_task(scene[1]).objects:
+    for name in get_task(task).objects:
         at, quaternion = drawn.poses[name]
         from_centre = at[:2] - space.centre
         world.place(name, at, quaternion)
         world.update()
         assert at[2] == pytest.approx(half_height(world, name), abs=1e-12)
-        if scene[1] != "sort":  # whose bins stand there
+        if task != "sort":  # whose bins stand there
             assert np.abs(from_centre).max() <= space.half_width
         assert np.hypot(*from_centre) >= min(FROM_HAND, FROM_HAND_SHARE * space.half_width)
 
@@ -81,10 +88,12 @@ def test_a_peg_stands_or_lies(scene: tuple[str, str], seed: int):
     assert (along, across) == pytest.approx((1, 0) if along > 0.5 else (0, 1), abs=1e-12)
 
 
-@given(st.sampled_from(WITH_CUBES), seeds)
-def test_a_cube_is_turned_about_the_vertical_by_an_eighth_turn_at_most(scene: tuple[str, str], seed: int):
-    drawn = start(world_of(*scene), seed)
-    for name in get_task(scene[1]).objects:
+@every_scene_with_cubes
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_a_cube_is_turned_about_the_vertical_by_an_eighth_turn_at_most(robot: str, task: str, seed: int):
+    drawn = start(world_of(robot, task), seed)
+    for name in get_task(task).objects:
         w, x, y, z = drawn.poses[name][1]
         assert x == y == 0
         assert abs(2 * np.arctan2(z, w)) <= np.pi / 4 + 1e-12
@@ -118,7 +127,8 @@ def test_a_start_is_the_home_posture_within_its_jitter_and_any_opening(robot: st
     assert 0.8 < share.max() <= 1 + 1e-9
 
 
-@given(st.sampled_from(sorted(ROBOTS)), edges, seeds)
+@every_robot
+@given(edge=edges, seed=seeds)
 def test_a_goal_of_pick_and_place_is_over_the_table(robot: str, edge: float | None, seed: int):
     world = world_of(robot, "pick_place", edge)
     space, goal = world.scene.robot.workspace, position(start(world, seed), GOAL)
@@ -127,7 +137,8 @@ def test_a_goal_of_pick_and_place_is_over_the_table(robot: str, edge: float | No
     assert resting <= goal[2] <= resting + space.height
 
 
-@given(st.sampled_from(sorted(ROBOTS)), seeds)
+@every_robot
+@given(seed=seeds)
 def test_lifts_goal_is_above_the_object(robot: str, seed: int):
     world = world_of(robot, "lift")
     drawn, room = start(world, seed), min(1.0, world.scene.robot.workspace.height / LIFT_HEIGHT)
