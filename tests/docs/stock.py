@@ -8,7 +8,7 @@ from pathlib import Path
 
 from manip_il.cli.main import main
 
-from ..robots.own import model_of
+from ..robots.own import model_of, write
 from .pages import ROOT, command_of
 from .sizes import small_words
 
@@ -28,6 +28,7 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
     "out/2": f"{_EXPERT} --eval.first=4 --output_dir=out/2",
 }
+ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
 _OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root")
 _TARGETS = ("build", "render", "mcap export", "mcap import", "pull")  # their second place is made, not read
@@ -42,6 +43,8 @@ class Stock:
     def bring(self, words: tuple[str, ...], target: Path) -> None:
         """Put what a line reads, and nobody has made there yet, into `target`."""
         for path in inputs(words):
+            if path == ARM.name and not (target / path).exists():
+                write(target, name=ARM.stem)
             if path.endswith(".xml") and not (target / path).exists():
                 (target / path).write_text(model_of())
             name = next((name for name in (*RECIPES, SAMPLE) if f"{path}/".startswith(f"{name}/")), None)

@@ -15,7 +15,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from manip_il.errors import UnknownName, UsageError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.lerobot_plugin.environment import TASKS
-from manip_il.tasks.table import get_task
+from manip_il.sim import config as settings
 
 from ..tables import BEYOND
 
@@ -46,15 +46,15 @@ def test_a_policys_inputs_are_those_of_the_chosen_observation(observation: str, 
 
 @pytest.mark.parametrize("task", [name for name, names in TASKS.items() if names not in BEYOND])
 def test_every_task_gives_what_its_features_say(task: str):
-    config = ManipILEnv(task=task)
+    config, ours = ManipILEnv(task=task), settings.EnvConfig(*TASKS[task])
     envs = vector_env(config, 2)
     observation, _ = envs.reset(seed=[1, 2])
     seen = preprocess_observation(observation)
     given = {key: tuple(value.shape[1:]) for key, value in seen.items()}
     assert given | {"action": envs.single_action_space.shape} == shapes(config)
     assert envs.call("task_description")[0]
-    assert envs.call("_max_episode_steps") == (get_task(TASKS[task][1]).limits.horizon,) * 2
-    assert envs.metadata["render_fps"] == 20
+    assert envs.call("_max_episode_steps") == (ours.horizon,) * 2
+    assert envs.metadata["render_fps"] == config.fps == ours.control_hz
 
 
 def test_options_reach_the_simulation():
