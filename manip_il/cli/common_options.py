@@ -49,6 +49,11 @@ def require_pictures(robot: str, cameras: Sequence[str]) -> None:
         raise UsageError(f"--cameras is {','.join(cameras)}; {robot} has no cameras here, leave it out")
 
 
+def own_robot(robot: str, suffix: str = "") -> str:
+    """Return the option, after a space, that a next command needs for a robot that does not ship; else nothing."""
+    return "" if robot in (*ROBOTS, stock.ROBOT) else f" --robot.type={robot}{suffix}"
+
+
 def require_workers(workers: int | None) -> None:
     """Raise `UsageError` for less than one process."""
     if workers is not None and workers < 1:

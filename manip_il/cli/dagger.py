@@ -129,7 +129,8 @@ class DaggerOptions(common.EnvOptions):
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
-        say(f"next: manip-il eval --policy.path={best} --output_dir={folder}/test")
+        robot = common.own_robot(config.env.robot)
+        say(f"next: manip-il eval --policy.path={best}{robot} --output_dir={folder}/test")
 
     def config(self) -> RunConfig:
         """Return what `run_algorithm` takes; `UsageError` for what does not go together."""

@@ -188,12 +188,20 @@ class BuildOptions:
 
 
 @dataclass
+class OwnRobotGroup:
+    """`--robot.*` of a dataset's robot that does not ship."""
+
+    type: str | None = option(None, "its YAML; by default the robot is the one that ships by the dataset's name for it")
+
+
+@dataclass
 class RenderOptions:
     """Render a dataset's stored states: TARGET is SOURCE with other cameras, sizes or lights. Nothing is simulated."""
 
     example: ClassVar[str] = "manip-il render datasets/demos datasets/demos_dim --cameras=front --look.brightness=0.6"
     source: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
+    robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)
     cameras: list[str] = option(lambda: ["front", "wrist"], "front, wrist or both")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
     look: Look = field(default_factory=Look)
@@ -220,7 +228,7 @@ class RenderOptions:
         from manip_il.engine.engine import default_workers
         from manip_il.engine.render import open_source, render_dataset
 
-        source = open_source(self.source)
+        source = open_source(self.source, self.robot.type)
         warn(source.warnings)
         with exclusive(self.target), progress(dataset_info(self.source).episodes, f"render {self.source}") as bar:
             info = render_dataset(

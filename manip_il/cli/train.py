@@ -102,7 +102,8 @@ class TrainOptions:
             path = fit(config, spec, fingerprint, sources)
         if _is_first_process():
             say(f"checkpoint: {path}")
-            say(f"next: manip-il eval --policy.path={path} --output_dir={self.output_dir}/eval")
+            robot = common.own_robot(spec.robot, suffix=".yaml")
+            say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output_dir}/eval")
 
     def _fit_config(self) -> FitConfig:
         from manip_il.seeding import stream_base

@@ -35,7 +35,7 @@ from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.simulations import SIMULATIONS
 from manip_il.errors import ManipError, MismatchError, RenderError
 from manip_il.mdp import Episode, State
-from manip_il.robots.robot import ROBOTS
+from manip_il.robots.robot import ROBOTS, get_robot
 from manip_il.sim.conditions import NOMINAL_VALUES, PICTURED, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -48,24 +48,20 @@ _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that pictures o
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset whose states can be pictured. warnings: what may make the pictures differ from the recorded world.
+    """A dataset whose states can be pictured. env: one that they fit.
 
-    conditions: what its episodes draw from.
+    warnings: what may make the pictures differ from the recorded world. conditions: what its episodes draw from.
     """
 
     root: Path
     spec: RobotTaskSpec
+    env: EnvConfig
     warnings: tuple[str, ...]
     conditions: tuple[Condition, ...] = ()
 
-    @property
-    def env(self) -> EnvConfig:
-        """An environment that its states fit."""
-        return EnvConfig(self.spec.robot, self.spec.task, object=self.spec.object)
 
-
-def open_source(root: Path) -> Source:
-    """Read what is needed to picture a dataset's states.
+def open_source(root: Path, robot: str | None = None) -> Source:
+    """Read what is needed to picture a dataset's states; robot: the YAML of its robot, where that does not ship.
 
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
     a robot and task that are known here, `MismatchError` where its states do not fit them.
@@ -74,12 +70,15 @@ def open_source(root: Path) -> Source:
     if spec.task == UNKNOWN_TASK:
         raise ManipError(f"{root} does not name its task: {OURS} is missing; LeRobot's tools drop it, so render first")
     for kind, name, known in (("robot", spec.robot, ROBOTS), ("task", spec.task, TASKS)):
-        if name not in known:
+        if name not in known and not (kind == "robot" and robot):
+            by_path = f"; a robot of your own is given by --robot.type=PATH/{name}.yaml" * (kind == "robot")
             raise ManipError(
                 f"{root} is for the {kind} {name!r}, which is not known here (known: {', '.join(known)}), "
-                "so its states cannot be rendered"
+                f"so its states cannot be rendered{by_path}"
             )
-    env = EnvConfig(spec.robot, spec.task, object=spec.object)
+    if robot and (given := get_robot(robot).name) != spec.robot:
+        raise MismatchError("robot", str(root), spec.robot, "--robot.type", given)
+    env = EnvConfig(robot or spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
     older = size - WORLD_SIZE  # of states from before they held all draws
     if spec.sim_state_size not in (size, older):
@@ -88,7 +87,7 @@ def open_source(root: Path) -> Source:
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
     differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
     conditions = recorded_conditions(root, read_provenance(root)) if spec.sim_state_size == older else ()
-    return Source(root, spec, differences, conditions)
+    return Source(root, spec, env, differences, conditions)
 
 
 def recorded_conditions(root: Path, provenance: Mapping[str, Any]) -> tuple[Condition, ...]:

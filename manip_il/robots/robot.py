@@ -179,7 +179,7 @@ def get_robot(name: str) -> Robot:
         return _read(ROBOTS[name])
     if name.endswith(SUFFIXES):
         return _read(Path(name).absolute())
-    raise UnknownName("robot", name, ROBOTS)
+    raise UnknownName("robot", name, ROBOTS, f"known: {', '.join(sorted(ROBOTS))}, or the path of a YAML")
 
 
 _read = cache(Robot.read)

@@ -17,7 +17,10 @@ SHORT = ("--demonstrations=2", "--episodes_per_round=1", "--rounds=1", "--valida
 
 
 @pytest.mark.slow
-def test_it_is_recorded_learnt_evaluated_and_improved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.gl
+def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     (tmp_path / "arms").mkdir()
     write(tmp_path / "arms", "mine")
     monkeypatch.chdir(tmp_path)
@@ -25,8 +28,17 @@ def test_it_is_recorded_learnt_evaluated_and_improved(tmp_path: Path, monkeypatc
     assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
     assert read_spec(Path("datasets/mine_reach")).robot == "mine"
     assert main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
+    assert "pretrained_model --robot.type=mine.yaml --output_dir=run/eval" in capsys.readouterr().out
     words = ["eval", robot, *REACH, "--policy.path=run", "--eval.n_episodes=1", "--eval.films=0", "--output_dir=test"]
     assert main(words) == 0
     assert json.loads(Path("test/eval.json").read_text())["robot"] == "arms/mine.yaml"
     assert main(["dagger", robot, *REACH, *SHORT, "--output_dir=dagger"]) == 0
     assert (tmp_path / "dagger" / "best").is_dir()
+    assert "pretrained_model --robot.type=arms/mine.yaml --output_dir=dagger/test" in capsys.readouterr().out
+    render = ["render", "datasets/mine_reach", "seen", "--cameras=front"]
+    assert main(render) == 1
+    assert "a robot of your own is given by --robot.type=PATH/mine.yaml" in capsys.readouterr().err
+    assert main([*render, "--robot.type=panda"]) == 1
+    assert "robot differs" in capsys.readouterr().err
+    assert main([*render, robot]) == 0
+    assert read_spec(Path("seen")).cameras == ("front",)
