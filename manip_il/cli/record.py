@@ -93,8 +93,10 @@ class RecordOptions(common.EnvOptions):
 
             try_encoder(VideoConfig(**asdict(self.dataset.rgb_encoder)), cameras.size, env.control_hz)
         from manip_il.engine.engine import Engine
+        from manip_il.engine.environments import env_spec
         from manip_il.engine.jobs import RolloutJob
 
+        env_spec(env, cameras)  # refuses what no scene can be made of, before anything is written
         engine = Engine(self.workers, self.engine)
         root, journals = self._folders()
         with exclusive(root):

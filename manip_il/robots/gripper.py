@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
-from manip_il.robots.geometry import distance, nearest
+from manip_il.robots.geometry import at_tip, distance, nearest
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import arm_spec
 
@@ -26,7 +26,7 @@ TOUCH = 0.0015  # a finger this near to an object touches it [m]
 _COMMANDS = 15  # of the sweep from closed to open
 _SETTLE = 250  # physics steps at each
 _STEP = 0.002  # [s]
-_PAD = 0.004  # what is this much farther from the other finger than the nearest is no pad [m]
+_PAD = 0.004  # what is this much farther from the other finger than the nearest at the tip is no pad [m]
 _LOPSIDED = 0.004  # the middle of the pads moves by more where only one of two fingers moves [m]
 _STILL = 1e-4  # a finger that moves by less is not driven [m]
 _LEAST_TRAVEL = 0.005  # a gripper that opens by less grips nothing [m]
@@ -141,10 +141,11 @@ def sweep(robot: Robot) -> Sweep:
         raise UsageError(
             f"robot {robot.name}: the fingers touch where they are open; look at gripper.open and gripper.fingers"
         )
-    gaps = [_gaps(*_at(model, data, pose), jaws) for pose in poses]
+    tips = _tips(*_at(model, data, poses[-1]), jaws)
+    gaps = [_gaps(*_at(model, data, pose), tips) for pose in poses]
     least = [min(float(gap.min()) for gap in one) for one in gaps]
     shut = max((place for place, gap in enumerate(least) if gap <= 0), default=0)  # a linkage's links pass another
-    pads = [[jaw[i] for i in _pads(gap)] for jaw, gap in zip(jaws, gaps[shut], strict=True)]
+    pads = [_near(gap, tip, float(gap.min())) for gap, tip in zip(gaps[shut], tips, strict=True)]
     measured = [_opening(*_at(model, data, pose), pads) for pose in poses[shut:]]
     openings, shares = [opening for opening, _ in measured], shares[shut:]
     middles = np.array([middle for _, middle in measured])
@@ -155,7 +156,11 @@ def sweep(robot: Robot) -> Sweep:
         )
     if np.ptp(middles) < _LOPSIDED:
         middles = np.zeros(len(middles))
-    holding = jaws if middles.any() else pads  # a jaw that turns holds wide things farther from its tip
+    holding = jaws  # one that turns holds wide things farther from its tip
+    if not middles.any():
+        of_all = _gaps(*_at(model, data, poses[shut]), jaws)
+        most = [float(gap.min()) for gap in gaps[shut]]
+        holding = [_near(*one) for one in zip(of_all, jaws, most, strict=True)]
     places = [
         tuple(tuple(map(finger.index, own)) for finger, own in zip(fingers, some, strict=True))
         for some in (pads, holding)
@@ -185,6 +190,12 @@ def _apart(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[l
     return [[geom for geom, gap in zip(*one, strict=True) if gap > 0] for one in zip(fingers, gaps, strict=True)]
 
 
+def _tips(model: mujoco.MjModel, data: mujoco.MjData, jaws: Geoms) -> list[list[int]]:
+    """The geoms of each finger that reach near its tip: what carries it may pass beside the other's."""
+    along = data.site("ee").xmat.reshape(3, 3)[:, 2]
+    return [at_tip(model, data, jaw, along) for jaw in jaws]
+
+
 def _gaps(model: mujoco.MjModel, data: mujoco.MjData, fingers: Geoms) -> list[F64]:
     """For each finger, how far each of its geoms is from the other fingers [m]."""
     gaps = []
@@ -203,9 +214,9 @@ def _opening(model: mujoco.MjModel, data: mujoco.MjData, pads: Geoms) -> tuple[f
     return gap, float(data.site("ee").xmat.reshape(3, 3)[:, 1] @ middle)
 
 
-def _pads(gaps: F64) -> tuple[int, ...]:
-    order = np.argsort(gaps, kind="stable")
-    return tuple(int(i) for i in order if gaps[i] <= gaps.min() + _PAD)
+def _near(gaps: F64, geoms: Sequence[int], least: float) -> list[int]:
+    """The geoms whose gap is hardly more than the least at the tip, the nearest first."""
+    return [geoms[i] for i in np.argsort(gaps, kind="stable") if gaps[i] <= least + _PAD]
 
 
 def finger_geoms(model: mujoco.MjModel, fingers: Sequence[str], prefix: str = "") -> list[tuple[int, ...]]:

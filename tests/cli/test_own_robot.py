@@ -25,6 +25,9 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     write(tmp_path / "arms", "mine")
     monkeypatch.chdir(tmp_path)
     robot = "--robot.type=arms/mine.yaml"
+    assert main(["record", robot, "--task.object=box:0.12", "--dataset.root=wide"]) == 2
+    assert "the gripper of mine opens to" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == ["arms"]
     assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
     assert read_spec(Path("datasets/mine_reach")).robot == "mine"
     assert main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0

@@ -20,7 +20,7 @@ from manip_il.tasks.pick_place import OBJECT
 
 from ..scenes import started, still, world_at_home
 from ..tables import every_robot
-from .own import JAWS, write
+from .own import JAWS, model_of, write
 
 EDGE = 0.05  # of the model's cube [m]
 
@@ -155,3 +155,13 @@ def test_the_stiffer_finger_waits_for_the_other(own: Robot):
     (left,), (right,) = gripper.pads
     gap = mujoco.mj_geomDistance(model, data, left, right, 1.0, None)
     assert gripper.opening(data.qpos) == pytest.approx(gap, abs=1e-3)
+
+
+def test_what_carries_a_finger_may_pass_beside_what_carries_the_other(tmp_path: Path):
+    model = model_of()
+    for name, side in (("left", -1), ("right", 1)):
+        carrier = f'<geom type="box" size="0.005 0.025 0.008" pos="{0.02 * side} 0 -0.03" mass="0.01"/>'
+        model = model.replace(f'<joint name="{name}"', f'{carrier}<joint name="{name}"')
+    plain = sweep(get_robot(str(write(tmp_path, "plain"))))
+    carried = sweep(get_robot(str(write(tmp_path, "carried", model=model))))
+    np.testing.assert_allclose(carried.openings, plain.openings, atol=1e-6)
