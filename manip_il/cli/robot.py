@@ -97,9 +97,10 @@ class RobotCheckOptions:
         if odd := next((task for task in self.tasks if task not in NAMES), None):
             raise UnknownName("task in --tasks:", odd, NAMES)
         require_new(self.output_dir, overwrite=self.overwrite)
+        from manip_il.robots.gripper import sweep
         from manip_il.robots.robot import get_robot
 
-        get_robot(self.robot)
+        sweep(get_robot(self.robot))
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
