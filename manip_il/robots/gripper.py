@@ -116,23 +116,7 @@ def sweep(robot: Robot) -> Sweep:
 
     Raises `UsageError` where they do not come apart.
     """
-    spec = arm_spec(robot)
-    spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model = spec.compile()
-    data, config = mujoco.MjData(model), robot.gripper
-    for name, value in zip(robot.joints, robot.home, strict=True):
-        data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = value
-    q = np.array([model.joint(name).qposadr[0] for name in config.joints])
-    ctrl = np.array([model.actuator(name).id for name in config.joints])
-    fingers = finger_geoms(model, config.fingers)
-    closed, travel = np.asarray(config.closed), np.subtract(config.open, config.closed)
-    data.qpos[q] = closed
-    shares, poses = [], []
-    for share in np.linspace(0, 1, _COMMANDS):
-        data.ctrl[ctrl] = closed + share * travel
-        mujoco.mj_step(model, data, _SETTLE)
-        shares.append(float(((data.qpos[q] - closed) / travel).mean()))
-        poses.append(data.qpos.copy())
+    model, data, fingers, shares, poses = _at_rest(robot)
     geoms = [geom for finger in fingers for geom in finger]
     places = [_at(model, data, pose)[1].geom_xpos[geoms] for pose in (poses[0], poses[-1])]
     _require_moved(robot, *places)
@@ -166,6 +150,28 @@ def sweep(robot: Robot) -> Sweep:
         for some in (pads, holding)
     ]
     return Sweep(np.array(shares), np.array(openings), middles, *places)
+
+
+def _at_rest(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData, Geoms, list[float], list[F64]]:
+    """The model, each finger's geoms, and what each command comes to: its share of the way, and all joints."""
+    spec = arm_spec(robot)
+    spec.option.timestep, spec.option.integrator = _STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model = spec.compile()
+    data, config = mujoco.MjData(model), robot.gripper
+    for name, value in zip(robot.joints, robot.home, strict=True):
+        data.joint(name).qpos[0] = data.actuator(name).ctrl[0] = value
+    q = np.array([model.joint(name).qposadr[0] for name in config.joints])
+    ctrl = np.array([model.actuator(name).id for name in config.joints])
+    fingers = finger_geoms(model, config.fingers)
+    closed, travel = np.asarray(config.closed), np.subtract(config.open, config.closed)
+    data.qpos[q] = closed
+    shares, poses = [], []
+    for share in np.linspace(0, 1, _COMMANDS):
+        data.ctrl[ctrl] = closed + share * travel
+        mujoco.mj_step(model, data, _SETTLE)
+        shares.append(float(((data.qpos[q] - closed) / travel).mean()))
+        poses.append(data.qpos.copy())
+    return model, data, fingers, shares, poses
 
 
 def _at(model: mujoco.MjModel, data: mujoco.MjData, pose: F64) -> tuple[mujoco.MjModel, mujoco.MjData]:
