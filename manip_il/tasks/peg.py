@@ -17,6 +17,7 @@ from manip_il.tasks.grasp import OPEN_SLACK, lie_of
 F64 = NDArray[np.float64]
 
 PEG, HOLE = "peg", "hole"
+_OPEN_SHARE = 0.85  # of what the gripper opens beyond the peg, where that is less than the slack
 FROM_END = 0.04  # of the grip from the peg's upper end [m]
 LOWEST = 0.024  # of the hand over the table at a peg that lies [m]
 BACK = 0.05  # how far behind the hand it is taken to be, when the upper end is the one that is nearer [m]
@@ -133,7 +134,8 @@ def _grip(world: World) -> Grip:
     angle = angle_between(ee.rotation, rotation)
     off = math.hypot(*(position - ee.position)[:2]) + 0.05 * max(0.0, angle - 0.1)
     height = min(OVER, SLOPE * max(0.0, off - FREE))
-    return Grip(position, rotation, off, angle, height, world.opening >= width + OPEN_SLACK)
+    slack = min(OPEN_SLACK, _OPEN_SHARE * (world.most_opening - width))
+    return Grip(position, rotation, off, angle, height, world.opening >= width + slack)
 
 
 @lru_cache(8)
