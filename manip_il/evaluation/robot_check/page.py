@@ -40,8 +40,11 @@ def verdict(check: RobotCheck) -> str:
     if not failed:
         which = f"all {count} tasks" if count > 1 else check.tasks[0].name
         return f"{name} can do {which}." if asked else f"{name} has starts for {which}; the expert was not asked."
-    names = _listed([task.name for task in failed])
-    return f"{name} can do {count - len(failed)} of {count} task{'s' if count > 1 else ''}; it cannot do {names}."
+    names, rest = _listed([task.name for task in failed]), count - len(failed)
+    if not asked:
+        others = f"; it has starts for the other {f'{rest} tasks' if rest > 1 else 'one'}, the expert was not asked"
+        return f"{name} cannot do {names}{others if rest else ''}."
+    return f"{name} can do {rest} of {count} task{'s' if count > 1 else ''}; it cannot do {names}."
 
 
 def joint_table(check: RobotCheck) -> Table:
