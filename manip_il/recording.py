@@ -27,6 +27,7 @@ from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.pool import Job
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 
@@ -52,7 +53,7 @@ class Collected:
 
 
 def collect(
-    engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
+    engine: Engine, job: Job, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
 ) -> Iterator[Collected]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
@@ -88,7 +89,7 @@ def collect(
 
 def collect_successes(
     engine: Engine,
-    job: RolloutJob,
+    job: Job,
     seeds: Sequence[int],
     count: int,
     journals: Path,
@@ -113,7 +114,7 @@ def record(
     episodes: Iterable[Collected],
     journals: Path,
     root: Path,
-    job: RolloutJob,
+    job: Job,
     recording: Recording,
     replace: bool = False,
 ) -> tuple[DatasetInfo, int]:
@@ -144,7 +145,7 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     return {**source, "label": job.label, "query": str(job.query), **steps}
 
 
-def check_journals(journals: Path, job: RolloutJob) -> list[str]:
+def check_journals(journals: Path, job: Job) -> list[str]:
     """Check that a recording may continue from these journals: `MismatchError`, or a list of warnings to show.
 
     Every file is read; one that is damaged is set aside, so that its seed runs again.

@@ -16,7 +16,15 @@ from manip_il.errors import UsageError
 
 BLOCK = 1_000_000  # seeds in one stream
 MAX_ROUNDS = 100
-_STREAMS = {"demonstrations": 1, "training": 2, "validation": 3, "test": 4, "certificate": 5, "held_out": 6}
+_STREAMS = {
+    "demonstrations": 1,
+    "training": 2,
+    "validation": 3,
+    "test": 4,
+    "certificate": 5,
+    "held_out": 6,
+    "redraw": 7,
+}
 _FIRST_ROUND = 10  # rounds take blocks 10, 11, ...
 _BLOCKS_PER_SEED = _FIRST_ROUND + MAX_ROUNDS
 MAX_SEED = 1_000

@@ -28,3 +28,8 @@ every_scene = pytest.mark.parametrize(("robot", "task"), SCENES)
 every_scene_that_grasps = pytest.mark.parametrize(("robot", "task"), GRASPING)
 every_scene_with_cubes = pytest.mark.parametrize(("robot", "task"), WITH_CUBES)
 every_scene_with_a_cube = pytest.mark.parametrize(("robot", "task"), WITH_A_CUBE)
+
+
+def one_arm_per_task() -> list[tuple[str, str]]:
+    """Every task, with the first robot."""
+    return [(next(iter(ROBOTS)), task) for task in TASKS]

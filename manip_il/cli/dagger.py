@@ -81,7 +81,7 @@ class DaggerOptions(common.EnvOptions):
     policy: Open = option_of(FitConfig, "policy")
     action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
-    cameras: list[str] = option(list, "front, wrist or both, for a policy on images")
+    cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
     vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")

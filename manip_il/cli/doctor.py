@@ -87,7 +87,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     from manip_il.engine.environments import env_fingerprint, env_spec
     from manip_il.engine.simulations import is_known
     from manip_il.sim.env import EnvConfig
-    from manip_il.sim.variation import WORLD_SIZE
+    from manip_il.sim.variation import OLDER
 
     if not is_known(spec.robot, spec.task):
         yield warning(OURS, f"is for {spec.robot} {spec.task}, which is not known here")
@@ -96,7 +96,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
     here = env_spec(env)
     for what in ("joint_names", "environment_state_names", "sim_state_size", "action_meaning"):
         found, wanted = getattr(spec, what), getattr(here, what)
-        older = what == "sim_state_size" and found == here.sim_state_size - WORLD_SIZE  # before it held all draws
+        older = what == "sim_state_size" and here.sim_state_size - found in OLDER  # before it held all draws
         if found != wanted and not older:
             yield error(OURS, f"{what} is {_short(found)}; {spec.robot} {spec.task} has {_short(wanted)} here")
     # Versions are compared elsewhere; tolerance and horizon are not part of a dataset.

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from manip_il.sim.render import Picture
 
-_CAMERAS = ("front", "wrist")
 _FRAMES = 20  # timed after the first one, which also loads the scene
 _BACKENDS = ("egl", "osmesa", "glfw")  # the last one needs a display
 _FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
@@ -96,11 +95,11 @@ def check_pictures(pictures: Mapping[str, Picture]) -> None:
 
 def _draw() -> str:
     """Draw and time the default scene; return renderer and speed."""
-    from manip_il.sim.config import CameraConfig
+    from manip_il.sim.config import CAMERAS, CameraConfig
     from manip_il.sim.env import ManipEnv
     from manip_il.sim.render import pictures
 
-    world, cameras = ManipEnv(), CameraConfig(_CAMERAS)
+    world, cameras = ManipEnv(), CameraConfig(CAMERAS)
     world.start(0)
 
     def draw() -> Mapping[str, Picture]:
@@ -110,7 +109,7 @@ def _draw() -> str:
     begin = time.perf_counter()
     for _ in range(_FRAMES):
         draw()
-    each = (time.perf_counter() - begin) / (_FRAMES * len(_CAMERAS))
+    each = (time.perf_counter() - begin) / (_FRAMES * len(CAMERAS))
     return f"{_renderer()}, {1e3 * each:.1f} ms a picture of {cameras.height} x {cameras.width}"
 
 

@@ -23,7 +23,7 @@ from manip_il.data.atomic import exclusive
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option, option_of
-from manip_il.sim.config import Look, scene_name
+from manip_il.sim.config import CAMERAS, Look, scene_name
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -62,7 +62,7 @@ class RecordOptions(common.EnvOptions):
 
     example: ClassVar[str] = "manip-il record --dataset.num_episodes=100 --dataset.root=datasets/demos"
     dataset: DatasetGroup = field(default_factory=DatasetGroup)
-    cameras: list[str] = option(list, "front, wrist or both; by default no pictures")
+    cameras: list[str] = option(list, "any of front, side, wrist; by default no pictures")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
     vary: list[str] = option(list, VARY_HELP)
     seed: int = common.seed_option()
@@ -204,7 +204,7 @@ class RenderOptions:
     source: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
     target: Path = option(MISSING, "folder of the new dataset", positional=True)
     robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)
-    cameras: list[str] = option(lambda: ["front", "wrist"], "front, wrist or both")
+    cameras: list[str] = option(lambda: list(CAMERAS), "any of front, side, wrist")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
     look: Look = field(default_factory=Look)
     workers: int | None = option(None, "processes; by default one per core")
@@ -224,7 +224,7 @@ class RenderOptions:
         """Render every episode; TARGET appears when all are there."""
         cameras = self.image.config(self.cameras, self.look)
         if cameras is None:
-            raise UsageError("--cameras names none; expected front, wrist or both")
+            raise UsageError("--cameras names none; expected any of front, side, wrist")
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.engine.engine import default_workers

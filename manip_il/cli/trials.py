@@ -28,13 +28,13 @@ FOLDER = "evaluations"
 FILM_EVERY = 2  # control steps a frame of film
 SUITES = {
     "nominal": ("nominal",),
-    "disturbed": ("knocked", "sensing"),
-    "randomised": ("object", "view", "dynamics"),
-    "all": ("nominal", "knocked", "sensing", "object", "view", "dynamics"),
+    "disturbed": ("knocked", "sensing", "late"),
+    "randomised": ("object", "view", "clutter", "dynamics"),
+    "all": ("nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"),
 }
 CONDITIONS = (*SUITES["all"], "random_actions")
 _YAML = (".yaml", ".yml")
-_NAMED = "object, view (with cameras), dynamics, knocked, sensing, random_actions"
+_NAMED = "object, dynamics, knocked, sensing, random_actions; with cameras view, clutter, late"
 VARY_HELP = f"how worlds differ from episode to episode: {_NAMED}, or YAMLs of ranges"
 SUITE_HELP = f"nominal, disturbed, randomised, all; one condition of {_NAMED}; or a YAML of ranges"
 

@@ -48,7 +48,8 @@ class Recording:
     A rollout becomes as many episodes as it has parts (see `parts`). only_successes: failed ones are left out.
     only_labelled: those without a valid label are. episodes: at most so many, the first in seed order; None: all.
     labels: at most so many valid ones; after the last one `label_valid` is 0, episodes beyond it are left out.
-    provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it.
+    provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it. stills:
+    they are PNGs in the data files, for frames that have nothing to do with each other.
     Raises `ManipError` naming what is wrong.
     """
 
@@ -59,10 +60,11 @@ class Recording:
     video: dict[str, Any] = field(default_factory=dict)
     only_labelled: bool = False
     labels: int | None = None
+    stills: bool = False
 
     def __post_init__(self) -> None:
         checks.repo_id("repo_id", self.repo_id)
-        for what in ("only_successes", "only_labelled"):
+        for what in ("only_successes", "only_labelled", "stills"):
             checks.truth(what, getattr(self, what))
         for what in ("episodes", "labels"):
             if getattr(self, what) is not None:
@@ -78,7 +80,7 @@ class Recording:
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
     ) -> AbstractContextManager[DatasetWriter]:
         """Return the dataset's writer; raises what `new_dataset` raises."""
-        video = VideoConfig.from_json(self.video)
+        video, spec = VideoConfig.from_json(self.video), dataclasses.replace(spec, video=not self.stills)
         return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
 
     def write(self, journals: Path) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info, read_info
 from manip_il.data.parquet_files import UNREADABLE, Shard, find_shards, floats, integers
-from manip_il.data.pictures import Pictures, VideoReader, open_picture
+from manip_il.data.pictures import Pictures, VideoReader, decode_picture
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` of the first
@@ -60,7 +60,7 @@ class ParquetPart:
                 for batch in file.iter_batches(64, [self.group], [key, layout.INDEX], use_threads=False):
                     rows, stored = (batch.column(name).to_pylist() for name in (layout.INDEX, key))
                     for row, picture in zip(rows, stored, strict=True):
-                        yield row, _decode(picture["bytes"])[None]
+                        yield row, decode_picture(picture["bytes"])[None]
         except UNREADABLE as error:
             raise ManipError(f"cannot read the pictures {key} in {root / self.path}: {error}; {_SEE_DOCTOR}") from error
 
@@ -218,12 +218,3 @@ def _pieces(source: FrameSource) -> Iterator[Part]:
         for start in range(0, part.count, limit):
             count = min(limit, part.count - start)
             yield VideoPart(part.path, part.first + start, count, part.row + start)
-
-
-def _decode(content: bytes | None) -> Pictures:
-    if content is None:
-        raise ValueError("a picture is not in the file")
-    with open_picture(content) as picture:
-        if picture.mode != "RGB":
-            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
-        return np.asarray(picture)

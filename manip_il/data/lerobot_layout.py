@@ -37,6 +37,7 @@ DRAWN = "drawn"  # of meta/episodes, ours: what an episode drew, as JSON
 
 _INDEX_DTYPES = {TIMESTAMP: "float32"} | dict.fromkeys((FRAME_INDEX, EPISODE_INDEX, INDEX, TASK_INDEX), "int64")
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+PICTURE = pa.struct({"bytes": pa.binary(), "path": pa.string()})  # a file's content, and the name that it had
 VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
     "chunk_index": pa.int64(),
     "file_index": pa.int64(),
@@ -94,7 +95,10 @@ def data_schema(spec: RobotTaskSpec) -> pa.Schema:
     hugging_face: dict[str, Any] = {}
     for key, feature in all_features(spec).items():
         if key in spec.image_keys:
-            continue  # in files of their own
+            if not spec.video:  # else in files of their own
+                fields.append(pa.field(key, PICTURE))
+                hugging_face[key] = {"_type": "Image"}
+            continue
         value = {"dtype": feature["dtype"], "_type": "Value"}
         dtype = pa.type_for_alias(feature["dtype"])
         size: int = feature["shape"][0]
@@ -113,7 +117,7 @@ def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
     for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
         columns[name] = pa.int64()
     columns[DRAWN] = pa.string()
-    for key in spec.image_keys:
+    for key in spec.image_keys if spec.video else ():
         columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
     for key in all_features(spec):
         columns |= {f"stats/{key}/{name}": _stat_type(name, key in spec.image_keys) for name in STAT_NAMES}

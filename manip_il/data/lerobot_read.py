@@ -19,7 +19,7 @@ from manip_il.data.draws import read_drawn
 from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.info import LARGEST_META, PICTURES, info_problems
 from manip_il.data.parquet_files import UNREADABLE, check_files, read_column, read_file, read_tasks
-from manip_il.data.pictures import VideoReader
+from manip_il.data.pictures import VideoReader, decode_picture
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -94,18 +94,21 @@ def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
     stored = [key for key in shapes if key not in cameras]
     _check_rows(root, sum(len(read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))
     info = _read_info(root)
-    clips = {key: find_clips(root, key, info["fps"]) for key in cameras}
+    stills = [key for key in cameras if info["features"][key]["dtype"] == "image"]
+    films = [key for key in cameras if key not in stills]
+    clips = {key: find_clips(root, key, info["fps"]) for key in films}
     with ExitStack() as stack:
-        readers = {key: stack.enter_context(closing(VideoReader())) for key in cameras}
+        readers = {key: stack.enter_context(closing(VideoReader())) for key in films}
         for path in _data_files(root):
-            table = read_file(path, [*stored, layout.EPISODE_INDEX, layout.TASK_INDEX])
+            table = read_file(path, [*stored, *stills, layout.EPISODE_INDEX, layout.TASK_INDEX])
             columns = {key: read_column(root, key, table, wanted[key]).reshape(-1, *shapes[key]) for key in stored}
             index = read_column(root, layout.EPISODE_INDEX, table, _INDEX)
             task = read_column(root, layout.TASK_INDEX, table, _INDEX)
             starts = np.flatnonzero(np.diff(index, prepend=-1))
             for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
                 own = {key: values[start:stop] for key, values in columns.items()}
-                own |= {key: _decode(root, info, readers[key], clips[key], key, int(index[start])) for key in cameras}
+                own |= {key: _decode(root, info, readers[key], clips[key], key, int(index[start])) for key in films}
+                own |= {key: _stills(root, key, table.column(key)[start:stop]) for key in stills}
                 text, draws = _text(root, tasks, int(task[start])), drawn.get(int(index[start]), {})
                 yield _episode({key: own[key] for key in shapes}, text, draws)
 
@@ -118,8 +121,12 @@ def read_frames(root: Path, key: str, episode: int) -> NDArray[np.uint8]:
     """
     if key not in (known := camera_keys(root)):
         raise UnknownName(f"camera in {root}", key, known)
+    info = _read_info(root)
+    if info["features"][key]["dtype"] == "image":
+        tables = (read_file(path, [key, layout.EPISODE_INDEX]) for path in _data_files(root))
+        kept = [_keep(root, table, [episode], info["total_episodes"]) for table in tables]
+        return _stills(root, key, pa.concat_tables(kept).column(key))
     with closing(VideoReader()) as reader:
-        info = _read_info(root)
         return _decode(root, info, reader, find_clips(root, key, info["fps"]), key, episode)
 
 
@@ -221,6 +228,14 @@ def _decode(
     return reader.read(root / part.path, part.first, part.count, int(info["fps"]))
 
 
+def _stills(root: Path, key: str, column: pa.ChunkedArray) -> NDArray[np.uint8]:
+    """Pictures of a data file's rows, (T, height, width, 3)."""
+    try:
+        return np.stack([decode_picture(one["bytes"]) for one in column.to_pylist()])
+    except (*UNREADABLE, KeyError, TypeError) as error:
+        raise ManipError(f"cannot read the pictures {key} in {root}: {error}") from error
+
+
 def _episode(columns: dict[str, NDArray[Any]], text: str, drawn: dict[str, Any]) -> Episode:
     seed, solved = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
     return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), (), text, drawn)
@@ -230,12 +245,13 @@ def _cameras(info: dict[str, Any]) -> dict[str, Any]:
     """Cameras and their size for a spec, from LeRobot's feature table."""
     sizes: dict[str, tuple[int, int]] = {}
     for key, feature in info["features"].items():
-        if feature["dtype"] == "video" and key.startswith(s.IMAGES):
+        if feature["dtype"] in PICTURES and key.startswith(s.IMAGES):
             named = dict(zip(feature["names"], feature["shape"], strict=False))  # either order is about
             sizes[key.removeprefix(s.IMAGES)] = (int(named["height"]), int(named["width"]))
     if len(set(sizes.values())) > 1:
         raise ManipError(f"cameras of different sizes: {sizes}; this project's datasets have one size for all")
-    return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0))}
+    video = not any(info["features"][s.IMAGES + camera]["dtype"] == "image" for camera in sizes)
+    return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
 
 
 def _check_rows(root: Path, found: int) -> None:

@@ -23,7 +23,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, writing
 from manip_il.data.draws import to_text
 from manip_il.data.lerobot_read import DatasetInfo
-from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats
+from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats, pixel_counts
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
 from manip_il.data.video import CameraFiles, CameraThreads, Clip, try_encoder
@@ -64,7 +64,7 @@ def new_dataset(
     settings that the encoder refuses, both before anything is written; `ManipError` on leaving without `finish`.
     """
     video = video or VideoConfig()
-    if spec.cameras:
+    if spec.cameras and spec.video:
         try_encoder(video, spec.image_size, spec.fps)
     ours = own_file(repo_id, spec, fingerprint)
     with new_folder(root, replace=replace) as folder:
@@ -115,7 +115,7 @@ class DatasetWriter:
         self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(spec), _GROUP_ROWS)
         self._meta = ParquetFiles(folder, layout.EPISODES_PATH, layout.episodes_schema(spec))
         self._cameras = CameraThreads(
-            {key: CameraFiles(folder, key, video, spec.fps, file_sizes[1]) for key in spec.image_keys}
+            {key: CameraFiles(folder, key, video, spec.fps, file_sizes[1]) for key in spec.image_keys if spec.video}
         )
         self._stats = RunningStats(folder)
         self._counts: dict[str, I64] = {}  # camera column -> pixels of all episodes
@@ -135,12 +135,15 @@ class DatasetWriter:
             raise ManipError(f"{self._root} is finished: no episodes can be added")
         columns = fitted_columns(episode, self._spec)
         pictures = {key: columns.pop(key) for key in self._spec.image_keys}
+        films, stills = (pictures, {}) if self._spec.video else ({}, pictures)
         task = checks.text("instruction", episode.instruction or self._spec.instruction)
         columns |= self._index_columns(len(episode), self._tasks.setdefault(task, len(self._tasks)))
         with _explained(self._root):
-            row = self._write_data(columns, len(episode), task) | _flat(self._stats.add(columns))
+            row = self._write_data(columns | stills, len(episode), task) | _flat(self._stats.add(columns))
             row[layout.DRAWN] = to_text(episode.drawn)
-            self._encoding.append((row, self._cameras.write(pictures)))
+            for key, frames in stills.items():
+                row |= self._picture_columns(key, pixel_counts(frames), len(episode))
+            self._encoding.append((row, self._cameras.write(films)))
             self._settle()
         self._episodes += 1
         self._frames += len(episode)
@@ -222,7 +225,7 @@ class DatasetWriter:
             for key, future in clips.items():
                 clip = future.result()
                 row |= self._clip_columns(key, clip)
-                self._counts[key] = self._counts.get(key, 0) + clip.counts
+                row |= self._picture_columns(key, clip.counts, clip.frames)
             self._rows.append(row)
             if len(self._rows) >= _EPISODE_ROWS:
                 self._write_rows()
@@ -233,8 +236,12 @@ class DatasetWriter:
             f"videos/{key}/file_index": clip.file,
             f"videos/{key}/from_timestamp": clip.first / self._spec.fps,
             f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._spec.fps,
-            **_flat({key: picture_stats(clip.counts, clip.frames)}),
         }
+
+    def _picture_columns(self, key: str, counts: I64, frames: int) -> dict[str, Any]:
+        """Statistics of an episode's pictures from one camera; they count for the dataset's."""
+        self._counts[key] = self._counts.get(key, 0) + counts
+        return _flat({key: picture_stats(counts, frames)})
 
     def _write_rows(self) -> None:
         if not self._rows:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.parquet_limits import check_parquet
+from manip_il.data.pictures import to_png
 from manip_il.errors import ManipError, UnknownName
 
 MAGIC = b"PAR1"
@@ -84,9 +85,13 @@ class ParquetFiles:
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
-    """Return columns (T,) and (T, d) as an Arrow table, vectors as lists of fixed size."""
+    """Return columns (T,) and (T, d) as an Arrow table, vectors as lists of fixed size, pictures as PNG."""
     arrays: list[pa.Array] = []
     for field in schema:
+        if field.type == layout.PICTURE:
+            rows = [{"bytes": to_png(picture), "path": None} for picture in columns[field.name]]
+            arrays.append(pa.array(rows, field.type))
+            continue
         values = np.ascontiguousarray(columns[field.name])
         if pa.types.is_fixed_size_list(field.type):
             flat = pa.array(values.reshape(-1), field.type.value_type)

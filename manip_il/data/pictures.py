@@ -38,6 +38,7 @@ _ELSEWHERE = re.compile(rb"moof|mvex|cmov")  # fragments and a packed index: wha
 
 _UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 _FORMATS = ("PNG", "JPEG")
+_LEVEL = 1  # of compression: the next ones save a tenth and take twice as long
 
 Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
@@ -58,6 +59,23 @@ def open_picture(content: bytes) -> Image.Image:
     if picture.width * picture.height > MOST_PIXELS:
         raise ValueError(f"it has {picture.width} x {picture.height} pixels; expected at most {MOST_PIXELS:,} in all")
     return picture
+
+
+def to_png(picture: NDArray[np.uint8]) -> bytes:
+    """Return a picture (height, width, 3) as the content of a PNG file."""
+    stream = BytesIO()
+    Image.fromarray(picture).save(stream, "PNG", compress_level=_LEVEL)
+    return stream.getvalue()
+
+
+def decode_picture(content: bytes | None) -> Pictures:
+    """Return the picture (height, width, 3) in the content of a file. Raises `ValueError` for none, or one not RGB."""
+    if content is None:
+        raise ValueError("a picture is not in the file")
+    with open_picture(content) as picture:
+        if picture.mode != "RGB":
+            raise ValueError(f"a picture of mode {picture.mode}; expected RGB")
+        return np.asarray(picture)
 
 
 def open_video(path: Path) -> InputContainer:

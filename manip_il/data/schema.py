@@ -44,7 +44,7 @@ LONGEST_SIDE = 8192  # of a picture [pixels]
 MOST_PIXELS = 4096 * 4096  # of a picture
 _LONGEST_LIST = 200  # of names in a message [characters]
 _LARGEST_STATE = 1_000_000  # numbers in a `sim_state`
-_MAY_LACK = ("object", "robot_type")  # of a spec as JSON
+_MAY_LACK = ("object", "robot_type", "video")  # of a spec as JSON
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class RobotTaskSpec:
     phases: tuple[str, ...] = ()  # what `expert_phase` counts: none, then the rungs of the task's ladder
     object: str = ""  # shape and size of what the task moves; empty for the task's own
     robot_type: str = ""  # the robot as LeRobot calls it; empty where that is `robot`
+    video: bool = True  # whether pictures are frames of video files; else each is a PNG in the data files
     schema: int = VERSION
 
     def __post_init__(self) -> None:
@@ -82,14 +83,16 @@ class RobotTaskSpec:
             checks.text(what, getattr(self, what))
         for camera in checks.array("cameras", self.cameras, MOST_CAMERAS):
             checks.name("a camera", camera)
+        checks.truth("video", self.video)
         if len(set(self.cameras)) < len(self.cameras):
             raise ManipError(f"cameras are {checks.shorten(self.cameras)}; expected each once")
         check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the spec as JSON types; without object and robot_type where they are empty."""
+        """Return the spec as JSON types; without object and robot_type where they are empty, and video where it is."""
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        return {key: value for key, value in values.items() if value or key not in _MAY_LACK}
+        values |= {"video": None if self.video else False}
+        return {key: value for key, value in values.items() if value not in ("", None) or key not in _MAY_LACK}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> RobotTaskSpec:
@@ -139,7 +142,7 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     return {
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
-        **{key: _image_feature(spec.image_size) for key in spec.image_keys},
+        **{key: _image_feature(spec.image_size, "video" if spec.video else "image") for key in spec.image_keys},
         ACTION: _feature("float32", joints),
         EXECUTED_ACTION: _feature("float32", joints),
         ACTOR: _feature("int64", ["actor"]),
@@ -156,8 +159,8 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
     }
 
 
-def _image_feature(size: tuple[int, int]) -> dict[str, Any]:
-    return {"dtype": "video", "shape": (*size, 3), "names": ["height", "width", "channels"]}
+def _image_feature(size: tuple[int, int], dtype: str) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": (*size, 3), "names": ["height", "width", "channels"]}
 
 
 def _feature(dtype: str, names: Sequence[str]) -> dict[str, Any]:
@@ -196,7 +199,7 @@ def fitted_columns(episode: Episode, spec: RobotTaskSpec) -> dict[str, NDArray[A
 
 def _fitted(who: str, key: str, values: NDArray[Any] | None, feature: dict[str, Any]) -> NDArray[Any]:
     shape: tuple[int, ...] = feature["shape"]
-    dtype = "uint8" if feature["dtype"] == "video" else feature["dtype"]
+    dtype = "uint8" if feature["dtype"] in ("video", "image") else feature["dtype"]
     what, need = f"column {key!r}", f"{dtype} of shape (T, {', '.join(map(str, shape))})"
     if values is None:
         raise MismatchError(what, who, "no such column", "the schema", need)

@@ -39,7 +39,7 @@ class RayCluster:
 
     def __init__(self, workers: int | None):
         self._running: dict[Any, Task] = {}  # Ray's generator of a task's answers -> the task
-        self._policies: dict[Path, Any] = {}  # folder -> its files in Ray's store
+        self._folders: dict[Path, Any] = {}  # folder -> its files in Ray's store
         self._ours = not ray.is_initialized()
         if self._ours:
             try:
@@ -56,7 +56,7 @@ class RayCluster:
         """Send a task to the cluster."""
         # Deaths are counted by the engine, which knows which seeds had ended: Ray itself is to try once.
         remote = _run_remote.options(num_returns="streaming", max_retries=0)
-        self._running[remote.remote(task, self._ship(task.job.policy))] = task
+        self._running[remote.remote(task, self._ship(task.job.files))] = task
 
     def wait(self) -> list[tuple[Task, Message]]:
         """Return one message of every task that has one."""
@@ -68,7 +68,7 @@ class RayCluster:
         for answers in self._running:
             ray.cancel(answers, force=True)
         self._running.clear()
-        self._policies.clear()
+        self._folders.clear()
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
@@ -84,19 +84,19 @@ class RayCluster:
             del self._running[answers]
         return task, message
 
-    def _ship(self, policy: Path | None) -> Any:
-        if policy is None:
+    def _ship(self, folder: Path | None) -> Any:
+        if folder is None:
             return None
-        if policy not in self._policies:
-            files = {path.relative_to(policy).as_posix(): path.read_bytes() for path in sorted(policy.rglob("*.*"))}
-            self._policies[policy] = ray.put(files)
-        return self._policies[policy]
+        if folder not in self._folders:
+            files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.*"))}
+            self._folders[folder] = ray.put(files)
+        return self._folders[folder]
 
 
 @ray.remote(num_cpus=1)
 def _run_remote(task: Task, files: Files | None) -> Iterator[Message]:
     def unpacked() -> Task:
-        return task if files is None else replace(task, job=replace(task.job, policy=_unpack(files)))
+        return task if files is None else replace(task, job=task.job.with_files(_unpack(files)))
 
     yield from run_task(unpacked, store=False)
 

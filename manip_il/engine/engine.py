@@ -13,9 +13,8 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Literal
 
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.engine.local import LocalProcesses, start_server
-from manip_il.engine.pool import Keep, Pool, Task
+from manip_il.engine.pool import Job, Keep, Pool, Task
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
@@ -38,7 +37,7 @@ class Engine:
         self._backend: Backend = backend
         self._pool: Pool | None = None
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
+    def run(self, job: Job, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
         """Yield one episode a seed as they end, in no fixed order, each once it is kept.
 
         Pictures stay in the process that made them: episodes from another one come without. Raises what the work
@@ -46,7 +45,7 @@ class Engine:
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
         if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
-            for episode in run_job(job, wanted):
+            for episode in job.run(wanted):
                 if keep is not None:
                     keep.store(episode.seed, keep.pack(episode))
                 yield episode
@@ -118,9 +117,9 @@ class Engine:
                 waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
 
 
-def _tasks(job: RolloutJob, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:
+def _tasks(job: Job, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:
     """One seed a task; where a learner drives, a lockstep batch, smaller where that would leave a worker idle."""
-    size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
+    size = 1 if not job.learned else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(Task(job, tuple(seeds[i : i + size]), keep) for i in range(0, len(seeds), size))
 
 

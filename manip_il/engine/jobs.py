@@ -85,6 +85,24 @@ class RolloutJob:
             raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
 
     @property
+    def learned(self) -> bool:
+        """Whether a policy drives."""
+        return self.policy is not None
+
+    @property
+    def files(self) -> Path | None:
+        """A folder that workers on other machines need a copy of."""
+        return self.policy
+
+    def with_files(self, files: Path) -> RolloutJob:
+        """Return the same where its folder has been copied to."""
+        return replace(self, policy=files)
+
+    def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
+        """Yield one episode a seed, in the order in which they end."""
+        return run_job(self, seeds)
+
+    @property
     def labels_all(self) -> bool:
         """True where every state gets its label, whoever drives."""
         return self.label == "per_state" and self.query.kind == "every"
@@ -101,7 +119,7 @@ def run_job(job: RolloutJob, seeds: Sequence[int]) -> Iterator[Episode]:
     steps = run_steps(job, envs, seeds)
     if job.cameras is None and cameras is not None:
         steps = map(_without_pictures, steps)
-    branch_env = _BranchEnv(make(job.env, job.cameras)) if job.label == "branch" else None
+    branch_env = BranchEnv(make(job.env, job.cameras)) if job.label == "branch" else None
     for frames in group_rollouts(steps):
         drawn = draw(job.conditions, frames[0].seed, job.env.object).values
         yield replace(_to_episode(job, frames, expert, branch_env), drawn=drawn)
@@ -187,7 +205,7 @@ def _rules(job: RolloutJob) -> Rules:
     return Rules(twice * job.env.horizon, job.hold, job.patience, "every" if job.labels_all else "driver")
 
 
-def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: _BranchEnv | None) -> Episode:
+def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: BranchEnv | None) -> Episode:
     if job.label == "last":
         return to_episode(frames, job.round, job.beta, labelled=False)
     if job.label == "takeover":
@@ -198,7 +216,13 @@ def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, bra
     if branch_env is None:
         return to_episode(frames, job.round, job.beta)
     path = [replace(frame, label=None) for frame in frames]
-    return to_episode([*path, *_branches(job, frames, expert, branch_env)], job.round, job.beta, path=len(path))
+    branches = (
+        step
+        for frame in frames
+        if frame.label is not None and frame.label.valid
+        for step in branch(branch_env, expert, frame.state, frame.seed, job.branch_steps)
+    )
+    return to_episode([*path, *branches], job.round, job.beta, path=len(path))
 
 
 def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
@@ -211,7 +235,7 @@ def _cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]
     return [*frames[:last], replace(frames[last], done=True), *rest]
 
 
-class _BranchEnv:
+class BranchEnv:
     """An environment of which every episode begins in `first`."""
 
     first: State
@@ -242,12 +266,10 @@ class _BranchEnv:
         return self._env.progress
 
 
-def _branches(job: RolloutJob, frames: Iterable[Transition], expert: Labeller, env: _BranchEnv) -> Iterator[Transition]:
-    """From every frame that has a sound label, the expert's next steps; each branch ends with `done`."""
-    for frame in frames:
-        if frame.label is not None and frame.label.valid:
-            env.first = frame.state
-            yield from rollout([env], [frame.seed], drivers.ExpertDriver(), Rules(job.branch_steps), expert)
+def branch(env: BranchEnv, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:
+    """Yield the expert's next steps from a state; the last one is `done`."""
+    env.first = first
+    yield from rollout([env], [seed], drivers.ExpertDriver(), Rules(steps), expert)
 
 
 def _without_pictures(transition: Transition) -> Transition:

@@ -80,7 +80,7 @@ class LocalProcesses:
 
     def submit(self, task: Task) -> None:
         """Send a task to a worker."""
-        start_server(learned=task.job.policy is not None)
+        start_server(learned=task.job.learned)
         worker = self._idle.pop() if self._idle else _Worker()
         self._busy[worker.connection] = worker
         worker.start(task)

@@ -2,13 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.sim.config import CameraConfig, EnvConfig
+
+
+class Job(Protocol):
+    """Work that makes episodes of seeds; must pickle, and depend on nothing else."""
+
+    @property
+    def env(self) -> EnvConfig:
+        """Environment of its episodes."""
+        ...
+
+    @property
+    def cameras(self) -> CameraConfig | None:
+        """Cameras whose pictures its episodes have."""
+        ...
+
+    @property
+    def learned(self) -> bool:
+        """Whether it needs a policy, which takes torch and memory."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """Seeds that are run together at most, where it is learned."""
+        ...
+
+    @property
+    def files(self) -> Path | None:
+        """A folder that workers on other machines need a copy of."""
+        ...
+
+    def with_files(self, files: Path) -> Job:
+        """Return the same where its folder has been copied to."""
+        ...
+
+    def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
+        """Yield one episode a seed, in the order in which they end."""
+        ...
 
 
 class Keep(Protocol):
@@ -27,7 +65,7 @@ class Keep(Protocol):
 class Task:
     """Some seeds of one job."""
 
-    job: RolloutJob
+    job: Job
     seeds: tuple[int, ...]
     keep: Keep | None
 
@@ -77,7 +115,7 @@ def run_task(get_task: Callable[[], Task], store: bool) -> Iterator[Message]:
     """
     try:
         task = get_task()
-        for episode in run_job(task.job, task.seeds):
+        for episode in task.job.run(task.seeds):
             packed = task.keep.pack(episode) if task.keep is not None else None
             if store and task.keep is not None:
                 task.keep.store(episode.seed, packed)

@@ -39,7 +39,7 @@ from manip_il.robots.robot import ROBOTS, get_robot
 from manip_il.sim.conditions import NOMINAL_VALUES, PICTURED, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig
 from manip_il.sim.env import EnvConfig, ManipEnv
-from manip_il.sim.variation import WORLD_SIZE, with_drawn
+from manip_il.sim.variation import OLDER, with_drawn
 from manip_il.tasks.table import TASKS
 
 Pictures = dict[str, NDArray[np.uint8]]
@@ -80,13 +80,13 @@ def open_source(root: Path, robot: str | None = None) -> Source:
         raise MismatchError("robot", str(root), spec.robot, "--robot.type", given)
     env = EnvConfig(robot or spec.robot, spec.task, object=spec.object)
     size = env_spec(env).sim_state_size
-    older = size - WORLD_SIZE  # of states from before they held all draws
-    if spec.sim_state_size not in (size, older):
+    lacks = size - spec.sim_state_size  # of states from before they held all draws
+    if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
     here, there = env_fingerprint(env), read_fingerprint(root)
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
     differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
-    conditions = recorded_conditions(root, read_provenance(root)) if spec.sim_state_size == older else ()
+    conditions = recorded_conditions(root, read_provenance(root)) if lacks == max(OLDER) else ()
     return Source(root, spec, env, differences, conditions)
 
 

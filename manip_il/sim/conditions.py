@@ -42,15 +42,19 @@ _BOUNDS: dict[str, Range] = {
     "camera_turn": (0, 90),
     "brightness": (0.1, 3),
     "light_turn": (-180, 180),
+    "clutter": (0, 12),
+    "picture_delay": (0, 100),
 }
 _NAMES = {"shape": KINDS}  # ranges that are lists of these names
 _KNOWN = (*_NAMES, *_BOUNDS)
-_WHOLE = ("knock_step", "delay")
+_WHOLE = ("knock_step", "delay", "picture_delay")
+_SEEDS = 2**31  # of clutter: a state holds one exactly
 _KNOCK_STEP = (5, 24)  # where a condition has a knock and does not say
 _BODY = ("mass", "size", "friction")  # of the object, in physics
 _MODEL = ("shape", *_BODY, "joint_damping", "actuator_gain")
 _OBJECT = ("knock", "colour", "shape", *_BODY)
-PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn")  # and nothing else
+PICTURED = ("colour", "table", "camera_shift", "camera_turn", "brightness", "light_turn", "clutter")  # and nothing else
+_SEEN = (*PICTURED, "picture_delay")
 
 
 @dataclass(frozen=True, init=False)
@@ -66,7 +70,8 @@ class Condition:
     green and blue; table: of the table's. joint_damping: factor on that of every joint of the arm; actuator_gain: on kp
     of its actuators, and by its root on kv. posture: how far every joint begins from home, at most [rad]. camera_shift
     [m], camera_turn [deg]: of every camera, in a drawn direction. brightness: factor on every lamp; light_turn: of the
-    lamps about the vertical [deg].
+    lamps about the vertical [deg]. clutter: things that lie around the workspace and touch nothing. picture_delay:
+    control steps by which pictures, and they alone, are late.
 
     Raises `UnknownName` for another range, `UsageError` for one that is empty or out of bounds.
     """
@@ -90,7 +95,7 @@ class Condition:
         `EnvConfig.object`. None where nothing of it is left.
         Raises `UsageError` where the condition's sizes are all others.
         """
-        dropped = {*(() if has_object else _OBJECT), *(() if sees else PICTURED), *(() if sizes else ("size",))}
+        dropped = {*(() if has_object else _OBJECT), *(() if sees else _SEEN), *(() if sizes else ("size",))}
         dropped |= set() if draws_shape(shape) else {"shape"}
         kept = {name: range_ for name, range_ in self.ranges.items() if name not in dropped}
         if "size" in kept and sizes is not None:
@@ -175,6 +180,8 @@ def _draw(name: str, range_: Any, rng: np.random.Generator) -> Any:
         return range_[int(rng.integers(len(range_)))]
     if name in _WHOLE:
         return int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True))
+    if name == "clutter":
+        return [int(rng.integers(int(range_[0]), int(range_[1]), endpoint=True)), int(rng.integers(_SEEDS))]
     if name in ("colour", "table"):
         return [float(value) for value in rng.uniform(range_[0], range_[1], 3)]
     if name in ("camera_shift", "camera_turn"):
@@ -204,7 +211,7 @@ def _require_known(what: str, names: Iterable[object]) -> None:
 def _checked(condition: str, name: str, given: Any) -> Any:
     what = f"{condition}: {name}"
     if name not in _NAMES:
-        _require_range(what, given, _BOUNDS[name], whole=name in _WHOLE)
+        _require_range(what, given, _BOUNDS[name], whole=name in (*_WHOLE, "clutter"))
         return given
     if not isinstance(given, Sequence) or isinstance(given, str) or not given or len(set(map(str, given))) < len(given):
         raise UsageError(f"{what} is {checks.shorten(given)}; expected names, each once")
@@ -221,7 +228,7 @@ def _require_range(what: str, given: Range, bounds: Range, *, whole: bool) -> No
     if not bounds[0] <= low <= high <= bounds[1]:
         raise UsageError(f"{what} is [{low}, {high}]; expected low <= high within {bounds[0]} to {bounds[1]}")
     if whole and (low % 1 or high % 1):
-        raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers of control steps")
+        raise UsageError(f"{what} is [{low}, {high}]; expected whole numbers")
 
 
 def _overlap(name: str, asked: Range, sizes: Range) -> Range:

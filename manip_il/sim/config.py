@@ -101,7 +101,7 @@ def scene_name(robot: str, task: str) -> str:
     return f"{Path(robot).stem}_{task}"
 
 
-CAMERAS = ("front", "wrist")
+CAMERAS = ("front", "side", "wrist")
 MIN_SIDE, MAX_SIDE = 16, 2048  # of a picture [pixels]
 _BRIGHTNESS = (0.1, 2.0)
 

@@ -141,6 +141,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._events = Events.of(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
         self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
+        self._pictured: deque[dict[str, Picture]] = deque(maxlen=int(drawn.number("picture_delay")) + 1)
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
@@ -210,8 +211,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         It has pictures only where the environment has cameras.
         """
         world, images = self._measured(), self._pictures(self._view) if self._view else {}
+        self._pictured.append(images)
         text = self.task_description
-        self._observed.append(Observation(joint_state(world), environment_state(world), images, text))
+        self._observed.append(Observation(joint_state(world), environment_state(world), self._pictured[0], text))
         return self._observed[0]
 
     def _measured(self) -> World:

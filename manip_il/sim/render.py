@@ -15,6 +15,7 @@ from manip_il.errors import RenderError
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.gl import PACKAGES
+from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.view import ViewModel
 
@@ -89,7 +90,8 @@ class _Renderer:
     def __init__(self, robot: str, task: str, look: Look, shape: str):
         self._view = ViewModel(robot, task, look, shape)
         self._model = self._view.model
-        self._data = mujoco.MjData(self._model)
+        self._data, self._props = mujoco.MjData(self._model), list[Prop]()
+        self._of = build_scene(robot, task, shape)
         self._scene: Any = mujoco.MjvScene(self._model, _MAX_GEOMS)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
@@ -105,6 +107,7 @@ class _Renderer:
         self._data.qpos[:], self._data.mocap_pos[:] = data.qpos, data.mocap_pos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
+        self._props = props(self._of, self._data, drawn.values.get("clutter", (0, 0)))
 
     def picture(self, camera: str | Overview, size: tuple[int, int], lines: Sequence[Line] = ()) -> Picture:
         height, width = (_FINER * side for side in size)
@@ -114,6 +117,8 @@ class _Renderer:
             seen_by.fixedcamid = self._cameras[camera]
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, seen_by, everything, self._scene)
+        for prop in self._props:
+            prop.add_to(self._scene)
         for line in lines:
             _add_line(self._scene, line)
         fine = np.empty((height, width, 3), dtype=np.uint8)

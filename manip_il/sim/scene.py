@@ -34,7 +34,10 @@ _TABLE_BEYOND = 0.08  # of the table's middle from the workspace's, away from th
 _FLOOR = -0.4  # [m]
 SCENES_KEPT = 8  # compiled, a process: the finest meshes take 64 MB
 _TURN, _SPARE_TURN = 0.1, 0.1  # of the last joint, to see which way it turns the hand; kept from its limits [rad]
-SEEN = 0.15  # half the width of a workspace that the front camera sees from its usual distance [m]
+SEEN, SEEN_HEIGHT = 0.15, 0.45  # half the width, and the height, of a workspace that cameras see from these places [m]
+# From the workspace's middle on the table; they look at a point over that, and see so many degrees up and down.
+_CAMERAS = {"front": (0.80, -0.15, 0.55), "side": (-0.05, -0.80, 0.50)}  # [m]
+_LOOK_AT, _FIELD = 0.17, 42.0  # [m], [deg]
 _ON_TABLE = 0.02  # of a robot's lowest point from the table's top: it stands there [m]
 _PEDESTAL = 0.13  # half its width [m]
 _SHADOW_SIZE = 1024  # the shadow map is what costs on a software renderer
@@ -79,7 +82,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
         add_wrist_camera(arm, arm_alone, robot)
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
-    _add_front_camera(spec, robot)
+    _add_cameras(spec, robot)
     task.build(spec)
     return spec
 
@@ -250,14 +253,15 @@ def _corner_lows(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArr
     return np.append((placed.max(axis=0) + placed.min(axis=0))[:2] / 2, placed[:, 2].min())
 
 
-def _add_front_camera(spec: mujoco.MjSpec, robot: Robot) -> None:
-    x, y = robot.workspace.centre
-    scale = robot.workspace.half_width / SEEN
-    eye, at = (x + 0.85 * scale, y - 0.72 * scale, 0.66 * scale), (x - 0.10 * scale, y, 0.20 * scale)
-    back = np.subtract(eye, at)
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right = right / np.linalg.norm(right)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
-    spec.worldbody.add_camera(name="front", pos=eye, quat=quat, fovy=45)
+def _add_cameras(spec: mujoco.MjSpec, robot: Robot) -> None:
+    space = robot.workspace
+    scale = max(space.half_width / SEEN, space.height / SEEN_HEIGHT)
+    middle, at = np.array([*space.centre, 0.0]), np.array([*space.centre, _LOOK_AT * scale])
+    for name, way in _CAMERAS.items():
+        eye = middle + scale * np.array(way)
+        back = (eye - at) / np.linalg.norm(eye - at)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right = right / np.linalg.norm(right)
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).flatten())
+        spec.worldbody.add_camera(name=name, pos=eye, quat=quat, fovy=_FIELD)

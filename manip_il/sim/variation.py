@@ -38,13 +38,18 @@ _WORLD: dict[str, tuple[float, ...]] = {  # behind the objects' numbers: what it
     "table": (_OWN,) * 3,
     "brightness": (1.0,),
     "light_turn": (0.0,),
-    "camera_shift": (0.0,) * 3 * len(CAMERAS),
-    "camera_turn": (0.0,) * 3 * len(CAMERAS),
+    **{f"{moved}.{camera}": (0.0,) * 3 for moved in ("camera_shift", "camera_turn") for camera in ("front", "wrist")},
+    # States that were recorded before there was a side camera end here.
+    "camera_shift.side": (0.0,) * 3,
+    "camera_turn.side": (0.0,) * 3,
+    "clutter": (0.0, 0.0),  # how many things, and the seed of what they are and where
 }
 _STARTS = np.cumsum([0, *map(len, _WORLD.values())]).tolist()
 _PLACES = {name: slice(*ends) for name, *ends in zip(_WORLD, _STARTS[:-1], _STARTS[1:], strict=True)}
 NOTHING_DRAWN = np.concatenate(list(_WORLD.values()))  # of the world, (w,)
 WORLD_SIZE = len(NOTHING_DRAWN)
+# How many numbers less older states have: before there was a side camera, and before anything but objects was drawn.
+OLDER = (WORLD_SIZE - _PLACES["camera_shift.side"].start, WORLD_SIZE)
 _NOT_PHYSICS = WORLD_SIZE - _PLACES["posture"].start  # how the episode began, and how it looks
 
 
@@ -71,11 +76,11 @@ def nominal(model: mujoco.MjModel, objects: Mapping[str, Object]) -> F64:
 def completed(variation: F64, like: F64) -> F64:
     """Return a variation (v,) as it is now. like: the scene's own, (v,).
 
-    States that were recorded before had the objects' numbers alone; nothing else was drawn, or only the data's
+    States that were recorded before lack numbers at the end; nothing of that was drawn, or only the data's
     provenance says so. Raises `MismatchError` for a variation of another length.
     """
-    if len(variation) == len(like) - WORLD_SIZE:
-        return np.concatenate([variation, NOTHING_DRAWN])
+    if (lacks := len(like) - len(variation)) in OLDER:
+        return np.concatenate([variation, NOTHING_DRAWN[-lacks:]])
     if variation.shape != like.shape:
         raise MismatchError("size of the variation", "the state", len(variation), "the scene", len(like))
     return variation
@@ -105,8 +110,9 @@ def with_drawn(base: F64, drawn: Mapping[str, Any]) -> F64:
     split = len(base) - WORLD_SIZE
     world = base[split:].copy()
     for name, place in _PLACES.items():
-        if name in drawn:
-            world[place] = _numbers(drawn[name])
+        value = _value(name, drawn)
+        if value is not None:
+            world[place] = float(GEOMS[value]) if isinstance(value, str) else value
     return np.concatenate([_objects_with(base[:split], drawn), world])
 
 
@@ -126,18 +132,19 @@ def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
         value, nothing = variation[split:][place].tolist(), _WORLD[name]
         if tuple(value) == nothing or name == "shape":
             continue
-        if name.startswith("camera"):
-            found[name] = {camera: value[3 * at : 3 * at + 3] for at, camera in enumerate(CAMERAS)}
+        what, _, camera = name.partition(".")
+        if camera:
+            found.setdefault(what, {one: [0.0] * 3 for one in CAMERAS})[camera] = value
         else:
             found[name] = value if len(value) > 1 else value[0]
     return found
 
 
-def _numbers(value: Any) -> Any:
-    """Numbers that a state holds of a drawn value."""
-    if isinstance(value, str):
-        return float(GEOMS[value])
-    return np.concatenate([value[camera] for camera in CAMERAS]) if isinstance(value, Mapping) else value
+def _value(name: str, drawn: Mapping[str, Any]) -> Any:
+    """What is drawn by the name of a state's numbers, of a camera where that names one; None for nothing."""
+    what, _, camera = name.partition(".")
+    value = drawn.get(what)
+    return value.get(camera) if camera and value is not None else value
 
 
 def resized(size: F64, drawn: Mapping[str, Any]) -> F64:

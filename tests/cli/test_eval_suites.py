@@ -45,7 +45,7 @@ def test_the_shipped_suites_are_sound_and_all_is_all_of_them():
     [knocked] = suite_conditions("knocked", "pick_place", sees=False)
     assert knocked.ranges == STANDARD.ranges  # the disturbance that DAgger collects under
     names = [one.name for one in suite_conditions("all", "pick_place", sees=True)]
-    assert names == ["nominal", "knocked", "sensing", "object", "view", "dynamics"]
+    assert names == ["nominal", "knocked", "sensing", "late", "object", "view", "clutter", "dynamics"]
     blind = ["nominal", "knocked", "sensing", "object", "dynamics"]
     assert [one.name for one in suite_conditions("all", "pick_place", sees=False)] == blind
     assert [one.name for one in suite_conditions("all", "reach", sees=False)] == [*blind[:3], "dynamics"]

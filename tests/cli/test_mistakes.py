@@ -128,10 +128,13 @@ def test_resume_with_nothing_to_resume_is_refused_before_anything_heavy_is_impor
     commands = ["train --dataset.root=SAMPLE", "dagger", "eval --policy.type=expert", f"compare {ROOT} {SAMPLE}"]
     commands += [f"study {ROOT / 'pyproject.toml'}", "quickstart"]
     cases = {f"{command} --resume=true --output_dir=new": nothing for command in commands}
-    mistakes(cases | {"record --resume=true --dataset.root=new": f"{nothing}.journals"}, tmp_path)
+    journals = f"{nothing}.journals"
+    cases |= {"record --resume=true --dataset.root=new": journals, "redraw SAMPLE new --resume=true": journals}
+    mistakes(cases, tmp_path)
     assert {name for name in COMMANDS if any(option.name == "resume" for option in options_of(load(name)))} == {
         *(command.split()[0] for command in commands),
         "record",
+        "redraw",
     }
 
 
@@ -142,14 +145,19 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             "record --robot.type=pandas": "unknown robot 'pandas' (did you mean 'panda'?); known: fetch, panda",
             "record --task.type=pick": "did you mean 'pick_place'?",
             "record --num_episodes=3": "did you mean '--dataset.num_episodes'?",
-            "record --cameras=front,wirst": "unknown camera 'wirst' (did you mean 'wrist'?); known: front, wrist",
+            "record --cameras=front,wirst": "unknown camera 'wirst' (did you mean 'wrist'?); known: front, side, wrist",
             "record --cameras=front --image.height=127": "pictures of height 127 and width 128; expected even numbers",
             "record --cameras=front --dataset.rgb_encoder.vcodec=h265": "did you mean 'h264'?",
             "record --cameras=front --dataset.rgb_encoder.preset=99": "preset",
             "record --engine=rai": "did you mean 'ray'?",
             "record --dataset.num_episodes=0": "expected at least 1",
             "record --dataset.repo_id=name": "expected USER/NAME",
-            "render SAMPLE x --cameras=": "--cameras names none; expected front, wrist or both",
+            "render SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
+            "redraw SAMPLE x --cameras=": "--cameras names none; expected any of front, side, wrist",
+            "redraw SAMPLE x --frames=0": "--frames is 0; expected at least 1",
+            "redraw SAMPLE x --branch_steps=0": "--branch_steps is 0; expected at least 1",
+            "redraw nowhere x": "nowhere does not exist; expected the folder of a LeRobot dataset",
+            "redraw SAMPLE SAMPLE": "overlaps SOURCE",
             "render SAMPLE x --look.brightness=9": "brightness is 9.0; expected a factor from 0.1 to 2.0",
             f"{train} --policy.type=atc": "unknown policy 'atc' (did you mean 'act'?)",
             f"{train} --policy.type=mpl": "did you mean 'mlp'?",

@@ -123,7 +123,7 @@ def test_pictures_that_no_environment_has_are_refused(seeing, tmp_path):
         edit_config(folder, input_features=features | visual)
 
     for pictures, kind, words in (
-        ({"top": [3, 32, 32]}, MismatchError, r"cameras .*top, the environment has front, wrist"),
+        ({"top": [3, 32, 32]}, MismatchError, r"cameras .*top, the environment has front, side, wrist"),
         ({"front": [3, 32, 32], "wrist": [3, 64, 64]}, MismatchError, "one size for all"),
         ({"front": [3, 33, 32]}, ManipError, "height 33"),
     ):

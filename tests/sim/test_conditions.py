@@ -123,7 +123,7 @@ def test_a_condition_is_its_json_again():
         ({"mass": [0.1, 0.2, 0.3]}, "expected a number, or [low, high]"),
         ({"mass": "heavy"}, "expected a number, or [low, high]"),
         ({"mass": True}, "expected a number, or [low, high]"),
-        ({"delay": [0, 1.5]}, "whole numbers of control steps"),
+        ({"delay": [0, 1.5]}, "expected whole numbers"),
         ({"action_noise": -0.1}, "action_noise is [-0.1, -0.1]; expected low <= high within 0 to 1"),
         ({"action_noise": [0.1, 1.5]}, "action_noise is [0.1, 1.5]; expected low <= high within 0 to 1"),
     ],

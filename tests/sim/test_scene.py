@@ -86,5 +86,5 @@ def test_a_pedestal_stands_on_the_floor_and_reaches_to_the_robot(robot: str):
 
 
 def test_an_unknown_camera_names_those_there_are():
-    with pytest.raises(UnknownName, match=r"did you mean 'wrist'.*known: front, wrist"):
+    with pytest.raises(UnknownName, match=r"did you mean 'wrist'.*known: front, side, wrist"):
         camera_id(build_scene("panda", "reach").model, "writs")

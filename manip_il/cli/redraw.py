@@ -1,0 +1,152 @@
+"""`manip-il redraw`: new scenes of the states that a dataset or a DAgger run visited, labelled and pictured."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import MISSING, asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from manip_il.cli import common_options as common
+from manip_il.cli.inputs import require_dataset
+from manip_il.cli.outputs import check_output, check_same_options, prepare_output, require_output, save_options
+from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.record import OwnRobotGroup
+from manip_il.cli.trials import varied
+from manip_il.data.atomic import exclusive
+from manip_il.errors import UsageError
+from manip_il.option import option
+from manip_il.sim.config import CAMERAS
+
+if TYPE_CHECKING:
+    from manip_il.engine.redraw import RedrawJob
+    from manip_il.engine.render import Source
+
+SIDE = 96  # of a picture that a policy learns from [pixels]
+_RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
+
+
+@dataclass
+class SmallImageGroup(common.ImageGroup):
+    """`--image.*`: the pictures of every camera."""
+
+    height: int = option(SIDE, "of a picture [pixels]")
+    width: int = option(SIDE, "of a picture [pixels]")
+
+
+@dataclass
+class RedrawOptions:
+    """Draw goals, untouched objects and looks anew in the states that were visited; the expert labels, cameras see.
+
+    TARGET is a LeRobot dataset to train policies on pictures from, each frame an episode of its own. Scenes without a
+    sound label are left out. A killed redraw goes on where it was.
+    """
+
+    example: ClassVar[str] = "manip-il redraw runs/dagger datasets/redrawn --frames=20000"
+    source: Path = option(MISSING, "a dataset of this program, or the folder of a DAgger run", positional=True)
+    target: Path = option(MISSING, "folder of the new dataset", positional=True)
+    frames: int = option(20_000, "scenes to draw")
+    scenes: bool = option(True, "draw goals and objects anew; false: states as they were visited")
+    branch_steps: int = option(1, "control steps that the expert drives on from every scene, for act and diffusion")
+    robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)
+    cameras: list[str] = option(lambda: list(CAMERAS), "any of front, side, wrist")
+    image: SmallImageGroup = field(default_factory=SmallImageGroup)
+    vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
+    seed: int = common.seed_option()
+    engine: Literal["local", "ray"] = common.engine_option()
+    workers: int | None = common.workers_option()
+    resume: bool = option(False, "continue a redraw, or add more frames")
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        if self.frames < 1:
+            raise UsageError(f"--frames is {self.frames}; expected at least 1")
+        if self.branch_steps < 1:
+            raise UsageError(f"--branch_steps is {self.branch_steps}; expected at least 1")
+        common.require_workers(self.workers)
+        source, target = self._dataset().resolve(), self.target.resolve()
+        if source.is_relative_to(target) or target.is_relative_to(source):
+            raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")
+        check_output(self.target, resume=self.resume, overwrite=self.overwrite)
+        if not self.target.is_dir():
+            require_output(self._journals(), "redraw", resume=self.resume, overwrite=self.overwrite)
+        if self.image.config(self.cameras) is None:
+            raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
+
+    def run(self) -> None:
+        """Redraw; TARGET appears when all frames are there."""
+        from manip_il.engine.render import open_source
+
+        source = open_source(self._dataset(), self.robot.type)
+        warn(source.warnings)
+        with exclusive(self.target):
+            journals = self._journals()
+            prepare_output(self.target, resume=self.resume, overwrite=self.overwrite)
+            prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
+            if self.resume:
+                check_same_options(journals, self, ("workers", "engine"))
+                if self.target.is_dir() and not journals.is_dir():
+                    say(f"{self.target} is complete already")
+                    return
+            save_options(journals, self)
+            self._redraw(source, journals)
+            shutil.rmtree(journals)
+        say(f"next: manip-il train --dataset.root={self.target} --policy.type=cnn --output_dir=runs/{self.target.name}")
+
+    def _dataset(self) -> Path:
+        root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
+        require_dataset(root)
+        return root
+
+    def _journals(self) -> Path:
+        return self.target.with_name(f"{self.target.name}.journals")
+
+    def _job(self, source: Source) -> RedrawJob:
+        from manip_il.engine.redraw import RedrawJob
+
+        cameras = self.image.config(self.cameras)
+        assert cameras is not None
+        conditions = varied(self.vary, source.env, sees=True)
+        return RedrawJob(
+            source.env,
+            cameras,
+            self._journals(),
+            self.frames,
+            self.seed,
+            self.scenes,
+            conditions,
+            self.branch_steps,
+        )
+
+    def _redraw(self, source: Source, journals: Path) -> None:
+        from manip_il.data.build import Recording, local_id
+        from manip_il.engine.engine import Engine
+        from manip_il.engine.redraw import STATES, write_states
+        from manip_il.recording import check_journals, collect, record
+
+        job = self._job(source)
+        warn(check_journals(journals, job))
+        if not (journals / STATES).is_file():
+            write_states(source.root, journals, self.seed)
+        recording = Recording(
+            local_id(self.target.name), only_labelled=True, provenance=_provenance(source, job), stills=True
+        )
+        asked = self.frames * self.branch_steps
+        with progress(asked, f"redraw {source.root}") as bar, Engine(self.workers, self.engine) as engine:
+            episodes = collect(engine, job, job.seeds, journals, lambda episode: bar.advance(len(episode)))
+            info, _ = record(episodes, journals, self.target, job, recording, replace=self.overwrite)
+        left = self.frames - info.episodes
+        what = f"{', '.join(job.cameras.names)}, {job.cameras.height} x {job.cameras.width} pixels"
+        say(
+            f"redrew {info.episodes:,} scenes, {info.frames:,} frames: {what}; {left:,} left out, without a sound label"
+        )
+        say(f"dataset: {self.target}")
+
+
+def _provenance(source: Source, job: RedrawJob) -> dict[str, Any]:
+    from manip_il.data.build import dataset_sha256
+
+    drawn = {"scenes": job.scenes, "branch_steps": job.branch_steps, "cameras": asdict(job.cameras)}
+    vary = {"vary": [condition.to_json() for condition in job.conditions]} if job.conditions else {}
+    return {"redrawn": {"from": source.root.name, "sha256": dataset_sha256(source.root), **drawn, **vary}}

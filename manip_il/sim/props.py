@@ -1,0 +1,110 @@
+"""Things that are only seen, and touch nothing: a pole under a goal in the air, and clutter around the workspace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.seeding import rng_for
+from manip_il.sim.world import GOAL, Scene
+
+F64 = NDArray[np.float64]
+_POLE, _SHORTEST = 0.003, 0.03  # radius of a pole, and the height of a goal that needs one [m]
+_POLE_COLOUR = (0.10, 0.55, 0.28, 1.0)
+_KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
+_HALF = (0.012, 0.04)  # of a thing's lengths [m], where the workspace is as large as Panda's
+_USUAL = 0.15  # half the width of that [m]
+_BESIDE, _WITHIN = 0.06, 0.24  # of clutter from the workspace's edge, least and most [m]
+_FROM_BASE = 0.18  # of clutter from the robot's first joint, sideways [m]
+_DRAWS = 50  # of a place for one thing, before it is left out
+
+
+class Prop(NamedTuple):
+    """A thing to draw: MuJoCo's geom type and size (3,), its place (3,) [m], axes (3, 3), red, green, blue, opacity."""
+
+    kind: int
+    size: F64
+    position: F64
+    rotation: F64
+    colour: tuple[float, float, float, float]
+
+    def add_to(self, scene: Any) -> None:
+        """Add it to the geoms that MuJoCo draws next."""
+        geom, colour = scene.geoms[scene.ngeom], np.array(self.colour, np.float32)
+        mujoco.mjv_initGeom(geom, self.kind, self.size, self.position, self.rotation.ravel(), colour)
+        geom.category = mujoco.mjtCatBit.mjCAT_STATIC
+        scene.ngeom += 1
+
+
+def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] = (0, 0)) -> list[Prop]:
+    """Return what is only seen of a scene's world. clutter: how many things, and the seed of what they are and where.
+
+    Poses of mocap bodies and joints in `data` must be up to date.
+    """
+    return [*_pole(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
+
+
+def _pole(scene: Scene, data: mujoco.MjData) -> list[Prop]:
+    """From the table to a goal in the air: what shows its height, and where it is, from any side."""
+    body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
+    if body < 0:
+        return []
+    x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
+    if z < _SHORTEST:
+        return []
+    kind, radius = int(mujoco.mjtGeom.mjGEOM_CYLINDER), _POLE * scene.robot.workspace.half_width / _USUAL
+    return [Prop(kind, np.array([radius, z / 2, 0.0]), np.array([x, y, z / 2]), np.eye(3), _POLE_COLOUR)]
+
+
+def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
+    rng, taken = rng_for(seed, "clutter"), _furniture(scene, data)
+    found: list[Prop] = []
+    for _ in range(count):
+        prop, radius, height = _thing(rng, scene)
+        for _ in range(_DRAWS):
+            at = _place(rng, scene, data)
+            if at is not None and all(math.dist(at, (x, y)) > radius + r for x, y, r in taken):
+                taken.append((*at, radius))
+                found.append(prop._replace(position=np.array([*at, height])))
+                break
+    return found
+
+
+def _thing(rng: np.random.Generator, scene: Scene) -> tuple[Prop, float, float]:
+    """A box, cylinder or ball of any colour, turned about the vertical; its radius from above, half its height [m]."""
+    kind = int(_KINDS[int(rng.integers(len(_KINDS)))])
+    x, y, z = (rng.uniform(*_HALF, 3) * min(1.0, scene.robot.workspace.half_width / _USUAL)).tolist()
+    size, radius, height = {
+        int(mujoco.mjtGeom.mjGEOM_BOX): ((x, y, z), math.hypot(x, y), z),
+        int(mujoco.mjtGeom.mjGEOM_CYLINDER): ((x, z, 0.0), x, z),
+        int(mujoco.mjtGeom.mjGEOM_SPHERE): ((x, 0.0, 0.0), x, x),
+    }[kind]
+    yaw, (red, green, blue) = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 0.95, 3)
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    prop = Prop(kind, np.array(size), np.zeros(3), turn, (float(red), float(green), float(blue), 1.0))
+    return prop, radius, height
+
+
+def _place(rng: np.random.Generator, scene: Scene, data: mujoco.MjData) -> tuple[float, float] | None:
+    """A place on the table around the workspace, apart from the robot's base; None for one that is not."""
+    space = scene.robot.workspace
+    outer = space.half_width + _WITHIN
+    x, y = rng.uniform(-outer, outer, 2).tolist()
+    if max(abs(x), abs(y)) < space.half_width + _BESIDE:
+        return None
+    at = space.centre[0] + x, space.centre[1] + y
+    base = data.xanchor[scene.shoulder]
+    return at if math.dist(at, base[:2].tolist()) > _FROM_BASE else None
+
+
+def _furniture(scene: Scene, data: mujoco.MjData) -> list[tuple[float, float, float]]:
+    """Middle and radius [m] of everything of the task that stands fixed, from above."""
+    model = scene.model
+    fixed = [geom for geom in range(model.ngeom) if model.body_mocapid[model.body_rootid[model.geom_bodyid[geom]]] >= 0]
+    return [(*data.geom_xpos[geom][:2].tolist(), float(model.geom_rbound[geom])) for geom in fixed]
