@@ -38,13 +38,14 @@ class ParquetFiles:
         self._path = folder
         self._writer: pq.ParquetWriter | None = None
         self._waiting: list[pa.Table] = []
+        self._waiting_rows = self._waiting_bytes = 0
         self.rows = 0  # in the open file, waiting ones too
 
     @property
     def size(self) -> int:
         """Bytes in the open file; rows that wait count as they are in memory."""
         written = self._path.stat().st_size if self._writer else 0
-        return written + sum(table.nbytes for table in self._waiting)
+        return written + self._waiting_bytes
 
     @property
     def next_place(self) -> tuple[int, int]:
@@ -54,8 +55,10 @@ class ParquetFiles:
     def write(self, table: pa.Table) -> tuple[int, int]:
         """Append rows; return the chunk and file index that they go to."""
         self._waiting.append(table)
+        self._waiting_rows += len(table)
+        self._waiting_bytes += table.nbytes
         self.rows += len(table)
-        if sum(map(len, self._waiting)) >= self._group_rows:
+        if self._waiting_rows >= self._group_rows:
             self._flush()
         return self.next_place
 
@@ -71,6 +74,7 @@ class ParquetFiles:
 
     def _flush(self) -> None:
         table, self._waiting = pa.concat_tables(self._waiting).combine_chunks(), []
+        self._waiting_rows = self._waiting_bytes = 0
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
