@@ -36,9 +36,9 @@ def fit_round(
     fit, weights = round_fit(config, init_from, member), frame_weights(config, roots)
     if fit.is_mlp:
         return fit_table(config, read_tables(roots, LEARNING_COLUMNS), folder, fit, on_log, weights)
-    from manip_il.learn.fit_policy import PolicyTrainer  # torch stays out of what only rolls out
+    from manip_il.learn.fit_policy import begin_fit  # torch stays out of what only rolls out
 
-    trainer = PolicyTrainer(
+    with begin_fit(
         roots,
         fit,
         folder,
@@ -47,8 +47,8 @@ def fit_round(
         look=asdict(config.cameras.look) if config.cameras is not None else None,
         resume=True,
         weights=weights,
-    )
-    return trainer.fit(on_log)
+    ) as trainer:
+        return trainer.fit(on_log)
 
 
 def fit_table(

@@ -80,6 +80,7 @@ class RedrawOptions:
 
         source = open_source(self._dataset(), self.robot.type)
         warn(source.warnings)
+        job = self._job(source)
         with exclusive(self.target):
             journals = self._journals()
             prepare_output(self.target, resume=self.resume, overwrite=self.overwrite)
@@ -90,7 +91,7 @@ class RedrawOptions:
                     say(f"{self.target} is complete already")
                     return
             save_options(journals, self)
-            self._redraw(source, journals)
+            self._redraw(source, job)
             shutil.rmtree(journals)
         say(f"next: manip-il train --dataset.root={self.target} --policy.type=cnn --output_dir=runs/{self.target.name}")
 
@@ -119,13 +120,13 @@ class RedrawOptions:
             self.branch_steps,
         )
 
-    def _redraw(self, source: Source, journals: Path) -> None:
+    def _redraw(self, source: Source, job: RedrawJob) -> None:
         from manip_il.data.build import Recording, local_id
         from manip_il.engine.engine import Engine
         from manip_il.engine.redraw import STATES, write_states
         from manip_il.recording import check_journals, collect, record
 
-        job = self._job(source)
+        journals = self._journals()
         warn(check_journals(journals, job))
         if not (journals / STATES).is_file():
             write_states(source.root, journals, self.seed)

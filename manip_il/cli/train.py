@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # the learner takes a second to import
 
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
-    *("threads", "log_freq", "save_freq", "num_workers"),
+    *("threads", "processes", "log_freq", "save_freq", "num_workers"),
     *("dataset.root", "output_dir", "tensorboard", "wandb", "trust"),
 )
 
@@ -66,6 +66,7 @@ class TrainOptions:
     output_dir: Path = option(Path("runs/train"), "folder of the run")
     seed: int = option(0, "seed of weights and batches, 0 to 1000")
     threads: int = option_of(FitConfig, "threads")
+    processes: int = option_of(FitConfig, "processes")
     save_freq: int | None = option_of(FitConfig, "save_freq")
     log_freq: int = option_of(FitConfig, "log_freq")
     tensorboard: bool = option_of(FitConfig, "tensorboard")
@@ -156,21 +157,24 @@ class TrainOptions:
             )
 
     def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any], sources: Sources) -> Path:
-        from manip_il.learn.fit_policy import PolicyTrainer
+        from manip_il.learn.fit_policy import begin_fit
 
-        with self._decoding() as on_frames:
-            trainer = PolicyTrainer(
-                sources.roots,
-                config,
-                self.output_dir,
-                spec=spec,
-                fingerprint=fingerprint,
-                look=_look(sources.roots),
-                resume=self.resume,
-                sources=sources,
-                on_frames=on_frames,
-            )
-        with self._begin(config) as stages:
+        with contextlib.ExitStack() as stack:
+            with self._decoding() as on_frames:
+                trainer = stack.enter_context(
+                    begin_fit(
+                        sources.roots,
+                        config,
+                        self.output_dir,
+                        spec=spec,
+                        fingerprint=fingerprint,
+                        look=_look(sources.roots),
+                        resume=self.resume,
+                        sources=sources,
+                        on_frames=on_frames,
+                    )
+                )
+            stages = stack.enter_context(self._begin(config))
             kind, samples = trainer.lerobot.policy.type, len(trainer.samples.train)
             stages.start(f"train {kind} on {samples:,} samples", config.total_steps)
             return trainer.fit(stages.log)

@@ -28,7 +28,7 @@ MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
 STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
 # Where a policy's configuration is kept with what was meant for one machine or one command.
 NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
-_AT_LEAST_1 = ("steps", "batch_size", "threads", "log_freq", "save_freq")
+_AT_LEAST_1 = ("steps", "batch_size", "threads", "processes", "log_freq", "save_freq")
 _AT_LEAST_0 = ("num_workers", "image_cache_gb")
 _REGISTERED = re.compile(r"""@PreTrainedConfig\.register_subclass\(\s*["'](\w+)["']""")
 _BASE = "PreTrainedConfig"
@@ -77,6 +77,7 @@ class FitConfig:
     image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
     num_workers: int = option(4, "processes of LeRobot's loader")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
+    processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")
     save_freq: int | None = option(
         None, f"steps between checkpoints; by default {MLP_SAVE_FREQ:,} for mlp, else {SAVE_FREQ:,}"
     )
@@ -97,6 +98,12 @@ class FitConfig:
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
         check_names(self.policy)
+        if self.processes > 1 and self.is_mlp:
+            raise UsageError(f"processes is {self.processes}; the mlp is fitted by one")
+        if self.samples_per_step % self.processes:
+            raise UsageError(
+                f"batch_size is {self.samples_per_step}; expected a multiple of processes ({self.processes})"
+            )
         if self.action_space is not None and self.action_space not in ACTION_SPACES:
             raise UnknownName("action space", self.action_space, ACTION_SPACES)
         if "path" not in self.policy:

@@ -12,6 +12,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +43,12 @@ from manip_il.learn.checkpoint import (
     unpublished,
     write_own_files,
 )
-from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.fit_config import OWN_SPACE, FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.limits import threads
 from manip_il.learn.metrics import Writer, metric_writers
+from manip_il.learn.processes import sharing_batches
 from manip_il.learn.samples import Batch, load_samples
 from manip_il.learn.sources import Sources
 
@@ -60,7 +62,8 @@ class PolicyTrainer:
     spec, fingerprint, look: see `CheckpointMeta.of`. weights: how often each frame is drawn, relative to the others,
     (N,); by default each once an epoch, or as `sources`, the datasets of `root`, have it. on_frames: sees how many
     frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
-    resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step.
+    resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step; of
+    `config.processes`, each takes its share of them (`fit_policy`).
 
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `MismatchError` for a run that is resumed
     on other data or options, `NotFiniteError` for data that is not finite, and what the policy refuses as `ManipError`.
@@ -106,7 +109,7 @@ class PolicyTrainer:
         if checkpoint is not None:
             check_same_run(checkpoint, self.digest, self.options)
         self.pipeline = self.lerobot.pipeline(self.dataset.repo_id, str(roots[-1]), output_dir)
-        self.steps, self.batch_size = config.total_steps, config.samples_per_step
+        self.steps, self.batch_size = config.total_steps, config.samples_per_step // config.processes
         self.step = 0
         with threads(config.threads):
             self._build(checkpoint)
@@ -261,6 +264,21 @@ class PolicyTrainer:
         return float(self.optimizer.param_groups[0]["lr"])
 
 
+@contextlib.contextmanager
+def begin_fit(
+    root: Path | Sequence[Path], config: FitConfig, output_dir: Path, **settings: Any
+) -> Iterator[PolicyTrainer]:
+    """Give a `PolicyTrainer` of these arguments, with the other processes of `config`, if any, at work inside."""
+    silent = {name: value for name, value in settings.items() if name != "on_frames"}
+    others = partial(_fit, root, config, output_dir, silent)
+    with sharing_batches(config.processes, config.threads, others):
+        yield PolicyTrainer(root, config, output_dir, **settings)
+
+
+def _fit(root: Path | Sequence[Path], config: FitConfig, output_dir: Path, settings: dict[str, Any]) -> None:
+    PolicyTrainer(root, config, output_dir, **settings).fit()
+
+
 def _convert(dataset: Metadata, conversion: Conversion) -> None:
     """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
     table = read_tables(dataset.roots, [STATE, ACTION])
@@ -277,5 +295,5 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         cpu=policy.device == "cpu",
-        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=policy.type not in OWN_SPACE)],
     )

@@ -107,7 +107,7 @@ def test_lerobot_makes_it_from_a_dataset_without_a_look_at_the_truth(meta):
     assert list(policy.config.input_features or {}) == [
         "observation.state", "observation.images.front", "observation.images.wrist"
     ]  # fmt: skip
-    assert policy.model.input_mean.shape == (4 + 2 * 3 * 4,)
+    assert policy.model.input_mean.shape == (4 + 2 * 3 * 4 + 6,)  # joints, keypoints, and what is read off
     assert set(CNNConfig(**SMALL).normalization_mapping.values()) == {NormalizationMode.IDENTITY}
 
 
@@ -117,7 +117,7 @@ def test_statistics_are_those_of_the_valid_relative_targets(meta, table):
     relative = (table["action"][:, :-1] - table["observation.state"][:, :-1])[valid]
     np.testing.assert_allclose(policy.model.target_mean[:-1], relative.mean(0), atol=1e-6)
     np.testing.assert_allclose(policy.model.input_mean[:4], table["observation.state"][valid].mean(0), rtol=1e-5)
-    assert torch.equal(policy.model.input_scale[4:], torch.ones(24))  # keypoints have no units
+    assert torch.equal(policy.model.input_scale[4:], torch.ones(24 + 6))  # keypoints have no units
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -177,24 +177,23 @@ def test_learning_in_half_precision_is_near_the_same(meta, table):
     torch.testing.assert_close(half, exact, rtol=2e-2, atol=0.0)
 
 
-def test_the_truth_is_read_off_the_keypoints_while_training_only(meta, table):
+def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_only(meta, table):
     policy, batch = new_policy(meta, aux_weight=0.5), make_batch(table)
-    assert isinstance(policy.privileged, torch.nn.Linear)
-    assert policy.privileged.out_features == 6
-    plain = new_policy(meta, aux_weight=0.0)
-    assert plain.privileged is None
-    plain.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("privileged")})
+    assert new_policy(meta, aux_weight=0.0).privileged is None
+    unweighted = new_policy(meta, aux_weight=0.5)
+    unweighted.load_state_dict(policy.state_dict())
+    unweighted.aux_weight = 0.0
     valid = torch.from_numpy(table["label_valid"][:20, 0] != 0)
     truth = table["observation.environment_state"]
     used = truth[table["label_valid"][:, 0] != -1]
     scaled = (truth[:20] - used.mean(0)) / np.where(used.std(0) < 1e-4, np.inf, used.std(0))
     with torch.no_grad():
-        keypoints = policy._inputs(batch)[:, 4:]
-        error = (policy.privileged(keypoints) - torch.from_numpy(scaled)).abs().mean(-1) * valid
-    more = policy.forward(batch, "none")[0] - plain.forward(batch, "none")[0]
+        read_off = policy._inputs(batch)[:, -6:]
+        error = (read_off - torch.from_numpy(scaled)).abs().mean(-1) * valid
+    more = policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]
     torch.testing.assert_close(more, (0.5 * error).float(), rtol=1e-3, atol=1e-4)
     held_out = policy.eval().forward(batch, "none")[0]
-    assert torch.equal(held_out, plain.eval().forward(batch, "none")[0])
+    assert torch.equal(held_out, unweighted.eval().forward(batch, "none")[0])
 
 
 def test_truth_that_is_an_input_is_not_learnt(meta, table):

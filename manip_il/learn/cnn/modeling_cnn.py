@@ -72,6 +72,13 @@ class KeypointEncoder(nn.Module):
         return torch.cat([x, y, _SPREAD * spread, _STRENGTH * strength], dim=-1)
 
 
+def _perceptron(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for size in (inputs, *[width] * (depth - 1)):
+        layers += [nn.Linear(size, width), nn.SiLU()]
+    return nn.Sequential(*layers, nn.Linear(width, outputs))
+
+
 def _light_and_colour(pictures: Tensor) -> Tensor:
     """Mean of red, green and blue, and what red and green have more than that, (B, 3, H, W)."""
     light = pictures.mean(1, keepdim=True)
@@ -114,15 +121,31 @@ class CNNPolicy(MLPPolicy):
         self.encoders = nn.ModuleList(encoders)
         self.keypoint_size = sum(encoder.size for encoder in encoders)
         width = sum(features[key].shape[0] for key in self.inputs)
-        self.model = MLPNetwork(width + self.keypoint_size, features[STATE].shape[0], config.network_shape())
-        self.privileged = nn.Linear(self.keypoint_size, config.privileged_size) if config.privileged_size else None
-        self.aux_weight = config.aux_weight
+        self.seen_size, self.aux_weight = width + self.keypoint_size, config.aux_weight
+        self.privileged: nn.Module | None = None
+        self._read_off(config.privileged_size)
         self._privileged_by_index: Tensor | None = None
+
+    def _read_off(self, size: int) -> None:
+        """Make the perceptron that reads so many numbers off, and the one for the action, which gets them, too."""
+        config = cast(CNNConfig, self.config)
+        n = (config.input_features or {})[STATE].shape[0]
+        if size:
+            self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
+        self.model = MLPNetwork(self.seen_size + size, n, config.network_shape())
 
     @override
     def _inputs(self, batch: dict[str, Tensor]) -> Tensor:
         keypoints = [encoder(batch[key]) for encoder, key in zip(self.encoders, self.cameras, strict=True)]
-        return torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
+        seen = torch.cat([*(batch[key] for key in self.inputs), *keypoints], dim=-1)
+        if self.privileged is None:
+            return seen
+        with torch.autocast(seen.device.type, enabled=False):
+            width, config = self.seen_size, cast(CNNConfig, self.config)
+            encoded = ((seen - self.model.input_mean[:width]) * self.model.input_scale[:width]).clamp(
+                -config.clamp, config.clamp
+            )
+            return torch.cat([seen, self.privileged(encoded)], dim=-1)
 
     @override
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -132,20 +155,19 @@ class CNNPolicy(MLPPolicy):
             if not self.training or privileged is None or self.privileged is None or batch.get(INDEX) is None:
                 return losses
             truth = privileged.to(inputs.device)[batch[INDEX].reshape(-1)]
-            return losses + self.aux_weight * (self.privileged(inputs[:, -self.keypoint_size :]) - truth).abs().mean(-1)
+            return losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
 
     @override
     def _learn_columns(self, columns: Table, loss: str) -> None:
+        reads = self.aux_weight > 0 and ENVIRONMENT_STATE in columns and ENVIRONMENT_STATE not in self.inputs
+        size, config = columns[ENVIRONMENT_STATE].shape[1] if reads else 0, cast(CNNConfig, self.config)
+        if reads and not config.privileged_size:
+            config.privileged_size = size
+            self._read_off(size)
         super()._learn_columns(columns, loss)
-        if self.aux_weight <= 0 or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
-            return
-        values, index = columns[ENVIRONMENT_STATE], torch.from_numpy(columns[INDEX])
-        size = values.shape[1]
-        if self.privileged is None:
-            cast(CNNConfig, self.config).privileged_size = size
-            self.privileged = nn.Linear(self.keypoint_size, size)
-        if self.privileged.out_features != size:
+        if not reads or config.privileged_size != size:
             return  # a checkpoint from another task goes on without
+        values, index = columns[ENVIRONMENT_STATE], torch.from_numpy(columns[INDEX])
         statistics = fit_statistics(values, values, "mse")
         known = torch.zeros(int(index.max()) + 1, size)
         known[index] = (torch.from_numpy(values) - statistics.input_mean) * statistics.input_scale

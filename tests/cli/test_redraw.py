@@ -1,0 +1,113 @@
+"""`manip-il redraw`: a dataset to train from, the same after a kill, on two workers, and read by LeRobot."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.data.lerobot_library import lerobot_windows
+from manip_il.data.lerobot_read import dataset_info, read_provenance, read_spec, read_table
+
+from ..damage import digests
+from .made_runs import files
+
+SMALL = ("--frames=60", "--image.height=32", "--image.width=32", "--workers=1", "--quiet")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("demos") / "demos"
+    assert main(["record", f"--dataset.root={root}", "--dataset.num_episodes=3", "--workers=1"]) == 0
+    return root
+
+
+@pytest.fixture(scope="module")
+def redrawn(demos, tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("redrawn") / "new"
+    assert main(["redraw", str(demos), str(root), *SMALL]) == 0
+    return root
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
+    info, spec = dataset_info(redrawn), read_spec(redrawn)
+    assert info.episodes == info.frames == 60
+    assert (spec.cameras, spec.image_size, spec.video) == (("front", "side", "wrist"), (32, 32), False)
+    assert read_provenance(redrawn)["redrawn"]["from"] == "demos"
+    assert read_table(redrawn, ["label_valid"])["label_valid"].all()
+    assert not redrawn.with_name("new.journals").exists()
+    assert main(["doctor", str(redrawn)]) == 0
+    sample = lerobot_windows(redrawn, "local/new", None)[7]
+    assert sample["observation.images.side"].shape == (3, 32, 32)
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_two_workers_and_a_resumed_redraw_write_the_same_bytes(redrawn, demos, tmp_path, monkeypatch):
+    two = tmp_path / "new"
+    assert main(["redraw", str(demos), str(two), *SMALL[:3], "--workers=2", "--quiet"]) == 0
+    assert digests(two) == digests(redrawn)
+    shutil.rmtree(two)
+    killed: list[int] = []
+
+    def kill(path: Path, content: bytes) -> None:
+        if len(killed) == 2:
+            raise KeyboardInterrupt
+        killed.append(1)
+        path.write_bytes(content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("manip_il.data.journal.write_file", kill)
+        assert main(["redraw", str(demos), str(two), *SMALL]) != 0
+    kept = tmp_path / "new.journals"
+    assert not two.exists()
+    assert len(list(kept.glob("*.mcap"))) == 2
+    assert main(["redraw", str(demos), str(two), *SMALL, "--resume=true"]) == 0
+    assert digests(two) == digests(redrawn)
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
+    target = tmp_path / "branches"
+    words = ["--frames=6", "--branch_steps=4", *SMALL[1:]]
+    assert main(["redraw", str(demos), str(target), *words]) == 0
+    assert (dataset_info(target).episodes, dataset_info(target).frames) == (6, 24)
+    table = read_table(target, ["action", "executed_action"])
+    np.testing.assert_array_equal(table["action"], table["executed_action"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--cameras=front,top"], "unknown camera 'top'"),
+        (["--vary=view,nothing"], "nothing"),
+        (["--robot.type=fetch"], "robot"),
+    ],
+)
+def test_wrong_words_are_one_line_and_nothing_is_written(demos, words, message, tmp_path, capsys):
+    before = files(tmp_path)
+    assert main(["redraw", str(demos), str(tmp_path / "new"), *words]) in (1, 2)
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("lacks", ["sim_state", "scene"])
+def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
+    import json
+
+    other = tmp_path / "other"
+    shutil.copytree(demos, other)
+    ours = other / "meta" / "manip_il.json"
+    about = json.loads(ours.read_text())
+    about["spec"]["sim_state_size" if lacks == "sim_state" else "task"] = 7 if lacks == "sim_state" else "sculpt"
+    ours.write_text(json.dumps(about))
+    assert main(["redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
+    assert capsys.readouterr().err.count("\n") == 1

@@ -1,0 +1,99 @@
+"""Pictures that are PNGs in the data files come back bit for bit, by our readers and LeRobot's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from manip_il.data import schema as s
+from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_library import lerobot_windows
+from manip_il.data.lerobot_read import camera_keys, read_episodes, read_frames, read_spec
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.data.pictures import decode_picture, to_png
+from manip_il.errors import ManipError
+from manip_il.mdp import Episode
+
+FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
+
+
+@pytest.fixture(scope="module")
+def pictured(spec) -> s.RobotTaskSpec:
+    return replace(spec, cameras=("front", "side"), image_size=(32, 48), video=False)
+
+
+@pytest.fixture(scope="module")
+def seen(episodes) -> list[Episode]:
+    rng = np.random.default_rng(0)
+
+    def pictures(episode: Episode) -> dict[str, np.ndarray]:
+        return {key: rng.integers(0, 256, (len(episode), 32, 48, 3), np.uint8) for key in (FRONT, SIDE)}
+
+    return [replace(episode, columns=episode.columns | pictures(episode)) for episode in episodes]
+
+
+@pytest.fixture
+def root(tmp_path: Path, seen, pictured) -> Path:
+    write_dataset(seen, tmp_path / "stills", pictured, repo_id="local/stills", fingerprint={})
+    return tmp_path / "stills"
+
+
+def test_pictures_come_back_bit_for_bit(root, seen, pictured):
+    assert read_spec(root) == pictured
+    assert camera_keys(root) == [FRONT, SIDE]
+    assert not (root / "videos").exists()
+    for written, read in zip(seen, read_episodes(root), strict=True):
+        for key, column in read.columns.items():
+            np.testing.assert_array_equal(column.reshape(written.columns[key].shape), written.columns[key])
+    np.testing.assert_array_equal(read_frames(root, SIDE, 2), seen[2].columns[SIDE])
+    blind = next(read_episodes(root, pictures=False))
+    assert FRONT not in blind.columns
+
+
+def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):
+    frames = open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "cache")
+    assert frames is not None
+    whole = np.concatenate([episode.columns[FRONT] for episode in seen])
+    np.testing.assert_array_equal(frames[FRONT], whole.transpose(0, 3, 1, 2))
+    dataset = lerobot_windows(root, "local/stills", None)
+    picture = dataset[8][FRONT]
+    exact = picture if picture.dtype == torch.uint8 else (picture * 255).round()
+    np.testing.assert_array_equal(exact.numpy(), whole[8].transpose(2, 0, 1))
+
+
+def test_lerobots_own_description_is_enough(root, pictured):
+    (root / "meta" / "manip_il.json").unlink()
+    spec = read_spec(root)
+    assert (spec.cameras, spec.image_size, spec.video) == (pictured.cameras, pictured.image_size, False)
+
+
+def test_a_spec_says_video_only_where_there_is_none(pictured):
+    assert "video" not in replace(pictured, video=True).to_json()
+    assert s.RobotTaskSpec.from_json(pictured.to_json()) == pictured
+
+
+@pytest.mark.parametrize(("content", "words"), [(None, "not in the file"), (b"GIF89a", "not a PNG or JPEG")])
+def test_a_picture_that_is_none_is_refused(content: bytes | None, words: str):
+    with pytest.raises(ValueError, match=words):
+        decode_picture(content)
+
+
+def test_a_grey_picture_is_refused_and_one_in_colour_comes_back():
+    grey = to_png(np.zeros((4, 4), np.uint8))
+    with pytest.raises(ValueError, match="a picture of mode L; expected RGB"):
+        decode_picture(grey)
+    picture = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    np.testing.assert_array_equal(decode_picture(to_png(picture)), picture)
+
+
+def test_damage_is_one_line(root, monkeypatch):
+    def damaged(_: bytes | None) -> np.ndarray:
+        raise ValueError("it is not a PNG or JPEG")
+
+    monkeypatch.setattr("manip_il.data.lerobot_read.decode_picture", damaged)
+    with pytest.raises(ManipError, match=r"cannot read the pictures observation\.images\.front in .*stills: it is not"):
+        next(read_episodes(root))
