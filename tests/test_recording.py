@@ -13,8 +13,8 @@ from manip_il.data.build import Recording, build
 from manip_il.data.journal import list_episodes, read_episode, read_header
 from manip_il.data.lerobot_read import read_table
 from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.pool import Keep
+from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.pool import Job, Keep
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.recording import check_journals, collect, collect_successes, record
@@ -35,9 +35,9 @@ class Recorded(Engine):
         self.asked: list[int] = []
         self._failing = set(failing)
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
+    def run(self, job: Job, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
         self.asked += seeds
-        for episode in run_job(job, seeds):
+        for episode in job.run(seeds):
             if episode.seed in self._failing:
                 lost = episode.columns | {"next.success": np.zeros_like(episode.columns["next.success"])}
                 episode = Episode(episode.seed, lost, False, False)
@@ -102,7 +102,7 @@ def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
 class Shuffled(Recorded):
     """Episodes end in another order than their seeds'; the seed that kills its worker never ends."""
 
-    def run(self, job: RolloutJob, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
+    def run(self, job: Job, seeds: Sequence[int], keep: Keep | None = None) -> Iterator[Episode]:
         yield from super().run(job, [seed for seed in reversed(seeds) if seed != SEEDS[2]], keep)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,8 +43,8 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
     assert read_table(redrawn, ["label_valid"])["label_valid"].all()
     assert not redrawn.with_name("new.journals").exists()
     assert main(["doctor", str(redrawn)]) == 0
-    sample = lerobot_windows(redrawn, "local/new", None)[7]
-    assert sample["observation.images.side"].shape == (3, 32, 32)
+    dataset: Any = lerobot_windows(redrawn, "local/new", None)
+    assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
 
 
 @pytest.mark.gl

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):
     assert frames is not None
     whole = np.concatenate([episode.columns[FRONT] for episode in seen])
     np.testing.assert_array_equal(frames[FRONT], whole.transpose(0, 3, 1, 2))
-    dataset = lerobot_windows(root, "local/stills", None)
+    dataset: Any = lerobot_windows(root, "local/stills", None)
     picture = dataset[8][FRONT]
     exact = picture if picture.dtype == torch.uint8 else (picture * 255).round()
     np.testing.assert_array_equal(exact.numpy(), whole[8].transpose(2, 0, 1))
