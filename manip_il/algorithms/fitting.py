@@ -15,14 +15,14 @@ from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
 from manip_il.engine.environments import env_actions, env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
-from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.fit_config import LEROBOT, FitConfig
 from manip_il.seeding import stream_base
 
 F64 = NDArray[np.float64]
 COLUMNS = (ROUND, ACTOR, EXECUTED_ACTION, ACTION)  # what `Sampling.weights` reads
 Table = dict[str, NDArray[Any]]
 OnLog = Callable[[dict[str, Any]], None]
-CHUNK_STEPS = 20_000  # of a round, for policies other than the mlp, where none are given
+CHUNK_STEPS = 20_000  # of a round, for LeRobot's policies, where none are given
 
 
 def fit_round(
@@ -82,7 +82,7 @@ def round_fit(config: RunConfig, init_from: Path | None = None, member: int = 0)
 
     Any other starts from the run's start policy, where there is one.
     """
-    steps = config.fit.steps or (None if config.fit.is_mlp else CHUNK_STEPS)
+    steps = config.fit.steps or (CHUNK_STEPS if config.fit.defaults is LEROBOT else None)
     if init_from is not None:
         steps = config.refit_steps or steps
     seed = stream_base("training", config.seed) + member

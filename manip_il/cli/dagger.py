@@ -28,7 +28,7 @@ from manip_il.cli.parsing import from_yaml
 from manip_il.cli.progress import Stages, say
 from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
-from manip_il.learn.fit_config import MLP_STEPS, FitConfig, check_weights
+from manip_il.learn.fit_config import DEFAULTS, FitConfig, check_weights
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
 FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
+
+_OWN_STEPS = ", ".join(f"{numbers.steps:,} for {kind}" for kind, numbers in DEFAULTS.items())
+_STEPS_HELP = f"gradient steps per round; by default {_OWN_STEPS}, else 20,000"
 
 
 @dataclass
@@ -85,7 +88,7 @@ class DaggerOptions(common.EnvOptions):
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
     vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
-    steps: int | None = option(None, f"gradient steps per round; by default {MLP_STEPS:,} for mlp, else 20,000")
+    steps: int | None = option(None, _STEPS_HELP)
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
     batch_size: int | None = option_of(FitConfig, "batch_size")
     lr: float | None = option_of(FitConfig, "lr")

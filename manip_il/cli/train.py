@@ -60,7 +60,7 @@ class TrainOptions:
     lr: float | None = option_of(FitConfig, "lr")
     optimizer: Open = option_of(FitConfig, "optimizer")
     scheduler: Open = option_of(FitConfig, "scheduler")
-    image_augment: bool = option_of(FitConfig, "image_augment")
+    image_augment: bool | None = option_of(FitConfig, "image_augment")
     image_cache_gb: float = option_of(FitConfig, "image_cache_gb")
     num_workers: int = option_of(FitConfig, "num_workers")
     output_dir: Path = option(Path("runs/train"), "folder of the run")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from manip_il.checks import read_json
 from manip_il.errors import UnknownName, UsageError
@@ -24,8 +24,7 @@ JOINT_TARGET, JOINT_DELTA, EE_DELTA = ACTION_SPACES = ("joint_target", "joint_de
 OWN_SPACE = ("mlp", "cnn")  # policies that know their action space: joint_delta unless told otherwise
 CONVERTED = (*OWN_SPACE, "act", "diffusion", "vqbet")  # policies whose actions may be converted
 MLP = "mlp"  # the one policy with a loop of its own
-MLP_STEPS, MLP_BATCH_SIZE, MLP_LR, MLP_SAVE_FREQ = 3_000, 512, 2e-3, 1_000
-STEPS, BATCH_SIZE, SAVE_FREQ = 100_000, 8, 20_000  # LeRobot's defaults
+MLP_LR = 2e-3
 # Where a policy's configuration is kept with what was meant for one machine or one command.
 NOT_OURS = ("push_to_hub", "repo_id", "private", "pretrained_path", "pretrained_revision", "use_peft")
 _AT_LEAST_1 = ("steps", "batch_size", "threads", "processes", "log_freq", "save_freq")
@@ -33,6 +32,24 @@ _AT_LEAST_0 = ("num_workers", "image_cache_gb")
 _REGISTERED = re.compile(r"""@PreTrainedConfig\.register_subclass\(\s*["'](\w+)["']""")
 _BASE = "PreTrainedConfig"
 _FEW = 12  # names that one line of an error may list
+
+
+class Defaults(NamedTuple):
+    """Gradient steps, samples in the batch of one, steps from one checkpoint to the next."""
+
+    steps: int
+    batch_size: int
+    save_freq: int
+
+
+LEROBOT = Defaults(100_000, 8, 20_000)
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(10_000, 64, 1_000)}  # where they are not LeRobot's
+
+
+def _by_default(name: str) -> str:
+    """What a number is where it is not given, by the kind of the policy."""
+    own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
+    return f"by default {own}, else {getattr(LEROBOT, name):,}"
 
 
 @dataclass(frozen=True)
@@ -65,22 +82,20 @@ class FitConfig:
     observation: str | None = option(
         None, "what the policy observes besides its joints; by default images if the policy is cnn, else state"
     )
-    steps: int | None = option(None, f"gradient steps; by default {MLP_STEPS:,} for mlp, else {STEPS:,}")
-    batch_size: int | None = option(
-        None, f"frames per step (and process); by default {MLP_BATCH_SIZE} for mlp, else {BATCH_SIZE}"
-    )
+    steps: int | None = option(None, f"gradient steps; {_by_default('steps')}")
+    batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}")
     lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
     optimizer: Mapping[str, Any] = option(dict, "in place of the policy's own: type (adamw), ...")
     scheduler: Mapping[str, Any] = option(dict, "in place of the policy's own: type, ...")
     eval_split: float = option(0.05, "share of the episodes held out for val_loss")
-    image_augment: bool = option(True, "random crops and colour jitter of pictures while training")
+    image_augment: bool | None = option(
+        None, "random crops and colour jitter of pictures while training; by default for all but cnn"
+    )
     image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
     num_workers: int = option(4, "processes of LeRobot's loader")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")
-    save_freq: int | None = option(
-        None, f"steps between checkpoints; by default {MLP_SAVE_FREQ:,} for mlp, else {SAVE_FREQ:,}"
-    )
+    save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}")
     log_freq: int = option(200, "steps between metrics")
     tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
     wandb: Mapping[str, Any] = option(dict, "Weights & Biases: enable, project, mode, ...")
@@ -131,19 +146,29 @@ class FitConfig:
         return kind == "cnn"
 
     @property
+    def defaults(self) -> Defaults:
+        """Numbers that hold where none are given; LeRobot's for a policy to start from."""
+        return LEROBOT if "path" in self.policy else DEFAULTS.get(self.policy.get("type", MLP), LEROBOT)
+
+    @property
+    def augments(self) -> bool:
+        """Whether pictures are changed by chance; cropped ones do not show the cnn where things are."""
+        return self.policy.get("type") != "cnn" if self.image_augment is None else self.image_augment
+
+    @property
     def total_steps(self) -> int:
         """Gradient steps."""
-        return self.steps or (MLP_STEPS if self.is_mlp else STEPS)
+        return self.steps or self.defaults.steps
 
     @property
     def samples_per_step(self) -> int:
         """Samples in the batch of a step."""
-        return self.batch_size or (MLP_BATCH_SIZE if self.is_mlp else BATCH_SIZE)
+        return self.batch_size or self.defaults.batch_size
 
     @property
     def steps_per_checkpoint(self) -> int:
         """Steps from one checkpoint to the next."""
-        return self.save_freq or (MLP_SAVE_FREQ if self.is_mlp else SAVE_FREQ)
+        return self.save_freq or self.defaults.save_freq
 
     @property
     def peak_lr(self) -> float | None:

@@ -286,11 +286,16 @@ def _convert(dataset: Metadata, conversion: Conversion) -> None:
     learn_actions(dataset, conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
 
 
+def _on_this_cpu() -> str:
+    """Half precision where the processor has it, else single."""
+    return "bf16" if torch.ops.mkldnn._is_mkldnn_bf16_supported() else "no"  # pyright: ignore[reportPrivateUsage]
+
+
 def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     """As lerobot-train makes it: half precision by the policy's `dtype`, else by its `use_amp`."""
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
-        precision = "bf16" if policy.device == "cpu" else "fp16"
+        precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

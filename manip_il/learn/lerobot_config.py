@@ -228,7 +228,7 @@ class LeRobotFit:
             self.policy.pretrained_path = config.init_from
         self.observation = config.observation or ("images" if self.policy.type == "cnn" else "state")
         self.action_space = _action_space(self.policy, config, action_meaning)
-        self.augment = Augment() if config.image_augment else None
+        self.augment = Augment() if config.augments else None
         self.wandb: WandBConfig = _decode(WandBConfig, config.wandb, "--wandb")
         self._optimizer = choice(OptimizerConfig, config.optimizer, "optimizer") if config.optimizer else None
         self._scheduler = choice(LRSchedulerConfig, config.scheduler, "scheduler") if config.scheduler else None
