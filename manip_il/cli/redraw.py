@@ -76,6 +76,11 @@ class RedrawOptions:
 
     def run(self) -> None:
         """Redraw; TARGET appears when all frames are there."""
+        self.make()
+        say(f"next: manip-il train --dataset.root={self.target} --policy.type=cnn --output_dir=runs/{self.target.name}")
+
+    def make(self) -> None:
+        """Redraw, and say nothing of what comes next."""
         from manip_il.engine.render import open_source
 
         source = open_source(self._dataset(), self.robot.type)
@@ -93,7 +98,6 @@ class RedrawOptions:
             save_options(journals, self)
             self._redraw(source, job)
             shutil.rmtree(journals)
-        say(f"next: manip-il train --dataset.root={self.target} --policy.type=cnn --output_dir=runs/{self.target.name}")
 
     def _dataset(self) -> Path:
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source

@@ -14,7 +14,9 @@ from manip_il.cli.inputs import check_dataset, require_dataset, start_policy
 from manip_il.cli.options import Open
 from manip_il.cli.outputs import check_same_options, prepare_output, require_output, save_options
 from manip_il.cli.progress import Stages, progress, say, set_quiet, warn
+from manip_il.cli.redraw import RedrawOptions
 from manip_il.data.atomic import exclusive
+from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option, option_of
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:  # the learner takes a second to import
     from manip_il.learn.lerobot_config import LeRobotFit
     from manip_il.learn.sources import Sources
 
+RANK = "RANK"  # the variable by which processes that were started together know their place
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
     *("threads", "processes", "log_freq", "save_freq", "num_workers"),
@@ -52,6 +55,9 @@ class TrainOptions:
         "manip-il train --dataset.root=datasets/demos --policy.type=act --policy.chunk_size=16 --output_dir=runs/act"
     )
     dataset: SourceGroup
+    redraw: int = option(
+        0, "learn from so many scenes that are drawn anew from the dataset's states (manip-il redraw), for pictures"
+    )
     policy: Open = option_of(FitConfig, "policy")
     action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
@@ -81,6 +87,7 @@ class TrainOptions:
         check_weights(self.dataset.root, self.dataset.weights)
         for root in self.dataset.root:
             require_dataset(root)
+        self._check_redraw()
         if _is_first_process():
             require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
 
@@ -92,19 +99,48 @@ class TrainOptions:
             set_quiet(True)
         config = self._fit_config()
         lerobot = LeRobotFit(config)  # refuses what LeRobot would, before anything is written
-        spec, fingerprint, sources = self._read_sources(lerobot)
         with contextlib.ExitStack() as held:
-            if _is_first_process():
-                held.enter_context(exclusive(self.output_dir))
-                prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
-                if self.resume:
-                    check_same_options(self.output_dir, self, _FREE)
+            root = self._redrawn(held) if self.redraw else None
+            spec, fingerprint, sources = self._read_sources(lerobot, (root,) if root else tuple(self.dataset.root))
+            if root is None:
+                self._prepare(held)
             fit = self._fit_mlp if config.is_mlp else self._fit_policy
             path = fit(config, spec, fingerprint, sources)
         if _is_first_process():
             say(f"checkpoint: {path}")
             robot = common.own_robot(spec.robot, suffix=".yaml")
             say(f"next: manip-il eval --policy.path={path}{robot} --output_dir={self.output_dir}/eval")
+
+    def _prepare(self, held: contextlib.ExitStack) -> None:
+        """Hold the run's folder, emptied or with the run to resume."""
+        if _is_first_process():
+            held.enter_context(exclusive(self.output_dir))
+            prepare_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
+            if self.resume:
+                check_same_options(self.output_dir, self, _FREE)
+
+    def _check_redraw(self) -> None:
+        if self.redraw < 0:
+            raise UsageError(f"--redraw is {self.redraw}; expected the number of scenes")
+        if self.redraw and len(self.dataset.root) > 1:
+            raise UsageError("--redraw is for one dataset; redraw each by manip-il redraw, and give those")
+        if self.redraw and not self._fit_config().takes_images:
+            raise UsageError("--redraw is for policies on pictures; use --policy.type=cnn, or --observation=images")
+        if self.redraw and RANK in os.environ:
+            raise UsageError("--redraw is not for processes that were started together; redraw by manip-il redraw")
+
+    def _redrawn(self, held: contextlib.ExitStack) -> Path:
+        """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
+        from manip_il.engine.render import open_source
+
+        source, target = self.dataset.root[0], self.output_dir / "redrawn"
+        open_source(source)  # refuses one without states before anything is removed
+        self._prepare(held)
+        save_options(self.output_dir, self)
+        if not target.is_dir():
+            begun = target.with_name(f"{target.name}.journals").is_dir()
+            RedrawOptions(source, target, self.redraw, seed=self.seed, resume=begun).make()
+        return target
 
     def _fit_config(self) -> FitConfig:
         from manip_il.seeding import stream_base
@@ -114,13 +150,14 @@ class TrainOptions:
         policy, seed = start_policy(self.policy), stream_base("training", self.seed)
         return FitConfig(policy=policy, eval_split=self.dataset.eval_split, seed=seed, **same)
 
-    def _read_sources(self, lerobot: LeRobotFit) -> tuple[RobotTaskSpec, Mapping[str, Any], Sources]:
+    def _read_sources(
+        self, lerobot: LeRobotFit, roots: tuple[Path, ...]
+    ) -> tuple[RobotTaskSpec, Mapping[str, Any], Sources]:
         """Return spec and fingerprint of the first dataset, and all of them, which must agree with it."""
         from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_spec
         from manip_il.learn.pretrained import PLAIN
         from manip_il.learn.sources import Sources, check_same_sources
 
-        roots = tuple(self.dataset.root)
         specs, fingerprints = [read_spec(root) for root in roots], [read_fingerprint(root) for root in roots]
         pictures, language = lerobot.observation != "state", lerobot.policy.type not in PLAIN
         check_same_sources(roots, specs, pictures=pictures, language=language)
@@ -217,4 +254,4 @@ def _look(roots: Sequence[Path]) -> dict[str, Any] | None:
 
 def _is_first_process() -> bool:
     """Whether this is the one of several processes (`accelerate launch`, `torchrun`) that writes."""
-    return os.environ.get("RANK", "0") == "0"
+    return os.environ.get(RANK, "0") == "0"

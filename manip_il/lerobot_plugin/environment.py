@@ -21,7 +21,7 @@ from manip_il.errors import UnknownName, UsageError, shorten_ffmpeg_warning
 from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
-from manip_il.sim.config import CameraConfig
+from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.config import EnvConfig as SimConfig
 from manip_il.sim.env import environment_state_names
 from manip_il.sim.register import ENV_IDS, TASK_IDS, register_envs
@@ -53,7 +53,7 @@ class ManipILEnv(EnvConfig):
     robot: str = ""
     fps: int = option_of(SimConfig, "control_hz")
     observation: str = "state"
-    cameras: str = "front,wrist"
+    cameras: str = ",".join(CAMERAS)
     observation_height: int = option_of(CameraConfig, "height")
     observation_width: int = option_of(CameraConfig, "width")
     episode_length: int = option_of(SimConfig, "horizon")

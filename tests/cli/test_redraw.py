@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -102,8 +103,6 @@ def test_wrong_words_are_one_line_and_nothing_is_written(demos, words, message, 
 
 @pytest.mark.parametrize("lacks", ["sim_state", "scene"])
 def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
-    import json
-
     other = tmp_path / "other"
     shutil.copytree(demos, other)
     ours = other / "meta" / "manip_il.json"
@@ -112,3 +111,26 @@ def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
     ours.write_text(json.dumps(about))
     assert main(["redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_train_redraws_in_passing_and_goes_on_after_a_kill(demos, tmp_path, capsys):
+    run = tmp_path / "run"
+    words = ["train", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=30", "--steps=2"]
+    words += ["--batch_size=4", "--log_freq=1", f"--output_dir={run}", "--quiet"]
+    assert main(words) == 0
+    assert dataset_info(run / "redrawn").frames == 30
+    config = json.loads((run / "checkpoints/last/pretrained_model/config.json").read_text())
+    assert set(config["input_features"]) == {
+        "observation.state", "observation.images.front", "observation.images.side", "observation.images.wrist"
+    }  # fmt: skip
+    shutil.rmtree(run / "checkpoints")
+    before = digests(run / "redrawn")
+    assert main([*words, "--resume=true"]) == 0
+    assert digests(run / "redrawn") == before
+    capsys.readouterr()
+    assert main([*words[:2], "--redraw=30", f"--output_dir={tmp_path / 'mlp'}"]) == 2
+    assert "--redraw is for policies on pictures; use --policy.type=cnn" in capsys.readouterr().err
+    assert main([*words[:2], f"--dataset.root={demos},{run / 'redrawn'}", *words[2:]]) == 2
+    assert "--redraw is for one dataset" in capsys.readouterr().err

@@ -104,7 +104,7 @@ def test_the_plugin_brings_our_policies():
         ({"task": "PandaLift-v0", "robot": "fetch"}, UsageError, "--env.robot is 'fetch'.*is panda's"),
         ({"task": "Lift-v0", "robot": "fecth"}, UnknownName, "did you mean 'fetch'"),
         ({"observation": "picture"}, UnknownName, "known: both, images, state"),
-        ({"observation": "images", "cameras": "front, top"}, UnknownName, "unknown camera 'top'.*front, wrist"),
+        ({"observation": "images", "cameras": "front, top"}, UnknownName, "unknown camera 'top'.*front, side, wrist"),
         ({"observation": "both", "observation_width": 33}, UsageError, "width 33"),
         ({"render_mode": "human"}, UnknownName, "rgb_array"),
         ({"fps": 501}, UsageError, "expected 1 to 500"),
