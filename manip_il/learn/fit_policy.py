@@ -48,7 +48,7 @@ from manip_il.learn.lerobot_config import LeRobotFit, set_features
 from manip_il.learn.lerobot_policy import build_policy, build_processors
 from manip_il.learn.limits import threads
 from manip_il.learn.metrics import Writer, metric_writers
-from manip_il.learn.processes import sharing_batches
+from manip_il.learn.processes import forget_earlier_fits, sharing_batches
 from manip_il.learn.samples import Batch, load_samples
 from manip_il.learn.sources import Sources
 
@@ -296,6 +296,7 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     precision = _HALF_PRECISION.get(getattr(policy, "dtype", None) or "", "no")
     if not hasattr(policy, "dtype") and policy.use_amp:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
+    forget_earlier_fits()
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,

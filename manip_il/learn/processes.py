@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing import get_context
 
@@ -33,7 +34,8 @@ def sharing_batches(count: int, threads: int, work: Callable[[], object]) -> Ite
     port = {"MASTER_PORT": str(_free_port())}
     context = get_context("spawn")
     others = [context.Process(target=_serve, args=(place | port, work), daemon=True) for place in places[1:]]
-    with _environment(places[0] | port):
+    with _environment(places[0] | port), warnings.catch_warnings():
+        _ignore_strides()
         try:
             with bound_to_this_process():
                 for other in others:
@@ -85,12 +87,24 @@ def _serve(variables: Mapping[str, str], work: Callable[[], object]) -> None:
     os.environ.update(variables)
     initialize_worker()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _ignore_strides()
     with open(os.devnull, "w", encoding="utf-8") as nothing, contextlib.redirect_stdout(nothing):
         work()
 
 
+def _ignore_strides() -> None:
+    """Convolutions on a CPU give gradients whose channels come last: torch warns that it copies them."""
+    warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
+
+
 def _leave() -> None:
-    """Forget the others, so that the next fit may have none, or others."""
+    """Leave the others, so that the next fit may have none, or others."""
     if torch.distributed.is_initialized():
         torch.distributed.destroy_process_group()
-    AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]
+    forget_earlier_fits()
+
+
+def forget_earlier_fits() -> None:
+    """Let the next fit of this process choose its own precision: accelerate keeps that of the first."""
+    if not torch.distributed.is_initialized():
+        AcceleratorState._reset_state(reset_partial_state=True)  # pyright: ignore[reportPrivateUsage]

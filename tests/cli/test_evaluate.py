@@ -101,7 +101,7 @@ def feature(kind: str, *shape: int) -> dict[str, object]:
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.images.top": feature("VISUAL", 3, 32, 32)}},
             1,
-            "top, the environment has front, wrist",
+            "top, the environment has front, side, wrist",
         ),
         (
             {"input_features": {STATE: feature("STATE", 8), "observation.effort": feature("STATE", 8)}},

@@ -35,15 +35,17 @@ SMALL: Sizes = {  # put into every command that has the option
     "cases": 1,
     "workers": 1,
 }
-GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1}  # only where the line gives the option
+GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 30, "processes": 1}  # only where the line gives the option
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
     "robot check": {"episodes": 1},
+    "redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
     "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
 }
 OF_POLICY: dict[str, Sizes] = {
     "mlp": {"width": 16},
     "act": {"dim_model": 32, "n_heads": 2, "dim_feedforward": 32, "n_encoder_layers": 1},
+    "diffusion": {"down_dims": "[16,32]", "n_groups": 4},
 }
 LEROBOT: dict[str, Sizes] = {
     "lerobot-train": {

@@ -157,7 +157,7 @@ def test_the_metadata_name_every_number_with_its_unit(kind, tmp_path):
         "control_rate_hz": 20,
         "action_meaning": "joint position targets [rad], gripper opening command [m]",
         "policy_type": "cnn",
-        "policy_loss": "mse",
+        "policy_loss": "l1",
         "policy_sha256": "abc",
     }
     state, around, front, wrist = told["inputs"]
