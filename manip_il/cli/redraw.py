@@ -77,7 +77,8 @@ class RedrawOptions:
     def run(self) -> None:
         """Redraw; TARGET appears when all frames are there."""
         self.make()
-        say(f"next: manip-il train --dataset.root={self.target} --policy.type=cnn --output_dir=runs/{self.target.name}")
+        policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
+        say(f"next: manip-il train --dataset.root={self.target} --policy.type={policy} --output_dir=runs/{self.target.name}")
 
     def make(self) -> None:
         """Redraw, and say nothing of what comes next."""

@@ -35,7 +35,8 @@ SMALL: Sizes = {  # put into every command that has the option
     "cases": 1,
     "workers": 1,
 }
-GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 30, "processes": 1}  # only where the line gives the option
+# Only where the line gives the option.
+GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 30, "processes": 1}
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
     "robot check": {"episodes": 1},

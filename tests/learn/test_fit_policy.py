@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from accelerate.state import AcceleratorState
 from huggingface_hub import ModelCard
 
 from manip_il.cli.main import main
@@ -346,18 +345,8 @@ def test_a_step_that_its_checkpoint_names_is_not_run_on_resuming(demos, tmp_path
         fit(demos, tmp_path / "r", resume=True)
 
 
-@pytest.fixture
-def new_accelerator():
-    """Accelerate keeps one precision for all of a process."""
-    AcceleratorState._reset_state(True)
-    yield
-    AcceleratorState._reset_state(True)
-
-
-@pytest.mark.usefixtures("new_accelerator")
 def test_half_precision_trains_in_bfloat16_on_a_cpu(demos, tmp_path) -> None:
     path = fit(demos, tmp_path / "half", {**ACT, "use_amp": True})
-    AcceleratorState._reset_state(True)
     fit(demos, tmp_path / "full", ACT)
     assert saved(tmp_path / "half")["model.safetensors"] != saved(tmp_path / "full")["model.safetensors"]
     assert json.loads((path / "config.json").read_text())["use_amp"] is True
