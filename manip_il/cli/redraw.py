@@ -78,7 +78,8 @@ class RedrawOptions:
         """Redraw; TARGET appears when all frames are there."""
         self.make()
         policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
-        say(f"next: manip-il train --dataset.root={self.target} --policy.type={policy} --output_dir=runs/{self.target.name}")
+        train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
+        say(f"next: {train} --output_dir=runs/{self.target.name}")
 
     def make(self) -> None:
         """Redraw, and say nothing of what comes next."""
