@@ -75,14 +75,14 @@ class RedrawOptions:
             raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
 
     def run(self) -> None:
-        """Redraw; TARGET appears when all frames are there."""
+        """Draw all frames; TARGET appears when they are there."""
         self.make()
         policy = "cnn" if self.branch_steps == 1 else "act --observation=images"
         train = f"manip-il train --dataset.root={self.target} --policy.type={policy}"
         say(f"next: {train} --output_dir=runs/{self.target.name}")
 
     def make(self) -> None:
-        """Redraw, and say nothing of what comes next."""
+        """Draw all frames, and say nothing of what comes next."""
         from manip_il.engine.render import open_source
 
         source = open_source(self._dataset(), self.robot.type)

@@ -22,7 +22,7 @@ _HOST = "127.0.0.1"
 
 @contextlib.contextmanager
 def sharing_batches(count: int, threads: int, work: Callable[[], object]) -> Iterator[None]:
-    """Do `work` in `count` - 1 processes more, while this one does the same inside, as the first.
+    """Run `work` in `count` - 1 processes more, while this one does the same inside, as the first.
 
     threads: of torch, in each. Processes that somebody else has started are left alone. Raises `ManipError` where one
     dies.
