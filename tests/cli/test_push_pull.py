@@ -98,18 +98,18 @@ def test_a_hub_from_the_command_line(tmp_path, capsys):
 
     with a_hub(tmp_path / "hub") as hub:
         assert said("push", SAMPLE, DATASET, "--dry-run")[-1] == (
-            f"{DATASET}: 8 files, 589 kB, to upload; 0 to remove; 0 unchanged; nothing was done"
+            f"{DATASET}: 8 files, 590 kB, to upload; 0 to remove; 0 unchanged; nothing was done"
         )
         assert not hub.repos
         assert said("push", SAMPLE, DATASET, "--private") == [
-            f"{DATASET}: 8 files, 589 kB, uploaded; 0 removed; 0 unchanged",
+            f"{DATASET}: 8 files, 590 kB, uploaded; 0 removed; 0 unchanged",
             f"next: manip-il pull {DATASET} FOLDER",
         ]
         assert hub.repo("datasets/user/demos").private
         assert said("push", SAMPLE, f"{DATASET}@trial")[0] == f"{DATASET}@trial: 8 files, all there already"
         target = tmp_path / "got"
         assert said("pull", DATASET, target, "--revision=trial") == [
-            f"{target}: a dataset of 8 files, 589 kB, all verified",
+            f"{target}: a dataset of 8 files, 590 kB, all verified",
             f"next: manip-il doctor {target}",
         ]
         assert main(["pull", DATASET, str(tmp_path / "more"), "--revision=v9"]) == 1

@@ -118,9 +118,9 @@ def demos(here) -> Path:
 def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
     assert main(["render", "demos", "seen", "--workers=1", "--image.height=48", "--image.width=64"]) == 0
     said = capsys.readouterr()
-    assert "rendered 3 episodes, 18 frames: front, wrist, 48 x 64 pixels\ndataset: seen\n" in said.out
+    assert "rendered 3 episodes, 18 frames: front, side, wrist, 48 x 64 pixels\ndataset: seen\n" in said.out
     assert "render demos: 3/3" in said.err
-    assert read_spec(Path("seen")) == env_spec(ENV, CameraConfig(("front", "wrist"), 48, 64))
+    assert read_spec(Path("seen")) == env_spec(ENV, CameraConfig(("front", "side", "wrist"), 48, 64))
     np.testing.assert_array_equal(read_table(Path("seen"))["sim_state"], read_table(demos)["sim_state"])
 
 

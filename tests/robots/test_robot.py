@@ -248,7 +248,7 @@ def test_nothing_that_belongs_to_a_world_is_left_of_a_model(own: Robot):
 def test_a_scene_has_the_worlds_cameras_lamps_and_sky_alone(robot: str):
     scene = build_scene(robot, "reach")
     model = scene.model
-    assert sorted(model.camera(i).name for i in range(model.ncam)) == ["front", f"{PREFIX}wrist"]
+    assert sorted(model.camera(i).name for i in range(model.ncam)) == ["front", f"{PREFIX}wrist", "side"]
     assert all(model.light_bodyid == 0)
     assert model.nsensor == model.nkey == 0
     assert [model.body(i).name for i in range(model.nbody) if model.body_mocapid[i] >= 0] == ["goal"]
