@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from manip_il.data.build import Recording
+from manip_il.data.build import Recording, dataset_sha256, local_id
 from manip_il.data.episodes import Header
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import (
@@ -28,6 +29,7 @@ from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.pool import Job
+from manip_il.engine.redraw import STATES, RedrawJob, write_states
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 
@@ -129,6 +131,26 @@ def record(
         for episode in selection.take(collected.read(spec, fingerprint) for collected in episodes):
             writer.add(episode)
         return writer.finish(recording.provenance | selection.provenance), selection.failed
+
+
+def redraw(
+    engine: Engine, source: Path, job: RedrawJob, root: Path, on_episode: OnEpisode | None = None
+) -> DatasetInfo:
+    """Write the dataset of a job's scenes of a dataset's states; its journals, in `job.files`, go once it is whole.
+
+    A job that was killed goes on from them. Raises `NothingToLearnError` where no scene has a sound label.
+    """
+    for line in check_journals(job.files, job):
+        _LOG.warning("%s", line)
+    if not (job.files / STATES).is_file():
+        write_states(source, job.files, job.seed)
+    drawn = {"scenes": job.scenes, "branch_steps": job.branch_steps, "cameras": asdict(job.cameras)}
+    vary = {"vary": [condition.to_json() for condition in job.conditions]} if job.conditions else {}
+    about = {"redrawn": {"from": source.name, "sha256": dataset_sha256(source), **drawn, **vary}}
+    recording = Recording(local_id(root.name), only_labelled=True, provenance=about, stills=True)
+    info, _ = record(collect(engine, job, job.seeds, job.files, on_episode), job.files, root, job, recording)
+    shutil.rmtree(job.files)
+    return info
 
 
 def provenance(job: RolloutJob) -> dict[str, Any]:

@@ -152,6 +152,7 @@ class RunConfig:
     many steps after success. patience: end a rollout in which every state is labelled after this many steps without
     progress: what follows are the same states again. disturbed_share: of a round's learner rollouts that run under
     `manip_il.sim.events.STANDARD`; 0 is the algorithm in an undisturbed world. cameras: what is pictured.
+    redraw: policies learn from scenes drawn anew of every round's states, which are then recorded without pictures.
     conditions: what the worlds of all episodes differ in, validation's too.
     """
 
@@ -180,6 +181,9 @@ class RunConfig:
         0.5, "share of a round's rollouts that are disturbed: object knocked, noisy actions"
     )
     cameras: CameraConfig | None = None
+    redraw: int = option(
+        0, "scenes drawn anew from round 0's states for a policy on pictures, and as many a state in later rounds"
+    )
     conditions: tuple[Condition, ...] = ()
     seed: int = 0
     datasets: tuple[Path, ...] = ()
@@ -199,6 +203,10 @@ class RunConfig:
             raise UsageError(f"rounds is {self.rounds}; expected at least 0")
         if self.rounds >= MAX_ROUNDS:
             raise UsageError(f"rounds is {self.rounds}; expected fewer than {MAX_ROUNDS}")
+        if self.redraw < 0:
+            raise UsageError(f"redraw is {self.redraw}; expected the number of scenes")
+        if self.redraw and (self.cameras is None or self.label != "per_state" or not self.sampling.is_even):
+            raise UsageError("redraw is for policies on pictures, with --label=per_state and even sampling")
         if self.refit_steps is not None and self.refit == "scratch":
             raise UsageError("refit_steps is for refit=warm; a policy from scratch takes all steps")
         self._check_queries()
@@ -261,7 +269,7 @@ def check_cameras(config: RunConfig) -> None:
     """Raise `UsageError` unless pictures are rendered exactly where the policy takes some."""
     takes_images = config.fit.takes_images
     if takes_images and config.cameras is None:
-        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,wrist")
+        raise UsageError("the policy takes images, but none are rendered; give --cameras=front,side,wrist")
     if config.cameras is not None and not takes_images:
         raise UsageError("images are rendered, but the policy takes none; leave out --cameras or --observation=images")
 

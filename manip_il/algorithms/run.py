@@ -2,6 +2,7 @@
 
 round_003/journals/    every rollout, the moment it ended
 round_003/dataset/     what is learnt from; missing where the expert gave no label
+round_003/redrawn/     scenes drawn anew of its states, where policies learn from those
 round_003/policy/      the fit; policy_1, ... of an ensemble
 round_003/eval.json    the validation
 held_out/              the expert's demonstrations that no policy learns from
@@ -34,18 +35,29 @@ from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
 from manip_il.engine.drivers import QueryRule
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.redraw import RedrawJob
 from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import PRETRAINED_MODEL
 from manip_il.mdp import Episode
-from manip_il.recording import MAX_TRIES, Collected, check_journals, collect, collect_successes, provenance, record
+from manip_il.recording import (
+    MAX_TRIES,
+    Collected,
+    check_journals,
+    collect,
+    collect_successes,
+    provenance,
+    record,
+    redraw,
+)
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
 
 _LOG = logging.getLogger(__name__)
 BEST, DATASET, HELD_OUT, JOURNALS, POLICY = "best", "dataset", "held_out", "journals", "policy"
+REDRAWN = "redrawn"
 
 
 @dataclass(frozen=True)
@@ -123,7 +135,7 @@ class Run:
             with self._timed("fit"):
                 self._fitted = Fitted(round_, (self._take(config.start, round_),))
             return self._fitted
-        roots = [one.dataset for one in data if one.dataset is not None]
+        roots = [self._learnt_from(one) for one in data if one.dataset is not None]
         starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
         members: list[Path] = []
         with self._timed("fit"):
@@ -134,6 +146,29 @@ class Run:
                 members.append(fit_round(config, roots, into, start, self._watch.on_log, member))
         self._fitted = Fitted(round_, tuple(members))
         return self._fitted
+
+    def _learnt_from(self, rollouts: Rollouts) -> Path:
+        """The dataset that policies learn from of a round: its own, or the scenes drawn anew of its states."""
+        assert rollouts.dataset is not None
+        if not self.config.redraw or self.config.cameras is None:
+            return rollouts.dataset
+        here = self._folder(rollouts.round)
+        if not (here / REDRAWN).is_dir():
+            frames, first = self._scenes(rollouts.round)
+            job = RedrawJob(
+                self.config.env, self.config.cameras, here / f"{REDRAWN}.journals", frames, self.config.seed
+            )
+            job = replace(job, first=first, conditions=self.config.conditions)
+            redraw(self._engine, rollouts.dataset, job, here / REDRAWN)
+        return here / REDRAWN
+
+    def _scenes(self, round_: int) -> tuple[int, int]:
+        """How many scenes are drawn of a round's states, as many a state as of round 0's, and the number of the first."""
+        states = [
+            dataset_info(one.dataset).frames for one in self._made.values() if one.dataset and one.round <= round_
+        ]
+        counts = [max(1, self.config.redraw * count // states[0]) for count in states]
+        return counts[-1], sum(counts[:-1])
 
     def validate(self, policy: Fitted) -> RoundResult:
         """Measure a round's policy on the validation's seeds, which ends the round."""
@@ -182,7 +217,8 @@ class Run:
     def _job(self, round_: int) -> RolloutJob:
         """The expert's rollouts."""
         config = self.config
-        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=config.cameras)
+        cameras = None if config.redraw else config.cameras  # states are enough
+        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=cameras)
         return replace(job, conditions=config.conditions)
 
     def _left(self, round_: int) -> int | None:

@@ -86,6 +86,7 @@ class DaggerOptions(common.EnvOptions):
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
     cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images")
     image: common.ImageGroup = field(default_factory=common.ImageGroup)
+    redraw: int = option_of(RunConfig, "redraw")
     vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
     steps: int | None = option(None, _STEPS_HELP)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import MISSING, asdict, dataclass, field
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset
@@ -99,7 +98,6 @@ class RedrawOptions:
                     return
             save_options(journals, self)
             self._redraw(source, job)
-            shutil.rmtree(journals)
 
     def _dataset(self) -> Path:
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
@@ -127,33 +125,15 @@ class RedrawOptions:
         )
 
     def _redraw(self, source: Source, job: RedrawJob) -> None:
-        from manip_il.data.build import Recording, local_id
         from manip_il.engine.engine import Engine
-        from manip_il.engine.redraw import STATES, write_states
-        from manip_il.recording import check_journals, collect, record
+        from manip_il.recording import redraw
 
-        journals = self._journals()
-        warn(check_journals(journals, job))
-        if not (journals / STATES).is_file():
-            write_states(source.root, journals, self.seed)
-        recording = Recording(
-            local_id(self.target.name), only_labelled=True, provenance=_provenance(source, job), stills=True
-        )
         asked = self.frames * self.branch_steps
         with progress(asked, f"redraw {source.root}") as bar, Engine(self.workers, self.engine) as engine:
-            episodes = collect(engine, job, job.seeds, journals, lambda episode: bar.advance(len(episode)))
-            info, _ = record(episodes, journals, self.target, job, recording, replace=self.overwrite)
+            info = redraw(engine, source.root, job, self.target, lambda episode: bar.advance(len(episode)))
         left = self.frames - info.episodes
         what = f"{', '.join(job.cameras.names)}, {job.cameras.height} x {job.cameras.width} pixels"
         say(
             f"redrew {info.episodes:,} scenes, {info.frames:,} frames: {what}; {left:,} left out, without a sound label"
         )
         say(f"dataset: {self.target}")
-
-
-def _provenance(source: Source, job: RedrawJob) -> dict[str, Any]:
-    from manip_il.data.build import dataset_sha256
-
-    drawn = {"scenes": job.scenes, "branch_steps": job.branch_steps, "cameras": asdict(job.cameras)}
-    vary = {"vary": [condition.to_json() for condition in job.conditions]} if job.conditions else {}
-    return {"redrawn": {"from": source.root.name, "sha256": dataset_sha256(source.root), **drawn, **vary}}

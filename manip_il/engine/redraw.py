@@ -23,7 +23,7 @@ from manip_il.engine.simulations import simulation_of
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Actor, Episode, Label, Observation, State, Transition
 from manip_il.rollout import Labeller
-from manip_il.seeding import rng_for, stream_base
+from manip_il.seeding import BLOCK, rng_for, stream_base
 from manip_il.sim.conditions import PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state, joint_state
@@ -46,7 +46,8 @@ class RedrawJob:
     """Frames of redrawn states, `CHUNK` for a seed. files: a folder with `STATES`.
 
     scenes: draw goals and objects anew, too, and not looks alone. conditions: what the looks of every frame are drawn
-    from. branch_steps: control steps for which the expert drives on from every state, for policies that plan.
+    from. branch_steps: control steps for which the expert drives on from every state, for policies that plan. first:
+    number of the first frame in the stream of draws, so that several jobs of one seed draw different scenes.
     """
 
     env: EnvConfig
@@ -57,6 +58,7 @@ class RedrawJob:
     scenes: bool = True
     conditions: tuple[Condition, ...] = ()
     branch_steps: int = 1
+    first: int = 0
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -73,12 +75,17 @@ class RedrawJob:
     @property
     def seeds(self) -> range:
         """Seeds of the journals; each is the number of its first frame in the stream."""
-        base = stream_base("redraw", self.seed)
-        return range(base, base + self.frames, CHUNK)
+        return range(self._base, self._base + self.frames, CHUNK)
+
+    @property
+    def _base(self) -> int:
+        if self.first + self.frames > BLOCK:
+            raise UsageError(f"frames {self.first} to {self.first + self.frames}; a seed has {BLOCK:,}, take another")
+        return stream_base("redraw", self.seed) + self.first
 
     def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
         """Yield an episode a seed: every frame, or branch, is a part that ends."""
-        base, states = stream_base("redraw", self.seed), _read_states(self.files)
+        base, states = self._base, _read_states(self.files)
         redrawer = _redrawer(self.env, self.cameras)
         for seed in seeds:
             frames: list[Transition] = []
