@@ -47,7 +47,7 @@ DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(10_000, 32, 1_000)
 
 
 def _by_default(name: str) -> str:
-    """What a number is where it is not given, by the kind of the policy."""
+    """Return what a number is where it is not given, by the kind of the policy."""
     own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
     return f"by default {own}, else {getattr(LEROBOT, name):,}"
 
