@@ -54,7 +54,7 @@ class RedrawOptions:
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()
     workers: int | None = common.workers_option()
-    resume: bool = option(False, "continue a redraw, or add more frames")
+    resume: bool = option(False, "continue an interrupted redraw")
     overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
@@ -94,6 +94,7 @@ class RedrawOptions:
             if self.resume:
                 check_same_options(journals, self, ("workers", "engine"))
                 if self.target.is_dir() and not journals.is_dir():
+                    require_dataset(self.target)
                     say(f"{self.target} is complete already")
                     return
             save_options(journals, self)

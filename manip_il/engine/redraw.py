@@ -5,6 +5,7 @@ The expert is a function of the state, so it labels scenes that nobody drove to:
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
+from manip_il.data.atomic import write_file, writing
 from manip_il.data.episodes import to_episode
 from manip_il.data.lerobot_read import read_table
 from manip_il.engine.jobs import BranchEnv, branch
@@ -102,10 +104,11 @@ def write_states(source: Path, folder: Path, seed: int) -> int:
     """
     states = read_table(source, [schema.SIM_STATE])[schema.SIM_STATE]
     order = rng_for(seed, "order of redrawn states").permutation(len(states))
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / STATES).with_suffix(".part").open("wb") as stream:
-        np.save(stream, states[order], allow_pickle=False)
-    (folder / STATES).with_suffix(".part").rename(folder / STATES)
+    content = io.BytesIO()
+    np.save(content, states[order], allow_pickle=False)
+    with writing(folder / STATES):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_file(folder / STATES, content.getvalue())
     return len(states)
 
 
@@ -166,7 +169,7 @@ class _Redrawer:
         )
 
     def _unseen(self) -> Observation:
-        """What is observed, with black pictures: a frame without a sound label is left out of datasets."""
+        """Return the observation with black pictures: a frame without a sound label is left out of datasets."""
         world, black = self._env.world, np.zeros((*self._env.image_size, 3), np.uint8)
         images = {camera: black for camera in self._env.cameras}
         return Observation(joint_state(world), environment_state(world), images, self._env.task_description)
@@ -220,7 +223,7 @@ def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
 
 
 def _overlaps(world: World, bodies: Sequence[int]) -> Iterator[float]:
-    """How deep these bodies are in others [m]."""
+    """Yield how deep these bodies are in others [m]."""
     model, data = world.model, world.data
     mujoco.mj_collision(model, data)
     for contact in data.contact:

@@ -43,11 +43,11 @@ class Defaults(NamedTuple):
 
 
 LEROBOT = Defaults(100_000, 8, 20_000)
-DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(10_000, 64, 1_000)}  # where they are not LeRobot's
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(10_000, 32, 1_000)}  # where they are not LeRobot's
 
 
 def _by_default(name: str) -> str:
-    """What a number is where it is not given, by the kind of the policy."""
+    """Return what a number is where it is not given, by the kind of the policy."""
     own = ", ".join(f"{getattr(numbers, name):,} for {kind}" for kind, numbers in DEFAULTS.items())
     return f"by default {own}, else {getattr(LEROBOT, name):,}"
 

@@ -141,7 +141,7 @@ def drawn_in(variation: F64, like: F64) -> dict[str, Any]:
 
 
 def _value(name: str, drawn: Mapping[str, Any]) -> Any:
-    """What is drawn by the name of a state's numbers, of a camera where that names one; None for nothing."""
+    """Return what is drawn by the name of a state's numbers, of a camera where that names one; None for nothing."""
     what, _, camera = name.partition(".")
     value = drawn.get(what)
     return value.get(camera) if camera and value is not None else value

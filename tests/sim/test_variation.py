@@ -16,6 +16,7 @@ from manip_il.sim.scene import build_scene
 from manip_il.sim.shape import KINDS
 from manip_il.sim.variation import (
     NOTHING_DRAWN,
+    OLDER,
     PER_OBJECT,
     Object,
     apply,
@@ -189,3 +190,14 @@ def test_only_a_drawn_friction_has_priority():
 def test_a_spheres_second_and_third_sizes_are_zero():
     sphere = np.array([0.02, 0.0, 0.0, 0.1, 1.0, *NOTHING_DRAWN])
     check(sphere, sphere)
+
+
+@pytest.mark.parametrize("lacks", OLDER)
+def test_an_older_state_lacks_numbers_at_the_end_of_which_nothing_was_drawn(lacks: int):
+    like = np.array([*CUBE, *NOTHING_DRAWN])
+    older = with_drawn(like, {"size": 0.04})[:-lacks]
+    whole = completed(older, like)
+    np.testing.assert_array_equal(whole[:-lacks], older)
+    assert drawn_in(whole, like) == {"size": 0.04}
+    with pytest.raises(MismatchError, match="size of the variation"):
+        completed(older[:-1], like)
