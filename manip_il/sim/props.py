@@ -1,4 +1,4 @@
-"""Things that are only seen, and touch nothing: a pole under a goal in the air, and clutter around the workspace."""
+"""Things that are only seen, and touch nothing: a pole through a goal, and clutter around the workspace."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
-_POLE, _SHORTEST = 0.003, 0.03  # radius of a pole, and the height of a goal that needs one [m]
+_POLE, _OVER = 0.003, 0.08  # radius of a pole, and how far it stands out over the goal [m]
 _POLE_COLOUR = (0.10, 0.55, 0.28, 1.0)
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
 _HALF = (0.012, 0.04)  # of a thing's lengths [m], where the workspace is as large as Panda's
@@ -50,15 +50,17 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] = (0, 0)) 
 
 
 def _pole(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """From the table to a goal in the air: what shows its height, and where it is, from any side."""
+    """From the table through the goal: what shows its height, and where it is though an object hides it."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
     x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
-    if z < _SHORTEST:
+    if z < 0:
         return []
-    kind, radius = int(mujoco.mjtGeom.mjGEOM_CYLINDER), _POLE * scene.robot.workspace.half_width / _USUAL
-    return [Prop(kind, np.array([radius, z / 2, 0.0]), np.array([x, y, z / 2]), np.eye(3), _POLE_COLOUR)]
+    scale = min(1.0, scene.robot.workspace.half_width / _USUAL)
+    top = z + _OVER * scale
+    kind, size = int(mujoco.mjtGeom.mjGEOM_CYLINDER), np.array([_POLE * scale, top / 2, 0.0])
+    return [Prop(kind, size, np.array([x, y, top / 2]), np.eye(3), _POLE_COLOUR)]
 
 
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
