@@ -98,17 +98,15 @@ def pixel_counts(frames: NDArray[np.uint8]) -> I64:
 
 def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
     """Return statistics of pictures from their `pixel_counts`: levels in [0, 1], one a channel as (3, 1, 1)."""
-    total = int(counts[0].sum())
-    stats: dict[str, list[float]] = {name: [] for name in STAT_NAMES if name != "count"}
-    for channel in counts:
-        levels = np.flatnonzero(channel)
-        first, second = int(channel @ _LEVELS), int(channel @ _LEVELS**2)  # Python's integers: nothing is rounded
-        stats["min"].append(int(levels[0]))
-        stats["max"].append(int(levels[-1]))
-        stats["mean"].append(first / total)
-        stats["std"].append(math.sqrt(total * second - first**2) / total)
-        for name, rank in quantile_places(total).items():
-            stats[name].append(int(np.searchsorted(channel.cumsum(), rank + 1)))
+    total, below = int(counts[0].sum()), counts.cumsum(axis=1)
+    first, second = (counts @ _LEVELS).tolist(), (counts @ _LEVELS**2).tolist()  # Python's integers: nothing is rounded
+    stats: dict[str, list[float]] = {
+        "min": (counts > 0).argmax(axis=1).tolist(),
+        "max": (len(_LEVELS) - 1 - (counts[:, ::-1] > 0).argmax(axis=1)).tolist(),
+        "mean": [one / total for one in first],
+        "std": [math.sqrt(total * two - one**2) / total for one, two in zip(first, second, strict=True)],
+        **{name: (below > rank).argmax(axis=1).tolist() for name, rank in quantile_places(total).items()},
+    }
     shaped: dict[str, list[Any]] = {name: [[[value / 255]] for value in values] for name, values in stats.items()}
     shaped["count"] = [frames]
     return {name: shaped[name] for name in STAT_NAMES}
@@ -116,6 +114,9 @@ def picture_stats(counts: I64, frames: int) -> dict[str, list[Any]]:
 
 def _row_stats(rows: F64) -> dict[str, F64]:
     """Of every row of (D, T), which are sorted in part afterwards."""
+    if rows.shape[1] == 1:  # a frame by itself
+        value = rows[:, 0].copy()
+        return dict.fromkeys(("min", "max", "mean", *QUANTILES), value) | {"std": np.zeros_like(value)}
     moments = {"min": rows.min(axis=1), "max": rows.max(axis=1), "mean": rows.mean(axis=1), "std": rows.std(axis=1)}
     ranks = quantile_places(rows.shape[1])
     rows.partition(sorted(set(ranks.values())), axis=1)
