@@ -67,6 +67,7 @@ class Watch:
     on_stage: Callable[[str, int, int], None] = lambda stage, round_, total: None
     on_episode: Callable[[Episode | EpisodeResult], None] = lambda episode: None
     on_log: Callable[[dict[str, Any]], None] = lambda record: None  # {} at a step without metrics
+    on_step: Callable[[], None] = lambda: None  # of anything else
 
 
 class Run:
@@ -148,25 +149,25 @@ class Run:
         return self._fitted
 
     def _learnt_from(self, rollouts: Rollouts) -> Path:
-        """The dataset that policies learn from of a round: its own, or the scenes drawn anew of its states."""
+        """The dataset that policies learn from of a round: its own, or scenes drawn anew of its states."""
         assert rollouts.dataset is not None
-        if not self.config.redraw or self.config.cameras is None:
+        config, root = self.config, self._folder(rollouts.round) / REDRAWN
+        if not config.redraw or config.cameras is None:
             return rollouts.dataset
-        here = self._folder(rollouts.round)
-        if not (here / REDRAWN).is_dir():
+        if not root.is_dir():
             frames, first = self._scenes(rollouts.round)
-            job = RedrawJob(
-                self.config.env, self.config.cameras, here / f"{REDRAWN}.journals", frames, self.config.seed
-            )
-            job = replace(job, first=first, conditions=self.config.conditions)
-            redraw(self._engine, rollouts.dataset, job, here / REDRAWN)
-        return here / REDRAWN
+            journals = root.with_name(f"{REDRAWN}.journals")
+            job = RedrawJob(config.env, config.cameras, journals, frames, config.seed, first=first)
+            job = replace(job, conditions=config.conditions)
+            self._watch.on_stage("redraw", rollouts.round, len(job.seeds))
+            with self._timed("redraw"):
+                redraw(self._engine, rollouts.dataset, job, root, lambda _: self._watch.on_step())
+        return root
 
     def _scenes(self, round_: int) -> tuple[int, int]:
-        """How many scenes are drawn of a round's states, as many a state as of round 0's, and the number of the first."""
-        states = [
-            dataset_info(one.dataset).frames for one in self._made.values() if one.dataset and one.round <= round_
-        ]
+        """How many scenes a round gets, as many a state as round 0's, and the number of the first."""
+        made = [one.dataset for one in self._made.values() if one.dataset is not None and one.round <= round_]
+        states = [dataset_info(dataset).frames for dataset in made]
         counts = [max(1, self.config.redraw * count // states[0]) for count in states]
         return counts[-1], sum(counts[:-1])
 

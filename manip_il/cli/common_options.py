@@ -17,6 +17,7 @@ from manip_il.tasks import NAMES
 if TYPE_CHECKING:
     from manip_il.learn.checkpoint import CheckpointMeta
 
+SMALL_SIDE = 96  # of a picture that a policy learns from [pixels]
 _TRUST = (
     "load models, and run code, that a checkpoint names (smolvla, pi0, groot, ...): only for sources that you trust; "
     "only on the command line"
@@ -155,6 +156,14 @@ class ImageGroup:
     def config(self, cameras: Sequence[str], look: Look | None = None) -> CameraConfig | None:
         """Return the cameras, None for none; `UnknownName` for a camera, `UsageError` for a size."""
         return CameraConfig(tuple(cameras), self.height, self.width, look or Look()) if cameras else None
+
+
+@dataclass
+class SmallImageGroup(ImageGroup):
+    """`--image.*`: the pictures of every camera, as small as a policy learns from them."""
+
+    height: int = option(SMALL_SIDE, "of a picture [pixels]")
+    width: int = option(SMALL_SIDE, "of a picture [pixels]")
 
 
 def policy_help(words: Iterable[str]) -> str:

@@ -30,6 +30,7 @@ from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import DEFAULTS, FitConfig, check_weights
 from manip_il.option import option, option_of
+from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
     from manip_il.engine.engine import Engine
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from manip_il.sim.config import CameraConfig
 
 METRICS_FILE, FINGERPRINT_FILE = "metrics.jsonl", "fingerprint.json"
-FREE = ("workers", "engine", "output_dir", "trust")  # options that may differ when a run is resumed
+FREE = ("workers", "engine", "processes", "output_dir", "trust")  # options that may differ when a run is resumed
 
 _OWN_STEPS = ", ".join(f"{numbers.steps:,} for {kind}" for kind, numbers in DEFAULTS.items())
 _STEPS_HELP = f"gradient steps per round; by default {_OWN_STEPS}, else 20,000"
@@ -84,8 +85,8 @@ class DaggerOptions(common.EnvOptions):
     policy: Open = option_of(FitConfig, "policy")
     action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
-    cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images")
-    image: common.ImageGroup = field(default_factory=common.ImageGroup)
+    cameras: list[str] = option(list, "any of front, side, wrist, for a policy on images; by default all for cnn")
+    image: common.SmallImageGroup = field(default_factory=common.SmallImageGroup)
     redraw: int = option_of(RunConfig, "redraw")
     vary: list[str] = option(list, VARY_HELP)
     refit: Literal["scratch", "warm"] = option_of(RunConfig, "refit")
@@ -93,6 +94,7 @@ class DaggerOptions(common.EnvOptions):
     refit_steps: int | None = option_of(RunConfig, "refit_steps")
     batch_size: int | None = option_of(FitConfig, "batch_size")
     lr: float | None = option_of(FitConfig, "lr")
+    processes: int = option_of(FitConfig, "processes")
     optimizer: Open = option_of(FitConfig, "optimizer")
     scheduler: Open = option_of(FitConfig, "scheduler")
     validation_episodes: int = option_of(RunConfig, "validation_episodes")
@@ -149,7 +151,7 @@ class DaggerOptions(common.EnvOptions):
 
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
-        same = ("action_space", "steps", "batch_size", "lr", "optimizer", "scheduler", "trust")
+        same = ("action_space", "steps", "batch_size", "lr", "processes", "optimizer", "scheduler", "trust")
         env = self.env_config()
         made = {
             "env": env,
@@ -169,7 +171,8 @@ class DaggerOptions(common.EnvOptions):
 
     def _pictures(self, start: Path | None) -> tuple[str | None, CameraConfig | None]:
         """Return observation and cameras: those given, else those of the policy to begin with."""
-        cameras = self.image.config(self.cameras)
+        sees = self.policy.get("type") == "cnn" and self.observation != "state"
+        cameras = self.image.config(self.cameras or CAMERAS if sees else self.cameras)
         if start is None:
             return self.observation, cameras
         from manip_il.engine.environments import policy_cameras

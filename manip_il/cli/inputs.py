@@ -111,7 +111,8 @@ def check_given(config: RunConfig) -> None:
     from manip_il.learn.pretrained import read_config, require_trust
     from manip_il.learn.sources import check_same_sources
 
-    here, run = env_spec(config.env, config.cameras), f"{config.env.robot} {config.env.task} of this run"
+    recorded = None if config.redraw else config.cameras
+    here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
     specs = [read_spec(root) for root in config.datasets]
     for root, spec in zip(config.datasets, specs, strict=True):
         check_same_sources((root, Path(run)), (spec, here), pictures=config.cameras is not None, language=False)

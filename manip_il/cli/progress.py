@@ -208,4 +208,5 @@ class Stages:
             on_stage=lambda stage, round_, total: self.start(f"round {round_}, {stage}", total),
             on_episode=self.episode,
             on_log=self.log,
+            on_step=self.step,
         )

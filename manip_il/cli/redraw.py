@@ -21,16 +21,7 @@ if TYPE_CHECKING:
     from manip_il.engine.redraw import RedrawJob
     from manip_il.engine.render import Source
 
-SIDE = 96  # of a picture that a policy learns from [pixels]
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
-
-
-@dataclass
-class SmallImageGroup(common.ImageGroup):
-    """`--image.*`: the pictures of every camera."""
-
-    height: int = option(SIDE, "of a picture [pixels]")
-    width: int = option(SIDE, "of a picture [pixels]")
 
 
 @dataclass
@@ -49,7 +40,7 @@ class RedrawOptions:
     branch_steps: int = option(1, "control steps that the expert drives on from every scene, for act and diffusion")
     robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)
     cameras: list[str] = option(lambda: list(CAMERAS), "any of front, side, wrist")
-    image: SmallImageGroup = field(default_factory=SmallImageGroup)
+    image: common.SmallImageGroup = field(default_factory=common.SmallImageGroup)
     vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
     seed: int = common.seed_option()
     engine: Literal["local", "ray"] = common.engine_option()

@@ -55,7 +55,7 @@ def test_options_that_contradict_each_other_are_refused(options, says: str):
         (check_method, {"method": "cloning", "label": "branch"}, "the expert drive throughout"),
         (check_method, {"method": "dart", "query_rule": QueryRule("one")}, "the expert drive throughout"),
         (check_method, {"method": "dart", "fit": CNN, "cameras": FRONT}, "not for a policy on images"),
-        (check_cameras, {"fit": CNN}, "give --cameras=front,wrist"),
+        (check_cameras, {"fit": CNN}, "give --cameras=front,side,wrist"),
         (check_cameras, {"cameras": FRONT}, "the policy takes none"),
         (check_cameras, {"fit": ACT, "cameras": FRONT}, "the policy takes none"),
     ],

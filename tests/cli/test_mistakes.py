@@ -182,7 +182,7 @@ def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):
             "dagger --query=ensemble:0.1": "give ensemble=2 or more",
             "dagger --label_budget=0": "label_budget is 0",
             "dagger --sampling.corrections=-1": "sampling.corrections is -1.0; expected 0 or more",
-            "dagger --policy.type=cnn": "give --cameras=front,wrist",
+            "dagger --policy.type=act --observation=images": "give --cameras=front,side,wrist",
             "dagger --policy.lr=1": "unknown option of --policy.type=mlp: 'lr'",
             "dagger --dataset.root=x": "x does not exist; expected the folder of a LeRobot dataset",
             f"{expert} --suite=hard": "unknown suite 'hard'",

@@ -134,3 +134,37 @@ def test_train_redraws_in_passing_and_goes_on_after_a_kill(demos, tmp_path, caps
     assert "--redraw is for policies on pictures; use --policy.type=cnn" in capsys.readouterr().err
     assert main([*words[:2], f"--dataset.root={demos},{run / 'redrawn'}", *words[2:]]) == 2
     assert "--redraw is for one dataset" in capsys.readouterr().err
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(demos, tmp_path, capsys):
+    run = tmp_path / "run"
+    words = ["dagger", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=60"]
+    words += ["--rounds=1", "--episodes_per_round=2", "--hold=1", "--env.horizon=20", "--steps=2", "--batch_size=4"]
+    words += ["--validation_episodes=1", *SMALL[1:], f"--output_dir={run}"]
+    assert main(words) == 0
+    first, second = (run / f"round_{number:03d}" for number in range(2))
+    states = [dataset_info(one / "dataset").frames for one in (first, second)]
+    scenes = [dataset_info(one / "redrawn").frames for one in (first, second)]
+    assert scenes == [60, 60 * states[1] // states[0]]
+    assert read_spec(first / "redrawn").cameras == ("front", "side", "wrist")
+    assert read_spec(second / "dataset").cameras == read_spec(run / "dataset").cameras == ()
+    seeds = [set(read_table(one / "redrawn", ["seed"])["seed"].tolist()) for one in (first, second)]
+    assert seeds[0].isdisjoint(seeds[1])
+    before = digests(second / "redrawn")
+    shutil.rmtree(second / "redrawn")
+    shutil.rmtree(second / "policy")
+    (second / "eval.json").unlink()
+    assert main([*words, "--resume=true"]) == 0
+    assert digests(second / "redrawn") == before
+    pictured = ["dagger", f"--dataset.root={first / 'redrawn'}", *words[2:-1], f"--output_dir={tmp_path / 'other'}"]
+    capsys.readouterr()
+    assert main(pictured) == 1
+    assert "cameras differs" in capsys.readouterr().err
+
+
+def test_redraw_of_a_run_is_for_pictures_and_one_label_a_state(capsys):
+    for words in (["--redraw=9"], ["--policy.type=cnn", "--redraw=9", "--label=takeover"], ["--redraw=-1"]):
+        assert main(["dagger", "--output_dir=never", *words]) == 2
+        assert "redraw" in capsys.readouterr().err
