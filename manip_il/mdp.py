@@ -18,6 +18,7 @@ from manip_il.errors import ManipError, NotFiniteError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+KEYPOINTS = "privileged.keypoints."  # before a camera's name: a column that comes and goes with its pictures
 STATE_EXTRAS = 4  # numbers of a `sim_state` beside physics and variation
 LONGEST_EPISODE = 10_000  # control steps; eight minutes at 20 Hz
 
@@ -71,13 +72,15 @@ class State:
 class Observation:
     """An observation for a learner. state: (n,); environment_state: (k,), privileged, for state-based policies.
 
-    instruction: what the episode is about, for policies that read language.
+    instruction: what the episode is about, for policies that read language. keypoints: where named points of the scene
+    are in each picture, across and down from 0 to 1, and 1 where that is within it; privileged.
     """
 
     state: F32
     environment_state: F32
     images: dict[str, NDArray[np.uint8]] = field(default_factory=dict)  # camera -> (H, W, 3)
     instruction: str = ""
+    keypoints: dict[str, F32] = field(default_factory=dict)  # camera -> (K, 3)
 
     def __post_init__(self) -> None:
         require_finite("observation.state", self.state)
@@ -158,8 +161,10 @@ class Episode:
         return len(next(iter(self.columns.values())))
 
     def without_pictures(self) -> Episode:
-        """Return the same without its columns of pictures (T, height, width, 3)."""
-        columns = {key: column for key, column in self.columns.items() if column.ndim < 4}
+        """Return the same without its columns of pictures (T, height, width, 3) and of what is where in them."""
+        columns = {
+            key: column for key, column in self.columns.items() if column.ndim < 4 and not key.startswith(KEYPOINTS)
+        }
         if len(columns) == len(self.columns):
             return self
         return replace(self, columns=columns, final=tuple(replace(one, images={}) for one in self.final))

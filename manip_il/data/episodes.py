@@ -111,6 +111,9 @@ def to_episode(
     }
     for camera in frames[0].observation.images:
         columns[schema.IMAGES + camera] = np.stack([frame.observation.images[camera] for frame in frames])
+    for camera in frames[0].observation.keypoints:
+        places = np.stack([frame.observation.keypoints[camera] for frame in frames])
+        columns[schema.KEYPOINTS + camera] = places.reshape(count, -1)
     if labelled:
         columns[schema.ACTION] = np.stack(
             [frame.label.action if frame.label else frame.executed_action for frame in frames]

@@ -82,14 +82,15 @@ def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDAr
 
 
 def read_episodes(root: Path, *, pictures: bool = True) -> Iterator[Episode]:
-    """Yield the dataset's episodes in order, scalars as (T, 1) columns, pictures decoded unless they are not wanted.
+    """Yield the dataset's episodes in order, scalars as (T, 1) columns, with pictures and their keypoints if wanted.
 
     An episode's success is what `next.success` has. One data file is held at a time. Raises what `read_table` and
     `read_frames` raise.
     """
     spec, tasks, drawn = read_spec(root), read_instructions(root), read_drawn(root)
     cameras = list(spec.image_keys) if pictures else []
-    wanted = {key: one for key, one in s.features(spec).items() if pictures or key not in spec.image_keys}
+    left_out = {} if pictures else spec.image_keys | spec.keypoint_keys
+    wanted = {key: one for key, one in s.features(spec).items() if key not in left_out}
     shapes = {key: feature["shape"] for key, feature in wanted.items()}
     stored = [key for key in shapes if key not in cameras]
     _check_rows(root, sum(len(read_file(path, [layout.EPISODE_INDEX])) for path in _data_files(root)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.errors import ManipError, MismatchError, OlderSchemaError, UnknownName
-from manip_il.mdp import Episode, require_finite
+from manip_il.mdp import KEYPOINTS, Episode, require_finite
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
@@ -44,7 +44,7 @@ LONGEST_SIDE = 8192  # of a picture [pixels]
 MOST_PIXELS = 4096 * 4096  # of a picture
 _LONGEST_LIST = 200  # of names in a message [characters]
 _LARGEST_STATE = 1_000_000  # numbers in a `sim_state`
-_MAY_LACK = ("object", "robot_type", "video")  # of a spec as JSON
+_MAY_LACK = ("object", "robot_type", "video", "keypoints")  # of a spec as JSON
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class RobotTaskSpec:
     object: str = ""  # shape and size of what the task moves; empty for the task's own
     robot_type: str = ""  # the robot as LeRobot calls it; empty where that is `robot`
     video: bool = True  # whether pictures are frames of video files; else each is a PNG in the data files
+    keypoints: tuple[str, ...] = ()  # points of the scene whose places in every camera's picture are columns
     schema: int = VERSION
 
     def __post_init__(self) -> None:
@@ -76,7 +77,7 @@ class RobotTaskSpec:
         checks.name("task", self.task)
         checks.whole("fps", self.fps, 1, MOST_FPS)
         checks.whole("sim_state_size", self.sim_state_size, 0, _LARGEST_STATE)
-        for what in ("joint_names", "environment_state_names", "phases"):
+        for what in ("joint_names", "environment_state_names", "phases", "keypoints"):
             for one in checks.array(what, getattr(self, what), MOST_NAMES):
                 checks.text(f"a name in {what}", one, checks.LONGEST_NAME)
         for what in ("instruction", "action_meaning", "object", "robot_type"):
@@ -89,9 +90,9 @@ class RobotTaskSpec:
         check_picture_size("image_size", self.image_size, least=1 if self.cameras else 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the spec as JSON types; without object and robot_type where they are empty, and video where it is."""
+        """Return the spec as JSON types; without what may lack where it is empty, and video where it is."""
         values = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        values |= {"video": None if self.video else False}
+        values |= {"video": None if self.video else False, "keypoints": list(self.keypoints) or None}
         return {key: value for key, value in values.items() if value not in ("", None) or key not in _MAY_LACK}
 
     @classmethod
@@ -116,6 +117,11 @@ class RobotTaskSpec:
     def image_keys(self) -> dict[str, str]:
         """Column -> camera."""
         return {IMAGES + camera: camera for camera in self.cameras}
+
+    @property
+    def keypoint_keys(self) -> dict[str, str]:
+        """Column -> camera; none where no points are named."""
+        return {KEYPOINTS + camera: camera for camera in self.cameras if self.keypoints}
 
 
 def robot_of(robot_type: str) -> dict[str, str]:
@@ -143,6 +149,7 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
         STATE: _feature("float32", joints),
         ENVIRONMENT_STATE: _feature("float32", spec.environment_state_names),
         **{key: _image_feature(spec.image_size, "video" if spec.video else "image") for key in spec.image_keys},
+        **{key: _feature("float32", keypoint_numbers(spec)) for key in spec.keypoint_keys},
         ACTION: _feature("float32", joints),
         EXECUTED_ACTION: _feature("float32", joints),
         ACTOR: _feature("int64", ["actor"]),
@@ -157,6 +164,11 @@ def features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
         ROUND: _feature("int64", ["round"]),
         BETA: _feature("float32", ["beta"]),
     }
+
+
+def keypoint_numbers(spec: RobotTaskSpec) -> list[str]:
+    """Return names of the numbers (3 K,) of a camera's keypoints."""
+    return [f"{name}.{what}" for name in spec.keypoints for what in ("across", "down", "in_view")]
 
 
 def _image_feature(size: tuple[int, int], dtype: str) -> dict[str, Any]:

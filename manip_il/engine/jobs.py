@@ -273,8 +273,8 @@ def branch(env: BranchEnv, expert: Labeller, first: State, seed: int, steps: int
 
 
 def _without_pictures(transition: Transition) -> Transition:
-    final = replace(transition.final, images={}) if transition.final else None
-    return replace(transition, observation=replace(transition.observation, images={}), final=final)
+    final = replace(transition.final, images={}, keypoints={}) if transition.final else None
+    return replace(transition, observation=replace(transition.observation, images={}, keypoints={}), final=final)
 
 
 @lru_cache(SCENES_KEPT)

@@ -31,6 +31,7 @@ from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state, joint_state
 from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
+from manip_il.tasks.points import point_names
 from manip_il.tasks.table import get_task
 
 F64 = NDArray[np.float64]
@@ -172,7 +173,8 @@ class _Redrawer:
         """Return the observation with black pictures: a frame without a sound label is left out of datasets."""
         world, black = self._env.world, np.zeros((*self._env.image_size, 3), np.uint8)
         images = {camera: black for camera in self._env.cameras}
-        return Observation(joint_state(world), environment_state(world), images, self._env.task_description)
+        nowhere = {camera: np.zeros((len(point_names(world.scene)), 3), np.float32) for camera in self._env.cameras}
+        return Observation(joint_state(world), environment_state(world), images, self._env.task_description, nowhere)
 
     def _redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
         """A scene with other goals and other places of what is untouched; None for one that cannot be."""

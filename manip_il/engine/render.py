@@ -42,7 +42,7 @@ from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.variation import OLDER, with_drawn
 from manip_il.tasks.table import TASKS
 
-Pictures = dict[str, NDArray[np.uint8]]
+Pictures = dict[str, NDArray[Any]]  # columns of pictures, and of what is where in them
 _DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that pictures of a state depend on
 
 
@@ -121,7 +121,8 @@ def render_dataset(
     it is written. Raises `RenderError` where there is no OpenGL, and what reading and `new_dataset` raise.
     """
     look = env_fingerprint(source.env, cameras)["cameras_sha256"]
-    spec = dataclasses.replace(source.spec, cameras=cameras.names, image_size=cameras.size)
+    names = env_spec(source.env, cameras).keypoints
+    spec = dataclasses.replace(source.spec, cameras=cameras.names, image_size=cameras.size, keypoints=names)
     fingerprint = {**read_fingerprint(source.root), "cameras_sha256": look}
     rendered = {"from": source.root.name, "cameras": dataclasses.asdict(cameras)}
     states = read_episodes(source.root, pictures=False)
@@ -173,7 +174,7 @@ def render_episodes(
 def render_states(
     env: EnvConfig, cameras: CameraConfig, states: NDArray[Any], drawn: Drawn = NOMINAL_VALUES
 ) -> Pictures:
-    """Return pictures of states, rows of `sim_state` (T, m): column -> uint8 (T, height, width, 3).
+    """Return columns of states, rows of `sim_state` (T, m): pictures (T, height, width, 3), and keypoints (T, 3 K).
 
     drawn: what their episode draws, for states that were recorded before they held it. An environment with these
     cameras gives the same bytes in these states.
@@ -182,15 +183,17 @@ def render_states(
         raise RenderError(f"{env.robot} has no cameras here")
     view = ManipEnv.of(env, cameras)
     looks = {name: drawn.values[name] for name in PICTURED if name in drawn.values}
-    pictures = {
-        schema.IMAGES + name: np.empty((len(states), *cameras.size, 3), dtype=np.uint8) for name in cameras.names
-    }
+    spec, rows = env_spec(env, cameras), len(states)
+    found: Pictures = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
+    found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
     for row, state in enumerate(states):
         view.set_state(State.from_vector(state))
         view.world.vary(with_drawn(view.world.variation, looks))
-        for name, picture in view.observe().images.items():
-            pictures[schema.IMAGES + name][row] = picture
-    return pictures
+        seen = view.observe()
+        for name in cameras.names:
+            found[schema.IMAGES + name][row] = seen.images[name]
+            found[schema.KEYPOINTS + name][row] = seen.keypoints[name].ravel()
+    return found
 
 
 def _with_pictures(episode: Episode, pictures: Pictures) -> Episode:

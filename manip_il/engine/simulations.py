@@ -27,6 +27,7 @@ from manip_il.sim.world import World
 from manip_il.stock.simulation import StockSimulation
 from manip_il.stock.table import ROBOT as STOCK
 from manip_il.stock.table import STOCK as STOCK_TASKS
+from manip_il.tasks.points import point_names
 from manip_il.tasks.table import TASKS, get_task
 from manip_il.tasks.task import objects_in, phases
 
@@ -114,6 +115,7 @@ class Scenes:
             **_in_lerobot(scene.robot),
             cameras=cameras.names if cameras else (),
             image_size=(cameras.height, cameras.width) if cameras else (0, 0),
+            keypoints=point_names(scene) if cameras else (),
         )
 
     def model_bytes(self, config: EnvConfig) -> bytes:

@@ -18,11 +18,12 @@ from manip_il.sim.conditions import NOMINAL_VALUES, Condition, Drawn, draw
 from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.events import Events
 from manip_il.sim.posture import draw_posture
-from manip_il.sim.render import Picture, pictures
+from manip_il.sim.render import Picture, pictures, projections
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.variation import drawn_in, with_drawn
 from manip_il.sim.window import Window, check_render_mode
 from manip_il.sim.world import Scene, World
+from manip_il.tasks.points import points_in
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import ask, instruction_in
 
@@ -141,7 +142,9 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self._events = Events.of(self.world, drawn, seed)
         self._noise = rng_for(seed, "observation noise")
         self._observed: deque[Observation] = deque(maxlen=int(drawn.number("delay")) + 1)
-        self._pictured: deque[dict[str, Picture]] = deque(maxlen=int(drawn.number("picture_delay")) + 1)
+        self._pictured: deque[tuple[dict[str, Picture], dict[str, F32]]] = deque(
+            maxlen=int(drawn.number("picture_delay")) + 1
+        )
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply one action (n,) for one control step."""
@@ -210,10 +213,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
         It has pictures only where the environment has cameras.
         """
-        world, images = self._measured(), self._pictures(self._view) if self._view else {}
-        self._pictured.append(images)
-        text = self.task_description
-        self._observed.append(Observation(joint_state(world), environment_state(world), self._pictured[0], text))
+        world = self._measured()
+        self._pictured.append((self._pictures(self._view), self._keypoints(self._view)) if self._view else ({}, {}))
+        (images, keypoints), text = self._pictured[0], self.task_description
+        self._observed.append(Observation(joint_state(world), environment_state(world), images, text, keypoints))
         return self._observed[0]
 
     def _measured(self) -> World:
@@ -256,6 +259,10 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _pictures(self, cameras: CameraConfig) -> dict[str, Picture]:
         return pictures(self.config.robot, self.config.task, self.data, cameras, self.looks, self.config.object)
+
+    def _keypoints(self, cameras: CameraConfig) -> dict[str, F32]:
+        points = np.stack([*points_in(self.world).values()])
+        return projections(self.config.robot, self.config.task, cameras, points, self.config.object)
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self.solved, "ever_success": self._ever, "distance": self.distance()}

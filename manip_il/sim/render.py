@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -59,6 +60,18 @@ def pictures(
     renderer = _process.renderer(robot, task, cameras.look, shape)
     renderer.pose(data, drawn)
     return {name: renderer.picture(name, cameras.size) for name in cameras.names}
+
+
+def projections(
+    robot: str, task: str, cameras: CameraConfig, points: NDArray[np.float64], shape: str = ""
+) -> dict[str, NDArray[np.float32]]:
+    """Return where points (K, 3) of the world [m] are in what `pictures` drew last in this process: name -> (K, 3).
+
+    Across and down from 0 to 1, and 1 for a point within the picture; zeros for any other. A point may be hidden by
+    something before it. Raises what `pictures` raises.
+    """
+    renderer = _process.renderer(robot, task, cameras.look, shape)
+    return {name: renderer.project(name, points, cameras.width / cameras.height) for name in cameras.names}
 
 
 def marked_picture(
@@ -126,6 +139,15 @@ class _Renderer:
         mujoco.mjr_render(view, self._scene, self._context)
         mujoco.mjr_readPixels(fine, None, view, self._context)
         return _coarser(fine[::-1])  # OpenGL counts rows from below
+
+    def project(self, camera: str, points: NDArray[np.float64], aspect: float) -> NDArray[np.float32]:
+        number = self._cameras[camera]
+        x, y, back = self._data.cam_xmat[number].reshape(3, 3).T @ (points - self._data.cam_xpos[number]).T
+        ahead = np.where(back < 0, -back, np.inf)
+        half = ahead * math.tan(math.radians(self._model.cam_fovy[number]) / 2)
+        found = np.stack([0.5 + x / (2 * half * aspect), 0.5 - y / (2 * half), np.ones_like(x)], axis=1)
+        inside = ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all(axis=1) & np.isfinite(ahead)
+        return np.where(inside[:, None], found, 0.0).astype(np.float32)
 
     def close(self) -> None:
         self._context.free()

@@ -24,7 +24,9 @@ class CNNConfig(MLPConfig):
     camera. aux_weight: while learning, weight of the mean absolute error, in standard deviations, of reading
     `observation.environment_state` off joints and keypoints by a perceptron, where the dataset has that column and
     it is not an input. The action is read off what was read off, too, and off joints and keypoints; acting never sees
-    the true state. What is not said here is the mlp's.
+    the true state. heatmap_weight: while learning, weight of the cross-entropy [nats] of heat maps against the places
+    of points that the scene names (`privileged.keypoints.<camera>`), each of which has a keypoint of its own beside the
+    others; 0: off. What is not said here is the mlp's.
 
     `use_amp` takes the convolutions of learning to half precision, where the processor has bfloat16: twice as fast.
     Acting is always in single precision.
@@ -35,7 +37,9 @@ class CNNConfig(MLPConfig):
     channels: tuple[int, ...] = (16, 32, 48, 48)
     keypoints: int = 32
     aux_weight: float = 0.5
+    heatmap_weight: float = 0.0
     privileged_size: int = 0  # of what is read off beside the action; taken from the dataset
+    named_points: int = 0  # that have a heat map; taken from the dataset
 
     depth: int = 2
     loss: str = "l1"
@@ -51,8 +55,10 @@ class CNNConfig(MLPConfig):
             if len(self.channels) < 2:
                 raise ManipError(f"channels is {list(self.channels)}; expected at least two layers")
             checks.whole("keypoints", self.keypoints, 1, LARGEST)
-            checks.whole("privileged_size", self.privileged_size, 0, LARGEST)  # 0: off
-            checks.number("aux_weight", self.aux_weight, 0.0)
+            for name in ("privileged_size", "named_points"):  # 0: off
+                checks.whole(name, getattr(self, name), 0, LARGEST)
+            for name in ("aux_weight", "heatmap_weight"):
+                checks.number(name, getattr(self, name), 0.0)
         except ManipError as error:
             raise UsageError(f"policy.{error}") from error
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any, cast, override
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manip_il.data.schema import ENVIRONMENT_STATE, STATE
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, KEYPOINTS, STATE
+from manip_il.errors import UsageError
 from manip_il.learn.cnn.configuration_cnn import CNNConfig
 from manip_il.learn.columns import INDEX, Table
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
@@ -16,6 +19,7 @@ from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.network import MLPNetwork, fit_statistics
 
 NUMBERS = 4  # a keypoint: x, y, spread, strength
+STRIDE = 4  # of heat maps [pixels]
 _LIGHT, _COLOUR = 4.0, 16.0  # pictures differ in light much more than in colour; these make them alike
 _SHARPNESS = 3.0  # of the softmax
 _SPREAD, _STRENGTH = 4.0, 0.3  # bring both to about -2 to 2
@@ -34,8 +38,11 @@ class KeypointEncoder(nn.Module):
     Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own weights every softmax
     began as the mean over the picture, and in 1,100 steps a goal of 5 pixels was not found; so it is in 300.
 
-    channels: of the layers; the first two halve the picture's sides.
+    channels: of the layers; the first two halve the picture's sides. maps: logarithms of the last pictures' heat maps,
+    (B, K, height, width), while learning.
     """
+
+    maps: Tensor | None = None
 
     def __init__(self, channels: Sequence[int], keypoints: int) -> None:
         super().__init__()
@@ -62,6 +69,8 @@ class KeypointEncoder(nn.Module):
     def _keypoints(self, heat: Tensor) -> Tensor:
         flat = heat.flatten(2)
         weights = (_SHARPNESS * flat).softmax(-1).view_as(heat)
+        if self.training:
+            self.maps = (_SHARPNESS * flat).log_softmax(-1).view_as(heat)
         across, down = weights.sum(2), weights.sum(3)
         grid_x = torch.linspace(-1.0, 1.0, heat.shape[3], device=heat.device)
         grid_y = torch.linspace(-1.0, 1.0, heat.shape[2], device=heat.device)
@@ -70,6 +79,26 @@ class KeypointEncoder(nn.Module):
         spread = variance.clamp(min=1e-6).sqrt()
         strength = (weights.flatten(2) * flat).sum(-1)
         return torch.cat([x, y, _SPREAD * spread, _STRENGTH * strength], dim=-1)
+
+
+def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
+    """Return the mean cross-entropy [nats] of the points in view, (B,), 0 where none is.
+
+    maps: logarithms of heat maps (B, K, height, width), whose cells are `STRIDE` pixels apart from the first pixel on.
+    places: across and down from 0 to 1, and whether that is in view, (B, K, 3); a place between cells counts for the
+    four around it, the nearer the more.
+    """
+    size = torch.tensor([maps.shape[3], maps.shape[2]], device=maps.device)
+    at = ((places[..., :2] * STRIDE * size - 0.5) / STRIDE).clamp(min=0).minimum(size - 1.0)
+    low = at.floor().minimum(size - 2.0)
+    share, low = at - low, low.long()
+    losses = torch.zeros_like(share[..., 0])
+    for right, below in product((0, 1), repeat=2):
+        weight = (share[..., 0] if right else 1 - share[..., 0]) * (share[..., 1] if below else 1 - share[..., 1])
+        cell = (low[..., 1] + below) * maps.shape[3] + low[..., 0] + right
+        losses = losses - weight * maps.flatten(2).gather(2, cell.unsqueeze(-1)).squeeze(-1)
+    seen = places[..., 2]
+    return (losses * seen).sum(1) / seen.sum(1).clamp(min=1)
 
 
 def _perceptron(inputs: int, width: int, depth: int, outputs: int) -> nn.Sequential:
@@ -92,7 +121,8 @@ class CNNPolicy(MLPPolicy):
     `observation.images.<camera>` (B, 3, H, W), from 0 to 1.
 
     dataset_meta: as for the mlp. While training, the state of the environment is then read off the keypoints
-    too (`CNNConfig.aux_weight`), each frame's known by the batch's `index`.
+    too (`CNNConfig.aux_weight`), and points that the scene names have heat maps (`heatmap_weight`); each frame's truth
+    is known by the batch's `index`.
     """
 
     config_class = CNNConfig  # type: ignore[assignment]
@@ -117,19 +147,19 @@ class CNNPolicy(MLPPolicy):
         features = config.input_features or {}
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
-        encoders = [KeypointEncoder(config.channels, config.keypoints) for _ in self.cameras]
-        self.encoders = nn.ModuleList(encoders)
-        self.keypoint_size = sum(encoder.size for encoder in encoders)
-        width = sum(features[key].shape[0] for key in self.inputs)
-        self.seen_size, self.aux_weight = width + self.keypoint_size, config.aux_weight
-        self.privileged: nn.Module | None = None
-        self._read_off(config.privileged_size)
+        self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
+        self._make(config)
         self._privileged_by_index: Tensor | None = None
+        self._places_by_index: Tensor | None = None
 
-    def _read_off(self, size: int) -> None:
-        """Make the perceptron that reads so many numbers off, and the one for the action, which gets them, too."""
-        config = cast(CNNConfig, self.config)
-        n = (config.input_features or {})[STATE].shape[0]
+    def _make(self, config: CNNConfig) -> None:
+        """Make encoders, the perceptron that reads the state off, and the one for the action, of the sizes given."""
+        features, size = config.input_features or {}, config.privileged_size
+        n = features[STATE].shape[0]
+        encoders = [KeypointEncoder(config.channels, config.named_points + config.keypoints) for _ in self.cameras]
+        self.encoders = nn.ModuleList(encoders)
+        self.seen_size = sum(features[key].shape[0] for key in self.inputs) + sum(one.size for one in encoders)
+        self.privileged: nn.Module | None = None
         if size:
             self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
         self.model = MLPNetwork(self.seen_size + size, n, config.network_shape())
@@ -151,24 +181,70 @@ class CNNPolicy(MLPPolicy):
     def _row_losses(self, inputs: Tensor, batch: dict[str, Tensor]) -> Tensor:
         with torch.autocast(inputs.device.type, enabled=False):
             losses = super()._row_losses(inputs, batch)
-            privileged = self._privileged_by_index
-            if not self.training or privileged is None or self.privileged is None or batch.get(INDEX) is None:
+            if not self.training or batch.get(INDEX) is None:
                 return losses
-            truth = privileged.to(inputs.device)[batch[INDEX].reshape(-1)]
-            return losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
+            index = batch[INDEX].reshape(-1)
+            if self._privileged_by_index is not None:
+                truth = self._privileged_by_index.to(inputs.device)[index]
+                losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
+            if self._places_by_index is not None:
+                losses = losses + self.heatmap_weight * self._heat_map_losses(self._places_by_index[index])
+            return losses
+
+    def _heat_map_losses(self, places: Tensor) -> Tensor:
+        """Mean over the cameras, (B,). places: (B, cameras, K, 3)."""
+        cameras = zip(self.encoders, places.unbind(1), strict=True)
+        maps = [(cast(KeypointEncoder, one).maps, at) for one, at in cameras]
+        found = [heat_map_losses(one[:, : at.shape[1]], at.to(one.device)) for one, at in maps if one is not None]
+        return torch.stack(found).mean(0)
+
+    @override
+    def _more_columns(self) -> Sequence[str]:
+        """The places of named points, where heat maps are learnt."""
+        return [key.replace(IMAGES, KEYPOINTS) for key in self.cameras] if self.heatmap_weight else ()
 
     @override
     def _learn_columns(self, columns: Table, loss: str) -> None:
-        reads = self.aux_weight > 0 and ENVIRONMENT_STATE in columns and ENVIRONMENT_STATE not in self.inputs
-        size, config = columns[ENVIRONMENT_STATE].shape[1] if reads else 0, cast(CNNConfig, self.config)
-        if reads and not config.privileged_size:
-            config.privileged_size = size
-            self._read_off(size)
+        config, truth, places = cast(CNNConfig, self.config), self._truth(columns), self._places(columns)
+        sizes = 0 if truth is None else truth.shape[1], 0 if places is None else places.shape[2]
+        if not config.privileged_size and not config.named_points and any(sizes):
+            config.privileged_size, config.named_points = sizes
+            self._make(config)
         super()._learn_columns(columns, loss)
-        if not reads or config.privileged_size != size:
-            return  # a checkpoint from another task goes on without
-        values, index = columns[ENVIRONMENT_STATE], torch.from_numpy(columns[INDEX])
+        index = torch.from_numpy(columns[INDEX])
+        # A checkpoint from another task goes on without.
+        self._privileged_by_index = _by_index(index, truth) if config.privileged_size == sizes[0] else None
+        self._places_by_index = _by_index(index, places) if config.named_points == sizes[1] else None
+
+    def _truth(self, columns: Table) -> Tensor | None:
+        """The state of the environment in standard deviations, (N, k), where it is to be read off."""
+        if not self.aux_weight or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
+            return None
+        values = columns[ENVIRONMENT_STATE]
         statistics = fit_statistics(values, values, "mse")
-        known = torch.zeros(int(index.max()) + 1, size)
-        known[index] = (torch.from_numpy(values) - statistics.input_mean) * statistics.input_scale
-        self._privileged_by_index = known
+        return (torch.from_numpy(values) - statistics.input_mean) * statistics.input_scale
+
+    def _places(self, columns: Table) -> Tensor | None:
+        """Where named points are in every camera's picture, (N, cameras, K, 3), where heat maps are to be learnt.
+
+        Raises `UsageError` for a dataset without.
+        """
+        keys = self._more_columns()
+        if not keys:
+            return None
+        if missing := [key for key in keys if key not in columns]:
+            raise UsageError(
+                f"policy.heatmap_weight is {self.heatmap_weight:g}, but the dataset has no {missing[0]}; "
+                "manip-il redraw and manip-il render write it"
+            )
+        found = np.stack([np.asarray(columns[key], np.float32) for key in keys], axis=1)
+        return torch.from_numpy(found).unflatten(2, (-1, 3))
+
+
+def _by_index(index: Tensor, values: Tensor | None) -> Tensor | None:
+    """Values (N, ...) of frames at their `index`."""
+    if values is None:
+        return None
+    known = torch.zeros(int(index.max()) + 1, *values.shape[1:])
+    known[index] = values
+    return known

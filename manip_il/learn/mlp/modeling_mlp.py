@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast, override
 
 import numpy as np
@@ -41,7 +42,7 @@ class MLPPolicy(PreTrainedPolicy):
         self._valid_by_index: Tensor | None = None
         if dataset_meta is not None:
             roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
-            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)
+            wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, *self._more_columns())
             names = [key for key in wanted if key in dataset_meta.features]
             table = read_tables(roots, [*names, INDEX])
             if config.action_space == EE_DELTA:
@@ -77,6 +78,10 @@ class MLPPolicy(PreTrainedPolicy):
     @override
     def get_optim_params(self) -> Any:
         return self.parameters()
+
+    def _more_columns(self) -> Sequence[str]:
+        """Columns that learning looks at beside the mlp's."""
+        return ()
 
     def _build(self, config: MLPConfig) -> None:
         """Make the network, and leave out the features that it does not look at."""

@@ -1,0 +1,58 @@
+"""Named points of a scene for pictures to show: the places that its task observes, and corners of its boxes."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.sim.world import Scene, World
+from manip_il.tasks.table import get_task
+
+F64 = NDArray[np.float64]
+_SIGNS = np.array(list(product((-1, 1), repeat=3)))  # of a box's corners
+_CORNERS = 4  # of a box: the upper ones, which cameras see
+
+
+def points_in(world: World) -> dict[str, F64]:
+    """Return name -> place (3,) [m].
+
+    What a task observes is a place where it has the name of something in the scene. Corners of a box are counted by the
+    direction in which they lie from its centre.
+    """
+    observed, named = get_task(world.scene.task).observe(world), _named(world.scene)
+    found = {name: np.asarray(value) for name, value in observed.items() if name in named}
+    for name, one in world.scene.objects.items():
+        if world.scene.model.geom_type[one.geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            found |= {f"{name}.corner_{number}": at for number, at in enumerate(_upper_corners(world, name))}
+    return found
+
+
+@lru_cache
+def point_names(scene: Scene) -> tuple[str, ...]:
+    """Return the names of `points_in`, in its order."""
+    world = World(scene)
+    world.update()
+    return tuple(points_in(world))
+
+
+@lru_cache
+def _named(scene: Scene) -> frozenset[str]:
+    """Names of bodies, geoms and sites."""
+    model = scene.model
+    return frozenset(
+        one(number).name
+        for one, count in ((model.body, model.nbody), (model.geom, model.ngeom), (model.site, model.nsite))
+        for number in range(count)
+    )
+
+
+def _upper_corners(world: World, name: str) -> F64:
+    """The corners (4, 3) [m] of a box."""
+    pose, half = world.pose(name), np.asarray(world.extents(name)) / 2
+    around = (_SIGNS * half) @ pose.rotation.T
+    upper = around[np.argsort(around[:, 2], kind="stable")[-_CORNERS:]]
+    return pose.position + upper[np.argsort(np.arctan2(upper[:, 1], upper[:, 0]), kind="stable")]
