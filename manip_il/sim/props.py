@@ -1,4 +1,4 @@
-"""Things that are only seen, and touch nothing: a pole through a goal, and clutter around the workspace."""
+"""Things that are only seen, and touch nothing: the stand of a goal, and clutter around the workspace."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
-_POLE, _OVER = 0.003, 0.08  # radius of a pole, and how far it stands out over the goal [m]
-_POLE_COLOUR = (0.10, 0.55, 0.28, 1.0)
+_POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
+_FOOT, _THIN = 1.2, 0.001  # radius of its foot, in radii of the largest object; its height [m]
+_STAND = (0.10, 0.55, 0.28, 1.0)  # its colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
 _HALF = (0.012, 0.04)  # of a thing's lengths [m], where the workspace is as large as Panda's
 _USUAL = 0.15  # half the width of that [m]
@@ -46,21 +47,21 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] = (0, 0)) 
 
     Poses of mocap bodies and joints in `data` must be up to date.
     """
-    return [*_pole(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
+    return [*_stand(scene, data), *_clutter(scene, data, int(clutter[0]), int(clutter[1]))]
 
 
-def _pole(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """From the table through the goal: what shows its height, and where it is though an object hides it."""
+def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
+    """Under a goal on the table a foot wider than objects, which shows around one that hides it; else a pole."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
     x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
-    if z < 0:
-        return []
-    scale = min(1.0, scene.robot.workspace.half_width / _USUAL)
-    top = z + _OVER * scale
-    kind, size = int(mujoco.mjtGeom.mjGEOM_CYLINDER), np.array([_POLE * scale, top / 2, 0.0])
-    return [Prop(kind, size, np.array([x, y, top / 2]), np.eye(3), _POLE_COLOUR)]
+    radius, height = _POLE * min(1.0, scene.robot.workspace.half_width / _USUAL), z
+    if z <= _SHORTEST:
+        radius = _FOOT * max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=0.0)
+        height = _THIN
+    size, at = np.array([radius, height / 2, 0.0]), np.array([x, y, height / 2])
+    return [Prop(int(mujoco.mjtGeom.mjGEOM_CYLINDER), size, at, np.eye(3), _STAND)]
 
 
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
