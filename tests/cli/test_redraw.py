@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.cli.main import main
 from manip_il.data.lerobot_library import lerobot_windows
@@ -41,11 +42,19 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
     assert info.episodes == info.frames == 60
     assert (spec.cameras, spec.image_size, spec.video) == (("front", "side", "wrist"), (32, 32), False)
     assert read_provenance(redrawn)["redrawn"]["from"] == "demos"
+    points = read_table(redrawn, [one for one in spec.keypoint_keys])
+    assert spec.keypoints[:2] == ("goal", "object")
+    for places in points.values():
+        assert places.shape == (60, 3 * len(spec.keypoints))
+        assert ((places >= 0) & (places <= 1)).all()
+        assert places.reshape(60, -1, 3)[:, :2, 2].any()
     assert read_table(redrawn, ["label_valid"])["label_valid"].all()
     assert not redrawn.with_name("new.journals").exists()
     assert main(["doctor", str(redrawn)]) == 0
     dataset: Any = lerobot_windows(redrawn, "local/new", None)
     assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
+    inputs = dataset_to_policy_features(dataset.meta.features)
+    assert not any("keypoints" in name for name in inputs)
 
 
 @pytest.mark.gl

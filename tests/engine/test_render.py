@@ -64,9 +64,11 @@ def test_pictures_made_afterwards_are_those_made_while_recording(robot):
     recorded = episodes(2, CAMERAS, env)
     for episode in recorded:
         pictures = render_states(env, CAMERAS, episode.columns[schema.SIM_STATE])
-        assert set(pictures) == {schema.IMAGES + "front", schema.IMAGES + "wrist"}
+        spec = env_spec(env, CAMERAS)
+        assert set(pictures) == {*spec.image_keys, *spec.keypoint_keys}
         for key, frames in pictures.items():
-            assert frames.shape == (len(episode), 64, 96, 3)
+            seen = key in spec.image_keys
+            assert frames.shape == (len(episode), *((64, 96, 3) if seen else (3 * len(spec.keypoints),)))
             np.testing.assert_array_equal(frames, episode.columns[key])
             assert not np.array_equal(frames[0], frames[-1])
 
@@ -91,7 +93,7 @@ def test_a_dataset_gains_pictures_and_keeps_everything_else(source, tmp_path):
     assert [episode.seed for episode in written] == [episode.seed for episode in read_episodes(source)]
     assert info.episodes == 3
     before, after = read_table(source), read_table(info.root)
-    assert before.keys() == after.keys()
+    assert after.keys() == before.keys() | env_spec(ENV, CAMERAS).keypoint_keys.keys()
     for key, column in before.items():
         np.testing.assert_array_equal(after[key], column)
     assert read_spec(info.root) == env_spec(ENV, CAMERAS)

@@ -15,9 +15,10 @@ from lerobot.policies.factory import get_policy_class, make_policy, make_policy_
 from manip_il.data.schema import features
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.cnn import CNNConfig
-from manip_il.learn.cnn.modeling_cnn import CNNPolicy, KeypointEncoder
+from manip_il.learn.cnn.modeling_cnn import CNNPolicy, KeypointEncoder, heat_map_losses
 from manip_il.learn.lerobot_config import policy_features
 from manip_il.learn.losses import LOSSES
+from manip_il.learn.mlp import modeling_mlp
 
 SIDE = 32
 SMALL = {"channels": (4, 4), "keypoints": 3, "width": 16, "depth": 1, "device": "cpu"}
@@ -218,3 +219,73 @@ def test_features_that_do_not_fit_are_refused_in_one_line(meta):
         columns = meta.features | {key: meta.features[key] | {"shape": shape}}
         with pytest.raises(MismatchError, match=words):
             new_policy(SimpleNamespace(features=columns, root=meta.root, stats={}))
+
+
+def test_a_heat_map_is_best_where_the_point_is_and_between_cells_where_it_lies_between():
+    height, width = 5, 6
+    places = torch.tensor([[[9.5 / 24, 8.5 / 20, 1.0]], [[10.5 / 24, 8.5 / 20, 1.0]], [[0.9, 0.9, 0.0]]])
+    peaks = torch.zeros(3, 1, height, width)
+    peaks[:, 0, 2, 2] = 20.0  # which is pixel 8, 8
+    maps = peaks.flatten(2).log_softmax(-1).view_as(peaks)
+    on, beside, unseen = heat_map_losses(maps, places).tolist()
+    assert on == pytest.approx(20.0 * 1 / 4, abs=0.1)  # a pixel off, of four
+    assert beside == pytest.approx(20.0 * 2 / 4, abs=0.1)
+    assert unseen == 0.0
+    free = torch.zeros(1, 1, height, width, requires_grad=True)
+    optimizer = torch.optim.Adam([free], lr=0.5)
+    for _ in range(200):
+        loss = heat_map_losses(free.flatten(2).log_softmax(-1).view_as(free), places[1:2]).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    weights = free.detach().flatten(2).softmax(-1).view_as(free)[0, 0]
+    assert (weights.sum(0) @ torch.arange(6.0)).item() == pytest.approx(10 / 4, abs=0.05)
+    assert (weights.sum(1) @ torch.arange(5.0)).item() == pytest.approx(8 / 4, abs=0.05)
+
+
+@pytest.fixture
+def named(meta, spec, table, monkeypatch):
+    """The same dataset with the places of two points."""
+    pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE), keypoints=("cube", "goal"))
+    rng, read = np.random.default_rng(0), modeling_mlp.read_tables
+
+    def with_places(roots, columns):
+        kept = [key for key in columns if key not in pictured.keypoint_keys]
+        found = read(roots, kept)
+        places = {key: rng.uniform(0, 1, (len(found["index"]), 6)) for key in columns if key not in kept}
+        for one in places.values():
+            one[:, [2, 5]] = one[:, [2, 5]].round()
+        return found | {key: one.astype(np.float32) for key, one in places.items()}
+
+    monkeypatch.setattr(modeling_mlp, "read_tables", with_places)
+    return SimpleNamespace(features=features(pictured), root=meta.root, stats={})
+
+
+def test_named_points_get_keypoints_of_their_own_that_learn_where_they_are(named, table, tmp_path):
+    policy, batch = new_policy(named, heatmap_weight=1.0, channels=(8, 16)), make_batch(table)
+    assert policy.model.input_mean.shape == (4 + 2 * (3 + 2) * 4 + 6,)
+    assert list(policy.config.input_features or {}) == [
+        "observation.state", "observation.images.front", "observation.images.wrist"
+    ]  # fmt: skip
+    unweighted = new_policy(named, heatmap_weight=1.0, channels=(8, 16))
+    unweighted.load_state_dict(policy.state_dict())
+    unweighted.heatmap_weight = 0.0
+    more = (policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]).mean()
+    assert more.item() > 1.0
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    for _ in range(60):
+        optimizer.zero_grad()
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+    unweighted.load_state_dict(policy.state_dict())
+    assert (policy.forward(batch, "none")[0] - unweighted.forward(batch, "none")[0]).mean() < 0.6 * more
+    policy.save_pretrained(tmp_path)
+    again = CNNPolicy.from_pretrained(tmp_path, strict=True)
+    assert torch.equal(again.eval().select_action(batch), policy.eval().select_action(batch))
+
+
+def test_heat_maps_without_named_points_are_refused(meta):
+    with pytest.raises(
+        UsageError, match=r"heatmap_weight is 0\.1, but the dataset has no privileged\.keypoints\.front"
+    ):
+        new_policy(meta, heatmap_weight=0.1)
