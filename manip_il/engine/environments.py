@@ -20,6 +20,7 @@ from manip_il.learn.pretrained import read_interface
 from manip_il.mdp import State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.sim.config import CAMERAS, CameraConfig, EnvConfig, Look
+from manip_il.sim.props import VERSION as DRAWN
 
 _FOR_PEOPLE = ("README.md", "train_config.json")  # beside a policy, and no part of how it acts
 
@@ -37,8 +38,10 @@ def env_actions(config: EnvConfig) -> ActionSpace:
 
 def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> dict[str, Any]:
     """Return versions, and hashes of the compiled model and of the environment's and the cameras' settings."""
-    look = {"cameras_sha256": hashlib.sha256(canonical_json(cameras).encode()).hexdigest()} if cameras else {}
-    return {**_fingerprint(config), **look}
+    if cameras is None:
+        return dict(_fingerprint(config))
+    look = hashlib.sha256(f"{canonical_json(cameras)} {DRAWN}".encode()).hexdigest()
+    return {**_fingerprint(config), "cameras_sha256": look}
 
 
 @cache

@@ -14,6 +14,7 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
+VERSION = 2  # of what is drawn of a state beside its model: policies on pictures know no other
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
 _FOOT, _THIN = 1.2, 0.001  # radius of its foot, in radii of the largest object; its height [m]
 _STAND = (0.10, 0.55, 0.28, 1.0)  # its colour
