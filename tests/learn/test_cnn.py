@@ -197,6 +197,21 @@ def test_the_truth_is_read_off_joints_and_keypoints_and_learnt_while_training_on
     assert torch.equal(held_out, unweighted.eval().forward(batch, "none")[0])
 
 
+def test_what_is_read_off_has_the_units_of_the_truth(meta, table):
+    policy, batch = new_policy(meta, channels=(8, 8), width=64, aux_weight=5.0), make_batch(table, rows=8)
+    truth = batch["observation.environment_state"]
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    for _ in range(150):
+        optimizer.zero_grad()
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+    valid = table["label_valid"][:8, 0] != 0
+    assert (policy.read_off(batch) - truth)[valid].abs().mean() < 0.3 * truth.std(0).mean()
+    assert torch.equal(policy.read_off(batch)[:, 2], policy.truth_mean[2].expand(8))  # it never moves
+    with pytest.raises(UsageError, match="it learnt without environment_state"):
+        new_policy(meta, aux_weight=0.0).read_off(batch)
+
+
 def test_truth_that_is_an_input_is_not_learnt(meta, table):
     policy = new_policy(meta, observation="both")
     assert policy.privileged is None

@@ -127,6 +127,8 @@ class CNNPolicy(MLPPolicy):
 
     config_class = CNNConfig  # type: ignore[assignment]
     name = "cnn"  # type: ignore[assignment]
+    truth_mean: Tensor
+    truth_scale: Tensor
 
     @override
     @torch.no_grad()
@@ -141,12 +143,24 @@ class CNNPolicy(MLPPolicy):
             rows = [self._inputs({key: batch[key][i : i + 1] for key in keys}) for i in range(len(state))]
             return self.model.act(torch.cat(rows))
 
+    @torch.no_grad()
+    def read_off(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return `observation.environment_state` as pictures and joints show it, (B, k), in its own units.
+
+        Raises `UsageError` for a policy that has not learnt to.
+        """
+        if self.privileged is None:
+            raise UsageError("this cnn reads nothing off its pictures but actions: it learnt without environment_state")
+        found, moves = self._inputs(batch)[:, self.seen_size :], self.truth_scale > 0
+        return self.truth_mean + torch.where(moves, found / self.truth_scale.clamp(min=1e-12), 0.0)
+
     @override
     def _build(self, config: MLPConfig) -> None:
         config = cast(CNNConfig, config)
         features = config.input_features or {}
         self.cameras = sorted(config.image_features)
         config.input_features = {key: features[key] for key in (*self.inputs, *self.cameras)}
+        self.privileged: nn.Module | None = None
         self.aux_weight, self.heatmap_weight = config.aux_weight, config.heatmap_weight
         self._make(config)
         self._privileged_by_index: Tensor | None = None
@@ -159,9 +173,11 @@ class CNNPolicy(MLPPolicy):
         encoders = [KeypointEncoder(config.channels, config.named_points + config.keypoints) for _ in self.cameras]
         self.encoders = nn.ModuleList(encoders)
         self.seen_size = sum(features[key].shape[0] for key in self.inputs) + sum(one.size for one in encoders)
-        self.privileged: nn.Module | None = None
+        self.privileged = None
         if size:
             self.privileged = _perceptron(self.seen_size, config.width, config.depth, size)
+            self.register_buffer("truth_mean", torch.zeros(size))
+            self.register_buffer("truth_scale", torch.ones(size))
         self.model = MLPNetwork(self.seen_size + size, n, config.network_shape())
 
     @override
@@ -185,7 +201,7 @@ class CNNPolicy(MLPPolicy):
                 return losses
             index = batch[INDEX].reshape(-1)
             if self._privileged_by_index is not None:
-                truth = self._privileged_by_index.to(inputs.device)[index]
+                truth = (self._privileged_by_index.to(inputs.device)[index] - self.truth_mean) * self.truth_scale
                 losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
             if self._places_by_index is not None:
                 losses = losses + self.heatmap_weight * self._heat_map_losses(self._places_by_index[index])
@@ -210,6 +226,10 @@ class CNNPolicy(MLPPolicy):
         if not config.privileged_size and not config.named_points and any(sizes):
             config.privileged_size, config.named_points = sizes
             self._make(config)
+        if truth is not None and config.privileged_size == sizes[0]:
+            statistics = fit_statistics(truth.numpy(), truth.numpy(), "mse")
+            self.truth_mean.copy_(statistics.input_mean)
+            self.truth_scale.copy_(statistics.input_scale)
         super()._learn_columns(columns, loss)
         index = torch.from_numpy(columns[INDEX])
         # A checkpoint from another task goes on without.
@@ -217,12 +237,10 @@ class CNNPolicy(MLPPolicy):
         self._places_by_index = _by_index(index, places) if config.named_points == sizes[1] else None
 
     def _truth(self, columns: Table) -> Tensor | None:
-        """The state of the environment in standard deviations, (N, k), where it is to be read off."""
+        """The state of the environment, (N, k), where it is to be read off."""
         if not self.aux_weight or ENVIRONMENT_STATE not in columns or ENVIRONMENT_STATE in self.inputs:
             return None
-        values = columns[ENVIRONMENT_STATE]
-        statistics = fit_statistics(values, values, "mse")
-        return (torch.from_numpy(values) - statistics.input_mean) * statistics.input_scale
+        return torch.from_numpy(columns[ENVIRONMENT_STATE])
 
     def _places(self, columns: Table) -> Tensor | None:
         """Where named points are in every camera's picture, (N, cameras, K, 3), where heat maps are to be learnt.

@@ -1,0 +1,94 @@
+"""What a `cnn` sees in scenes that it has not learnt from: errors of what it reads off, and its heat maps as a picture.
+
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset that `manip-il redraw` made with a
+seed of its own. The picture needs a policy that has learnt heat maps (`--policy.heatmap_weight`).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_read import read_spec, read_table
+from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
+from manip_il.learn.cnn.modeling_cnn import CNNPolicy
+
+FRAMES, ROWS = 2_000, 4  # looked at, and drawn
+ENLARGED = 2
+COLOURS = np.array([[0.1, 0.9, 0.3], [1.0, 0.1, 0.6], [0.2, 0.4, 1.0], [1.0, 0.7, 0.0]])  # of points, in turn
+Batch = dict[str, torch.Tensor]
+
+
+def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> Batch:
+    """Return frames of a dataset as a policy takes them."""
+    keys = [IMAGES + camera for camera in cameras]
+    frames: Any = open_frame_cache(root, keys, max_bytes=int(60e9))
+    table = read_table(root, [STATE, ENVIRONMENT_STATE])
+    numbers = {key: torch.from_numpy(np.array(column[rows])) for key, column in table.items()}
+    return numbers | {key: torch.from_numpy(frames[key][rows]).float() / 255 for key in keys}
+
+
+def report(policy: CNNPolicy, batch: Batch, names: tuple[str, ...]) -> None:
+    """Print the median error of every place [mm] and yaw [mrad] that is read off."""
+    with torch.no_grad():
+        found = torch.cat([policy.read_off({k: v[i : i + 50] for k, v in batch.items()}) for i in range(0, FRAMES, 50)])
+    truth, found = batch[ENVIRONMENT_STATE][: len(found)].double().numpy(), found.double().numpy()
+    for name in names:
+        first = names.index(name)
+        if name.endswith(".x") and "axis" not in name:
+            off = np.linalg.norm((found - truth)[:, first : first + 3], axis=1) * 1e3
+            print(
+                f"{name.removesuffix('.x'):20} {np.median(off):6.1f} mm, nine of ten within {np.quantile(off, 0.9):.1f}"
+            )
+        if name.endswith(".cos4yaw"):
+            yaw = [np.arctan2(one[:, first + 1], one[:, first]) / 4 for one in (found, truth)]
+            off = np.abs((yaw[0] - yaw[1] + np.pi / 4) % (np.pi / 2) - np.pi / 4) * 1e3
+            print(f"{name:20} {np.median(off):6.1f} mrad, nine of ten within {np.quantile(off, 0.9):.1f}")
+
+
+def draw(policy: CNNPolicy, batch: Batch, points: tuple[str, ...]) -> Image.Image:
+    """Return pictures of all cameras side by side, one frame a row, with heat maps of the points over them."""
+    policy.train()  # only then heat maps are kept
+    with torch.no_grad():
+        policy.forward({key: value[:ROWS] for key, value in batch.items()} | {"action": batch[STATE][:ROWS]})
+    columns: list[NDArray[np.float64]] = []
+    for camera, encoder in zip(policy.cameras, policy.encoders, strict=True):
+        pictures = batch[camera][:ROWS].permute(0, 2, 3, 1).double().numpy()
+        size = (pictures.shape[2], pictures.shape[1])
+        maps: Any = encoder.maps
+        for number in range(len(points)):
+            heat = maps[:ROWS, number].exp().double().numpy()
+            for picture, one in zip(pictures, heat / heat.max(axis=(1, 2), keepdims=True), strict=True):
+                wide = Image.fromarray(one.astype(np.float32)).resize(size, Image.Resampling.BILINEAR)
+                share = 0.75 * np.asarray(wide, np.float64)[..., None]
+                picture[:] = (1 - share) * picture + share * COLOURS[number % len(COLOURS)]
+        columns.append(np.concatenate(pictures))
+    whole = Image.fromarray((np.concatenate(columns, axis=1) * 255).astype(np.uint8))
+    return whole.resize((whole.width * ENLARGED, whole.height * ENLARGED), Image.Resampling.NEAREST)
+
+
+def main() -> None:
+    if len(sys.argv) < 3:
+        print(__doc__)
+        return
+    policy, root = CNNPolicy.from_pretrained(sys.argv[1]).eval(), Path(sys.argv[2])
+    spec = read_spec(root)
+    count = len(read_table(root, [STATE])[STATE])
+    rows = np.sort(np.random.default_rng(1).choice(count, min(FRAMES, count), replace=False))
+    batch = batch_of(root, spec.cameras, rows)
+    report(policy, batch, spec.environment_state_names)
+    if len(sys.argv) > 3:
+        points = tuple(name for name in spec.keypoints if "corner" not in name)
+        draw(policy, batch, points).save(sys.argv[3], optimize=True)
+        print(f"{sys.argv[3]}: {', '.join(points)}")
+
+
+if __name__ == "__main__":
+    main()
