@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -298,11 +299,13 @@ def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options,
     assert not share_start(options, [options])
 
 
-def test_the_studies_that_come_along_are_sound_and_say_their_own_commands():
+def test_the_studies_that_come_along_are_sound_and_say_their_own_commands(tmp_path):
     paths = sorted((Path(__file__).parents[2] / "configs/studies").glob("*.yaml"))
-    assert len(paths) >= 4
+    assert len(paths) >= 5
     for path in paths:
-        plan = read_plan(path, None)
+        copy = tmp_path / path.name
+        copy.write_text(re.sub(r"dataset\.root: [^,}\n]+,? ?", "", path.read_text()))  # which are made before
+        plan = read_plan(copy, None)
         assert (plan.baseline is None) == (len({env.task for env in plan.envs.values()}) > 1)
         assert all(len(found) >= len(plan.experts) - 1 for found in expert_trials(plan).values())
         first = path.read_text().splitlines()[0]
