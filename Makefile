@@ -1,6 +1,6 @@
 # `make help` lists the targets.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-fast fuzz lint format docker docker-test bench lock clean
+.PHONY: help setup demo demo-eyes test test-fast fuzz lint format docker docker-test bench lock clean
 
 UV_VERSION := 0.13.8
 PYTHON     ?= $(or $(shell command -v python3.12),$(shell command -v python3.13),python3.12)
@@ -36,6 +36,11 @@ setup: .venv/.installed  ## the environment, in .venv; as root also OpenGL and F
 
 demo: setup  ## the whole story, small: runs/quickstart/report.html
 	$(BIN)/manip-il quickstart --output_dir=runs/quickstart $(DEMO)
+
+demo-eyes: setup  ## a policy from pictures, from nothing, in half an hour: runs/eyes/test/report.html
+	$(BIN)/manip-il dagger --config_path=configs/panda_dagger.yaml --output_dir=runs/eyes_state
+	$(BIN)/manip-il train --dataset.root=runs/eyes_state/dataset --policy.type=cnn --redraw=30000 --output_dir=runs/eyes
+	$(BIN)/manip-il eval --policy.path=runs/eyes --eval.n_episodes=200 --eval.films=6 --output_dir=runs/eyes/test
 
 # Two workers with one thread each: more threads than cores makes small networks slower, not faster.
 # A file's tests stay in one worker, so that what they share is made once; tests/conftest.py puts long files first.
