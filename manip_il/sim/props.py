@@ -14,9 +14,15 @@ from manip_il.seeding import rng_for
 from manip_il.sim.world import GOAL, Scene
 
 F64 = NDArray[np.float64]
-VERSION = 2  # of what is drawn of a state beside its model: policies on pictures know no other
+VERSION = 3  # of what is drawn of a state beside its model: policies on pictures know no other
 _POLE, _SHORTEST = 0.003, 0.03  # radius of a goal's pole, and its least height [m]
-_FOOT, _THIN = 1.2, 0.001  # radius of its foot, in radii of the largest object; its height [m]
+_FOOT, _ARM = 1.2, 1.6  # radius of a goal's foot, half the length of its cross, in radii of the largest object
+_THIN, _GOAL = 0.001, 0.02  # height of a foot, radius of a goal [m]
+_UP = np.eye(3)
+_ACROSS = (
+    np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+)  # z along x, y
 _STAND = (0.10, 0.55, 0.28, 1.0)  # its colour
 _KINDS = (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE)
 _HALF = (0.012, 0.04)  # of a thing's lengths [m], where the workspace is as large as Panda's
@@ -52,17 +58,22 @@ def props(scene: Scene, data: mujoco.MjData, clutter: Sequence[float] = (0, 0)) 
 
 
 def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
-    """Under a goal on the table a foot wider than objects, which shows around one that hides it; else a pole."""
+    """What shows around an object that hides a goal: on the table a foot, in the air a pole and a cross on it."""
     body = mujoco.mj_name2id(scene.model, mujoco.mjtObj.mjOBJ_BODY, GOAL)
     if body < 0:
         return []
     x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
-    radius, height = _POLE * min(1.0, scene.robot.workspace.half_width / _USUAL), z
+    scale = min(1.0, scene.robot.workspace.half_width / _USUAL)
+    largest = max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=_GOAL * scale)
     if z <= _SHORTEST:
-        radius = _FOOT * max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=0.0)
-        height = _THIN
-    size, at = np.array([radius, height / 2, 0.0]), np.array([x, y, height / 2])
-    return [Prop(int(mujoco.mjtGeom.mjGEOM_CYLINDER), size, at, np.eye(3), _STAND)]
+        return [_cylinder((x, y, _THIN / 2), _UP, _FOOT * largest, _THIN)]
+    pole = _cylinder((x, y, z / 2), _UP, _POLE * scale, z)
+    return [pole, *(_cylinder((x, y, z), along, _POLE * scale, 2 * _ARM * largest) for along in _ACROSS)]
+
+
+def _cylinder(at: tuple[float, float, float], rotation: F64, radius: float, length: float) -> Prop:
+    size = np.array([radius, length / 2, 0.0])
+    return Prop(int(mujoco.mjtGeom.mjGEOM_CYLINDER), size, np.array(at), rotation, _STAND)
 
 
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:

@@ -31,19 +31,24 @@ def things(env: ManipEnv) -> list:
 
 
 @every_robot
-def test_a_goal_in_the_air_stands_on_a_pole_and_one_on_the_table_on_a_foot_that_objects_do_not_hide(robot: str):
+def test_a_goal_stands_on_what_shows_around_an_object_that_hides_it(robot: str):
     env = started(robot)
     widest = max(math.hypot(*env.world.extents(name)[:2]) for name in env.scene.objects)
     for height in (0.3, widest / 4):
         env.world.place(GOAL, np.array([0.5, 0.1, height]), UPRIGHT)
         env.world.update()
-        (stand,) = props(env.scene, env.data)
+        stand, *cross = props(env.scene, env.data)
         np.testing.assert_allclose(stand.position[:2], [0.5, 0.1])
         assert stand.position[2] == pytest.approx(stand.size[1])  # on the table
-        if height == 0.3:
-            assert 2 * stand.size[1] == pytest.approx(height)
-        else:
+        if height < 0.3:
             assert 2 * stand.size[0] > widest
+            assert not cross
+            continue
+        assert 2 * stand.size[1] == pytest.approx(height)
+        for one in cross:
+            np.testing.assert_allclose(one.position, [0.5, 0.1, height])
+            assert 2 * one.size[1] > widest
+        np.testing.assert_allclose(np.abs(np.stack([one.rotation[:, 2] for one in cross])), np.eye(3)[:2])
 
 
 @every_robot
