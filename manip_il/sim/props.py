@@ -63,6 +63,8 @@ def _stand(scene: Scene, data: mujoco.MjData) -> list[Prop]:
     if body < 0:
         return []
     x, y, z = data.mocap_pos[scene.model.body_mocapid[body]].tolist()
+    if z < 0:
+        return []
     scale = min(1.0, scene.robot.workspace.half_width / _USUAL)
     largest = max((float(scene.model.geom_rbound[one.geom]) for one in scene.objects.values()), default=_GOAL * scale)
     if z <= _SHORTEST:
