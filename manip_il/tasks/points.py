@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 
@@ -31,7 +32,7 @@ def points_in(world: World) -> dict[str, F64]:
     return found
 
 
-@lru_cache
+@lru_cache(SCENES_KEPT)
 def point_names(scene: Scene) -> tuple[str, ...]:
     """Return the names of `points_in`, in its order."""
     world = World(scene)
@@ -39,7 +40,7 @@ def point_names(scene: Scene) -> tuple[str, ...]:
     return tuple(points_in(world))
 
 
-@lru_cache
+@lru_cache(SCENES_KEPT)
 def _named(scene: Scene) -> frozenset[str]:
     """Names of bodies, geoms and sites."""
     model = scene.model

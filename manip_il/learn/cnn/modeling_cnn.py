@@ -199,9 +199,9 @@ class CNNPolicy(MLPPolicy):
             losses = super()._row_losses(inputs, batch)
             if not self.training or batch.get(INDEX) is None:
                 return losses
-            index = batch[INDEX].reshape(-1)
+            index = batch[INDEX].reshape(-1).cpu()
             if self._privileged_by_index is not None:
-                truth = (self._privileged_by_index.to(inputs.device)[index] - self.truth_mean) * self.truth_scale
+                truth = (self._privileged_by_index[index].to(inputs.device) - self.truth_mean) * self.truth_scale
                 losses = losses + self.aux_weight * (inputs[:, self.seen_size :] - truth).abs().mean(-1)
             if self._places_by_index is not None:
                 losses = losses + self.heatmap_weight * self._heat_map_losses(self._places_by_index[index])
