@@ -24,6 +24,7 @@ _STREAMS = {
     "certificate": 5,
     "held_out": 6,
     "redraw": 7,
+    "theory": 8,
 }
 _FIRST_ROUND = 10  # rounds take blocks 10, 11, ...
 _BLOCKS_PER_SEED = _FIRST_ROUND + MAX_ROUNDS

@@ -54,6 +54,7 @@ COMMANDS = {
     "compare": Command("manip_il.cli.compare:CompareOptions", "compare two policies or runs on the same seeds"),
     "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
     "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
+    "theory": Command("manip_il.cli.theory:TheoryOptions", "see what is proved of cloning and DAgger, on an arm, too"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(
