@@ -228,7 +228,8 @@ def _commands(names: Collection[str]) -> str:
 def _command_help(name: str, cls: Any, words: Sequence[str] = ()) -> str:
     """Help of one command. words: all that was given, as some have help for a choice, too (`more_help`)."""
     options = options_of(cls)
-    places = "".join(f" {option.label}" for option in options if option.positional)
+    positional = [option for option in options if option.positional]
+    places = "".join(f" {one.label}" if one.default is MISSING else f" [{one.label}]" for one in positional)
     rows = [_row(option) for option in options]
     rows.append(("--config_path=FILE.yaml", "read options from YAML; those on the command line win"))
     width = max(len(left) for left, _ in rows) + 2

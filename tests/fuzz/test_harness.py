@@ -51,7 +51,7 @@ def test_an_error_of_ours_is_no_finding_and_neither_is_a_file_that_may_not_be_re
 
 @pytest.mark.slow
 def test_memory_beyond_the_limit_is_a_finding(tmp_path: Path) -> None:
-    tried = _bench(tmp_path, lambda folder: bytes(1) * (LARGEST + 100) * 2**20).attempt(b"", 0)
+    tried = _bench(tmp_path, lambda folder: bytes(1) * (LARGEST + 400) * 2**20).attempt(b"", 0)
     assert f"more than {LARGEST}" in tried.problem
     assert tried.megabytes > LARGEST
 
