@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
+from manip_il.cli.candidates import common_env, read_candidate
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
@@ -76,11 +77,10 @@ class TheoryOptions:
     def _shift(self, run: Path) -> Shift:
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.certify import certify, count_episodes
-        from manip_il.learn.checkpoint import read_meta
         from manip_il.theory.shift import find_rounds, measure_shift
 
         rounds = find_rounds(run)
-        env = common.EnvGroup().config(None, None, read_meta(rounds[0].policy))
+        env = common_env(read_candidate(run).sources, common.EnvGroup(), None, common.MaybeTaskGroup())
         count = count_episodes(env, self.cases) + self.episodes * (1 + len(rounds))
         with progress(count, f"theory {run}") as bar, Engine(self.workers) as engine:
             certificate = certify(engine, env, self.cases, on_episode=lambda _: bar.advance())

@@ -1,1 +1,1 @@
-"""Finite Markov decision processes, the chapter's theorems on them, and rewards inferred from demonstrations."""
+"""Finite Markov decision processes, solved exactly."""

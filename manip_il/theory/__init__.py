@@ -1,1 +1,1 @@
-"""What is proved of imitation, seen: theorems on processes solved exactly, control of linear systems, and an arm."""
+"""Theorems on imitation, seen: on processes solved exactly, on linear systems, and on an arm."""

@@ -1,4 +1,4 @@
-"""What cloning and DAgger lose over the horizon, beside what the two theorems allow.
+"""Losses of cloning and DAgger over the horizon, beside what the two theorems allow.
 
 Theorem 8.1: a policy that errs in a share eps of the expert's states loses at most H^2 eps (Ross & Bagnell 2010).
 Theorem 8.2: one that errs in a share eps of its own states loses at most u H eps, where u is the most that one wrong

@@ -7,7 +7,7 @@ import pytest
 from manip_il.cli.main import main
 
 RUN = ["dagger", "--robot.type=panda", "--task.type=reach", "--demonstrations=4", "--rounds=1"]
-QUICK = ["--episodes_per_round=2", "--validation_episodes=2", "--steps=60", "--workers=1"]
+QUICK = ["--env.horizon=60", "--episodes_per_round=2", "--validation_episodes=2", "--steps=60", "--workers=1"]
 
 
 @pytest.mark.slow
@@ -22,6 +22,7 @@ def test_the_page_shows_the_theorems_and_the_run(tmp_path, capsys):
     assert "policies above their bound: 0" in out
     shift = found["shift"]
     assert (shift["robot"], shift["task"], len(shift["rounds"])) == ("panda", "reach", 2)
+    assert shift["horizon"] == 60  # the run's own
     for one in shift["rounds"]:
         assert one["bound"] == pytest.approx(shift["u"] * one["on_own"]["per_episode"])
         assert one["gap"] == pytest.approx(one["cost"] - shift["expert_cost"])
