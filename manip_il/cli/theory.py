@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli import common_options as common
-from manip_il.cli.candidates import common_env, read_candidate
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
@@ -75,6 +74,7 @@ class TheoryOptions:
         say(f"report: {folder / PAGE}")
 
     def _shift(self, run: Path) -> Shift:
+        from manip_il.cli.candidates import common_env, read_candidate  # here, as it needs numpy
         from manip_il.engine.engine import Engine
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.theory.shift import find_rounds, measure_shift
