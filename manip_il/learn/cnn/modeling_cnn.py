@@ -38,14 +38,15 @@ class KeypointEncoder(nn.Module):
     Delving deep into rectifiers, ICCV 2015, Eq. 10). With red, green and blue and torch's own weights every softmax
     began as the mean over the picture, and in 1,100 steps a goal of 5 pixels was not found; so it is in 300.
 
-    channels: of the layers; the first two halve the picture's sides. maps: logarithms of the last pictures' heat maps,
-    (B, K, height, width), while learning.
+    channels: of the layers; the first two halve the picture's sides. keeps_maps: have `maps`, logarithms of the last
+    pictures' heat maps, (B, K, height, width), while learning.
     """
 
     maps: Tensor | None = None
 
-    def __init__(self, channels: Sequence[int], keypoints: int) -> None:
+    def __init__(self, channels: Sequence[int], keypoints: int, *, keeps_maps: bool = False) -> None:
         super().__init__()
+        self.keeps_maps = keeps_maps
         layers: list[nn.Module] = []
         for i, (inputs, outputs) in enumerate(zip((3, *channels[:-1]), channels, strict=True)):
             kernel = 5 if i == 0 else 3
@@ -64,21 +65,30 @@ class KeypointEncoder(nn.Module):
         features = self.layers(_light_and_colour(pictures).contiguous(memory_format=torch.channels_last))
         # In half precision a keypoint would jump from pixel to pixel.
         with torch.autocast(pictures.device.type, enabled=False):
-            return self._keypoints(self.heat(features.float()))
+            return self._keypoints(features.float())
 
-    def _keypoints(self, heat: Tensor) -> Tensor:
-        flat = heat.flatten(2)
-        weights = (_SHARPNESS * flat).softmax(-1).view_as(heat)
-        if self.training:
-            self.maps = (_SHARPNESS * flat).log_softmax(-1).view_as(heat)
-        across, down = weights.sum(2), weights.sum(3)
-        grid_x = torch.linspace(-1.0, 1.0, heat.shape[3], device=heat.device)
-        grid_y = torch.linspace(-1.0, 1.0, heat.shape[2], device=heat.device)
-        x, y = across @ grid_x, down @ grid_y
-        variance = across @ grid_x.square() + down @ grid_y.square() - x.square() - y.square()
+    def _keypoints(self, features: Tensor) -> Tensor:
+        """Numbers of the keypoints, (B, 4 K), from features (B, C, height, width)."""
+        height, width = features.shape[2:]
+        # A convolution of one pixel as a product, whose result lies in memory as the softmax wants it.
+        cells = features.permute(0, 2, 3, 1).flatten(1, 2).transpose(1, 2)  # (B, C, cells), without a copy
+        heat = self.heat.weight.flatten(1) @ cells + self.heat.bias.unsqueeze(1)  # type: ignore[union-attr]
+        weights = (_SHARPNESS * heat).softmax(-1)
+        if self.training and self.keeps_maps:
+            self.maps = (_SHARPNESS * heat).log_softmax(-1).unflatten(-1, (height, width))
+        moments = weights @ _places(height, width, heat.device)
+        x, y = moments[..., 0], moments[..., 1]
+        variance = moments[..., 2] - x.square() - y.square()
         spread = variance.clamp(min=1e-6).sqrt()
-        strength = (weights.flatten(2) * flat).sum(-1)
+        strength = (weights * heat).sum(-1)
         return torch.cat([x, y, _SPREAD * spread, _STRENGTH * strength], dim=-1)
+
+
+def _places(height: int, width: int, device: torch.device) -> Tensor:
+    """Across, down, and the sum of their squares, of every cell of a heat map, row by row, (height width, 3)."""
+    x = torch.linspace(-1.0, 1.0, width, device=device).repeat(height)
+    y = torch.linspace(-1.0, 1.0, height, device=device).repeat_interleave(width)
+    return torch.stack([x, y, x.square() + y.square()], dim=1)
 
 
 def heat_map_losses(maps: Tensor, places: Tensor) -> Tensor:
@@ -170,7 +180,8 @@ class CNNPolicy(MLPPolicy):
         """Make encoders, the perceptron that reads the state off, and the one for the action, of the sizes given."""
         features, size = config.input_features or {}, config.privileged_size
         n = features[STATE].shape[0]
-        encoders = [KeypointEncoder(config.channels, config.named_points + config.keypoints) for _ in self.cameras]
+        count, named = config.named_points + config.keypoints, config.named_points > 0
+        encoders = [KeypointEncoder(config.channels, count, keeps_maps=named) for _ in self.cameras]
         self.encoders = nn.ModuleList(encoders)
         self.seen_size = sum(features[key].shape[0] for key in self.inputs) + sum(one.size for one in encoders)
         self.privileged = None
