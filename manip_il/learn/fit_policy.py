@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -192,21 +192,27 @@ class PolicyTrainer:
                 yield record | self.validate()
 
     def validate(self) -> dict[str, float]:
-        """Return mean loss on samples of the held-out episodes, without touching the training's random state."""
-        held_out = self.samples.held_out
-        if len(held_out) == 0 or not self.accelerator.is_main_process:
+        """Return mean loss on samples of the held-out episodes, without touching the training's random state.
+
+        Every process takes its share of them.
+        """
+        held_out, size = self.samples.held_out, self.batch_size
+        if len(held_out) == 0:
             return {}
         policy = self.accelerator.unwrap_model(self.policy)
         policy.eval()
         total = 0.0
         with torch.no_grad(), torch.random.fork_rng(), self.accelerator.autocast():
             torch.manual_seed(self.config.seed)  # a policy that draws (diffusion) draws the same every time
-            size = self.batch_size
             pieces = [held_out[start : start + size] for start in range(0, len(held_out), size)]
+            pieces = pieces[self.accelerator.process_index :: self.accelerator.num_processes]
             for rows, batch in zip(pieces, self.samples.source.batches(pieces), strict=True):
                 loss, _ = policy.forward(self.preprocessor(pictures_to_float(batch, self.samples.cameras)))
                 total += loss.item() * len(rows)
         policy.train()
+        if self.accelerator.num_processes > 1:
+            mine = torch.tensor(total, dtype=torch.float64, device=self.accelerator.device)
+            total = cast(torch.Tensor, self.accelerator.reduce(mine)).item()
         return {"val_loss": total / len(held_out)}
 
     def save(self, record: Mapping[str, Any]) -> None:
@@ -297,9 +303,10 @@ def _accelerator(policy: PreTrainedConfig) -> Accelerator:
     if not hasattr(policy, "dtype") and policy.use_amp:
         precision = _on_this_cpu() if policy.device == "cpu" else "fp16"
     forget_earlier_fits()
+    ours = policy.type in OWN_SPACE  # their buffers are units of the data, which do not change
     return Accelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         cpu=policy.device == "cpu",
-        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=policy.type not in OWN_SPACE)],
+        kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=not ours, broadcast_buffers=not ours)],
     )

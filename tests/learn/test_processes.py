@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -35,6 +36,12 @@ def fit(root: Path, folder: Path, processes: int, steps: int = 4) -> dict[str, t
         return load_file(trainer.fit() / "model.safetensors")
 
 
+def val_losses(folder: Path) -> list[float]:
+    """Loss on held-out episodes after every step."""
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line)["val_loss"] for line in lines]
+
+
 @pytest.mark.slow
 def test_two_processes_make_the_weights_of_one_within_rounding(demos, tmp_path):
     one, two = fit(demos, tmp_path / "one", 1), fit(demos, tmp_path / "two", 2)
@@ -43,6 +50,9 @@ def test_two_processes_make_the_weights_of_one_within_rounding(demos, tmp_path):
         torch.testing.assert_close(two[name], weights, rtol=1e-4, atol=1e-5)
     assert any(not torch.allclose(begun[name], weights, rtol=1e-4, atol=1e-5) for name, weights in one.items())
     assert "RANK" not in os.environ
+    losses = [val_losses(tmp_path / name) for name in ("one", "two")]
+    assert len(losses[0]) == 4
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)
     again = fit(demos, tmp_path / "again", 1)  # this process is alone again
     assert all(torch.equal(again[name], weights) for name, weights in one.items())
 
