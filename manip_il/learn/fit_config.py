@@ -43,7 +43,7 @@ class Defaults(NamedTuple):
 
 
 LEROBOT = Defaults(100_000, 8, 20_000)
-DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(10_000, 32, 1_000)}  # where they are not LeRobot's
+DEFAULTS = {MLP: Defaults(3_000, 512, 1_000), "cnn": Defaults(15_000, 32, 1_000)}  # where they are not LeRobot's
 
 
 def _by_default(name: str) -> str:

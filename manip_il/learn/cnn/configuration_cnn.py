@@ -34,7 +34,7 @@ class CNNConfig(MLPConfig):
     Raises what `MLPConfig` raises, `UsageError` for sizes and weights out of range.
     """
 
-    channels: tuple[int, ...] = (16, 32, 48, 48)
+    channels: tuple[int, ...] = (16, 32, 32, 32)
     keypoints: int = 32
     aux_weight: float = 0.5
     heatmap_weight: float = 0.0
