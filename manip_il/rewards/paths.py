@@ -1,0 +1,161 @@
+"""Paths to a goal as a finite decision process: named costs an edge, the cheapest path by Dijkstra.
+
+Every edge has features, and weights turn them into its cost; states are nodes, actions the edges that leave them, and
+the goal keeps who reaches it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from manip_il.errors import ManipError, MismatchError
+from manip_il.rewards.finite import FiniteMDP
+
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
+NOWHERE = -1  # as the node that follows: none
+_UNREACHED = 1e6  # times the dearest edge: what a step costs in `to_mdp` where no edge leaves
+
+
+@dataclass(frozen=True)
+class PathProblem:
+    """S nodes, E edges with K features each, one goal.
+
+    edges: (E, 2), from and to, each pair once and none from a node to itself. features: (E, K), 0 or more, such as
+    metres of the edge above a thing. Raises `MismatchError` for shapes that do not fit, `ManipError` for edges between
+    nodes that are not there, pairs twice, and features that are negative or not finite.
+    """
+
+    edges: I64
+    features: F64
+    nodes: int
+    goal: int
+
+    def __post_init__(self) -> None:
+        if self.edges.ndim != 2 or self.edges.shape[1] != 2:
+            raise MismatchError("shape", "the edges", self.edges.shape, "a path problem", "(E, 2)")
+        if self.features.ndim != 2 or len(self.features) != len(self.edges):
+            raise MismatchError("shape", "the features", self.features.shape, "the edges", (len(self.edges), "K"))
+        least, most = self.edges.min(initial=self.goal), self.edges.max(initial=self.goal)
+        if least < 0 or most >= self.nodes:
+            raise ManipError(f"edges or goal name nodes {least} to {most}; expected 0 to {self.nodes - 1}")
+        if (self.edges[:, 0] == self.edges[:, 1]).any():
+            raise ManipError("an edge leads from a node to itself")
+        if (np.diff(self._keys) == 0).any():
+            raise ManipError("two edges have the same nodes; expected one edge from a node to another")
+        if not np.isfinite(self.features).all() or self.features.min(initial=0.0) < 0:
+            raise ManipError("a feature of an edge is negative or not finite")
+
+    @cached_property
+    def order(self) -> I64:
+        """Edges sorted by the node they leave, then by the one they lead to, (E,)."""
+        return np.argsort(self.edges[:, 0] * self.nodes + self.edges[:, 1], kind="stable")
+
+    @cached_property
+    def _keys(self) -> I64:
+        ordered = self.edges[self.order]
+        return ordered[:, 0] * self.nodes + ordered[:, 1]
+
+    @cached_property
+    def _starts(self) -> I64:
+        """Where the edges of each node begin in `order`, (S + 1,)."""
+        return np.append(0, np.cumsum(np.bincount(self.edges[:, 0], minlength=self.nodes)))
+
+    @cached_property
+    def incoming(self) -> tuple[I64, I64, I64]:
+        """Edges sorted by the node they lead to (E,), the nodes they leave (E,), where each node's begin (S + 1,)."""
+        order = np.argsort(self.edges[:, 1], kind="stable")
+        return order, self.edges[order, 0], np.append(0, np.cumsum(np.bincount(self.edges[:, 1], minlength=self.nodes)))
+
+    def costs(self, weights: F64) -> F64:
+        """Return what every edge costs, (E,), for weights (K,). Raises `ManipError` for a cost below 0."""
+        if np.shape(weights) != self.features.shape[1:]:
+            raise MismatchError("shape", "the weights", np.shape(weights), "the features", self.features.shape[1:])
+        found = self.features @ weights
+        if not np.isfinite(found).all() or found.min(initial=0.0) < 0:
+            raise ManipError(f"an edge costs {found.min():.3g}; expected 0 or more: with less, no path is the cheapest")
+        return found
+
+    def matrix(self, values: F64) -> Any:
+        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S)."""
+        to = self.edges[self.order, 1]
+        return csr_array((values[self.order], to, self._starts), shape=(self.nodes, self.nodes))
+
+    def edges_of(self, path: I64) -> I64:
+        """Return the edges along a path of nodes (n,), (n - 1,). Raises `ManipError` where two are not joined."""
+        wanted = path[:-1] * self.nodes + path[1:]
+        at = np.searchsorted(self._keys, wanted).clip(max=max(len(self._keys) - 1, 0))
+        if len(wanted) and (not len(self._keys) or (self._keys[at] != wanted).any()):
+            raise ManipError("a path goes where no edge leads")
+        return self.order[at]
+
+    def sums(self, path: I64) -> F64:
+        """Return the features of a path of nodes (n,), summed over its edges, (K,)."""
+        return self.features[self.edges_of(path)].sum(axis=0)
+
+    def to_mdp(self, weights: F64, start: int) -> FiniteMDP:
+        """Return the same as a process of S states; action a takes a node's edge a, or its last one where it has fewer.
+
+        weights: (K,). The goal keeps who is there at no cost; a node without edges does so at a high one.
+        """
+        costs, counts = self.costs(weights)[self.order], np.diff(self._starts)
+        actions = np.minimum(np.arange(counts.max(initial=1)), np.maximum(counts, 1)[:, None] - 1)
+        edge = np.minimum(self._starts[:-1, None] + actions, max(len(costs) - 1, 0))
+        stays = np.arange(self.nodes) == self.goal
+        stuck = (counts == 0) & ~stays
+        to = np.where((stays | stuck)[:, None], np.arange(self.nodes)[:, None], self.edges[self.order, 1][edge])
+        paid = np.where(stays[:, None], 0.0, costs[edge])
+        paid[stuck] = _UNREACHED * costs.max(initial=1.0)
+        rows = np.arange(to.size + 1)
+        moves = csr_array((np.ones(to.size), to.ravel(), rows), shape=(to.size, self.nodes))
+        return FiniteMDP(moves, -paid, np.eye(self.nodes)[start])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The cheapest way to the goal from everywhere.
+
+    costs: (S,), infinite where no path leads to the goal. following: the next node, (S,), `NOWHERE` at the goal and
+    where no path leads.
+    """
+
+    costs: F64
+    following: I64
+
+
+def plan(problem: PathProblem, weights: F64) -> Plan:
+    """Return the cheapest way from every node for weights (K,), exactly: Dijkstra from the goal backwards.
+
+    Raises what `PathProblem.costs` raises.
+    """
+    order, before, starts = problem.incoming
+    backwards = csr_array(
+        (problem.costs(weights)[order], before, starts), shape=(problem.nodes, problem.nodes)
+    )  # built of its parts, as zeros stay edges so
+    costs, following = dijkstra(backwards, indices=problem.goal, return_predecessors=True)
+    return Plan(costs, np.where(following < 0, NOWHERE, following).astype(np.int64))
+
+
+def costs_to_go(problem: PathProblem, weights: F64) -> F64:
+    """Return the cost of the cheapest path from every node, (S,), for weights (K,); infinite where there is none."""
+    return plan(problem, weights).costs
+
+
+def cheapest_path(problem: PathProblem, planned: Plan, start: int) -> tuple[I64, F64]:
+    """Return the nodes of a plan's path from a start, (n,), and its feature sums, (K,).
+
+    Raises `ManipError` where no path leads to the goal.
+    """
+    if not np.isfinite(planned.costs[start]):
+        raise ManipError(f"no path leads from node {start} to the goal")
+    path = [start]
+    while path[-1] != problem.goal:
+        path.append(int(planned.following[path[-1]]))
+    nodes = np.array(path, np.int64)
+    return nodes, problem.sums(nodes)
