@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 from manip_il.errors import ManipError, MismatchError
 from manip_il.rewards.finite import FiniteMDP
 
-F64, I64 = NDArray[np.float64], NDArray[np.int64]
+F64, I64, I32 = NDArray[np.float64], NDArray[np.int64], NDArray[np.int32]
 NOWHERE = -1  # as the node that follows: none
 _UNREACHED = 1e6  # times the dearest edge: what a step costs in `to_mdp` where no edge leaves
 
@@ -47,31 +47,33 @@ class PathProblem:
             raise ManipError(f"edges or goal name nodes {least} to {most}; expected 0 to {self.nodes - 1}")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ManipError("an edge leads from a node to itself")
-        if (np.diff(self._keys) == 0).any():
+        if (np.diff(self._keys()) == 0).any():
             raise ManipError("two edges have the same nodes; expected one edge from a node to another")
         if not np.isfinite(self.features).all() or self.features.min(initial=0.0) < 0:
             raise ManipError("a feature of an edge is negative or not finite")
 
     @cached_property
-    def order(self) -> I64:
+    def order(self) -> I32:
         """Edges sorted by the node they leave, then by the one they lead to, (E,)."""
-        return np.argsort(self.edges[:, 0] * self.nodes + self.edges[:, 1], kind="stable")
+        return np.argsort(self.edges[:, 0] * self.nodes + self.edges[:, 1], kind="stable").astype(np.int32)
 
-    @cached_property
     def _keys(self) -> I64:
-        ordered = self.edges[self.order]
-        return ordered[:, 0] * self.nodes + ordered[:, 1]
+        return self.edges[self.order, 0] * self.nodes + self.edges[self.order, 1]
 
     @cached_property
-    def _starts(self) -> I64:
-        """Where the edges of each node begin in `order`, (S + 1,)."""
-        return np.append(0, np.cumsum(np.bincount(self.edges[:, 0], minlength=self.nodes)))
+    def _outgoing(self) -> tuple[I32, I32]:
+        """The nodes that the edges in `order` lead to (E,), and where each node's edges begin there (S + 1,)."""
+        return self.edges[self.order, 1].astype(np.int32), self._starts(0)
 
     @cached_property
-    def incoming(self) -> tuple[I64, I64, I64]:
+    def _incoming(self) -> tuple[I32, I32, I32]:
         """Edges sorted by the node they lead to (E,), the nodes they leave (E,), where each node's begin (S + 1,)."""
-        order = np.argsort(self.edges[:, 1], kind="stable")
-        return order, self.edges[order, 0], np.append(0, np.cumsum(np.bincount(self.edges[:, 1], minlength=self.nodes)))
+        order = np.argsort(self.edges[:, 1], kind="stable").astype(np.int32)
+        return order, self.edges[order, 0].astype(np.int32), self._starts(1)
+
+    def _starts(self, side: int) -> I32:
+        counts = np.bincount(self.edges[:, side], minlength=self.nodes)
+        return np.append(0, np.cumsum(counts)).astype(np.int32)
 
     def costs(self, weights: F64) -> F64:
         """Return what every edge costs, (E,), for weights (K,). Raises `ManipError` for a cost below 0."""
@@ -83,17 +85,22 @@ class PathProblem:
         return found
 
     def matrix(self, values: F64) -> Any:
-        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S)."""
-        to = self.edges[self.order, 1]
-        return csr_array((values[self.order], to, self._starts), shape=(self.nodes, self.nodes))
+        """Return values of the edges (E,) as a sparse matrix from -> to, (S, S). Zeros stay entries."""
+        return csr_array((values[self.order], *self._outgoing), shape=(self.nodes, self.nodes))
+
+    def backwards(self, values: F64) -> Any:
+        """Return values of the edges (E,) as a sparse matrix to -> from, (S, S). Zeros stay entries."""
+        order, before, starts = self._incoming
+        return csr_array((values[order], before, starts), shape=(self.nodes, self.nodes))
 
     def edges_of(self, path: I64) -> I64:
         """Return the edges along a path of nodes (n,), (n - 1,). Raises `ManipError` where two are not joined."""
         wanted = path[:-1] * self.nodes + path[1:]
-        at = np.searchsorted(self._keys, wanted).clip(max=max(len(self._keys) - 1, 0))
-        if len(wanted) and (not len(self._keys) or (self._keys[at] != wanted).any()):
+        keys = self._keys()
+        at = np.searchsorted(keys, wanted).clip(max=max(len(keys) - 1, 0))
+        if len(wanted) and (not len(keys) or (keys[at] != wanted).any()):
             raise ManipError("a path goes where no edge leads")
-        return self.order[at]
+        return self.order[at].astype(np.int64)
 
     def sums(self, path: I64) -> F64:
         """Return the features of a path of nodes (n,), summed over its edges, (K,)."""
@@ -104,12 +111,13 @@ class PathProblem:
 
         weights: (K,). The goal keeps who is there at no cost; a node without edges does so at a high one.
         """
-        costs, counts = self.costs(weights)[self.order], np.diff(self._starts)
+        costs, (leads, starts) = self.costs(weights)[self.order], self._outgoing
+        counts = np.diff(starts)
         actions = np.minimum(np.arange(counts.max(initial=1)), np.maximum(counts, 1)[:, None] - 1)
-        edge = np.minimum(self._starts[:-1, None] + actions, max(len(costs) - 1, 0))
+        edge = np.minimum(starts[:-1, None] + actions, max(len(costs) - 1, 0))
         stays = np.arange(self.nodes) == self.goal
         stuck = (counts == 0) & ~stays
-        to = np.where((stays | stuck)[:, None], np.arange(self.nodes)[:, None], self.edges[self.order, 1][edge])
+        to = np.where((stays | stuck)[:, None], np.arange(self.nodes)[:, None], leads[edge])
         paid = np.where(stays[:, None], 0.0, costs[edge])
         paid[stuck] = _UNREACHED * costs.max(initial=1.0)
         rows = np.arange(to.size + 1)
@@ -134,10 +142,7 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 
     Raises what `PathProblem.costs` raises.
     """
-    order, before, starts = problem.incoming
-    backwards = csr_array(
-        (problem.costs(weights)[order], before, starts), shape=(problem.nodes, problem.nodes)
-    )  # built of its parts, as zeros stay edges so
+    backwards = problem.backwards(problem.costs(weights))
     costs, following = dijkstra(backwards, indices=problem.goal, return_predecessors=True)
     return Plan(costs, np.where(following < 0, NOWHERE, following).astype(np.int64))
 

@@ -1,0 +1,89 @@
+"""Maximum entropy inverse reinforcement learning (Ziebart et al. 2008, 2010).
+
+Of all distributions over paths whose expected features are the demonstrations', the one of most entropy is
+p(path) = exp(-w . features(path)) / Z(w). Its weights are those of the greatest likelihood, which is concave; the
+gradient is the difference between expected and demonstrated features. Who always takes the cheapest path leaves the
+scale of the weights open, so a normal prior holds it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from manip_il.errors import ManipError
+from manip_il.rewards.demonstrations import Demonstration, count_features
+from manip_il.rewards.soft import soft_plan
+
+F64 = NDArray[np.float64]
+PRIOR = 100.0  # standard deviation of a weight [1/m]
+_MOST_STEPS = 200
+_ENOUGH = 1e-5  # [m] by which the gradient may miss 0
+_ABOVE = 1.001  # times the least weight for which the sum over all paths is finite
+
+
+@dataclass(frozen=True)
+class Entropy:
+    """weights: (K,) [1/m], their scale the certainty. expected, demonstrated: mean features of a path, (K,) [m]."""
+
+    weights: F64
+    expected: F64
+    demonstrated: F64
+    evaluations: int
+
+
+def loss_of(demonstrations: Sequence[Demonstration], weights: F64, prior: float = PRIOR) -> tuple[float, F64, F64]:
+    """Return the mean negative log-likelihood with the prior's share, its gradient (K,), mean expected features (K,).
+
+    Raises what `soft_plan` raises.
+    """
+    count = len(demonstrations)
+    loss = 0.5 * float(weights @ weights) / (prior**2 * count)
+    gradient, expected = weights / (prior**2 * count), np.zeros_like(weights)
+    for one in demonstrations:
+        planned = soft_plan(one.problem, weights)
+        loss += (float(one.sums @ weights) - float(planned.values[one.start])) / count
+        features = planned.features(one.start)
+        expected += features / count
+        gradient = gradient + (one.sums - features) / count
+    return loss, gradient, expected
+
+
+def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
+    """Return weights (K,) [1/m] from which on the sum over all paths is finite: a step outweighs the choice of it.
+
+    That is log(most edges of a node) over the shortest edge, for the first feature that every edge has; 0 for others.
+    Raises `ManipError` where no feature is on every edge.
+    """
+    found = np.zeros(count_features(demonstrations))
+    shortest = np.min([one.problem.features.min(axis=0) for one in demonstrations], axis=0)
+    if not (shortest > 0).any():
+        raise ManipError("no feature is above 0 on every edge, as length is: paths over edges of no cost never end")
+    base = int(np.argmax(shortest > 0))
+    most = max(int(np.bincount(one.problem.edges[:, 0]).max()) for one in demonstrations)
+    found[base] = _ABOVE * np.log(most) / shortest[base]
+    return found
+
+
+def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> Entropy:
+    """Return the most likely weights, each 0 or more, by L-BFGS-B from twice the least ones. prior: [1/m]."""
+    least = least_weights(demonstrations)
+    start = np.maximum(2 * least, least.max() / 2)
+    evaluations = 0
+
+    def loss(weights: F64) -> tuple[float, F64]:
+        nonlocal evaluations
+        evaluations += 1
+        value, gradient, _ = loss_of(demonstrations, weights, prior)
+        return value, gradient
+
+    options: Any = {"maxiter": _MOST_STEPS, "gtol": _ENOUGH, "ftol": 0.0}
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(low, None) for low in least], options=options)
+    weights = np.asarray(found.x)
+    *_, expected = loss_of(demonstrations, weights, prior)
+    return Entropy(weights, expected, np.mean([one.sums for one in demonstrations], axis=0), evaluations)
