@@ -12,7 +12,7 @@ from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import angle_between
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Target, objects_in
+from manip_il.tasks.task import Refusing, Target, objects_in
 
 F64 = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Expert:
             reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
             if not in_hand and not reaches(position):
                 return f"{name} out of reach"
-        return ""
+        return self._task.unsound(world) if isinstance(self._task, Refusing) else ""
 
     def _towards(self, q: F64, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)

@@ -134,7 +134,7 @@ class _Redrawer:
 
     def __init__(self, config: EnvConfig, cameras: CameraConfig):
         self._env = ManipEnv.of(config, cameras)
-        self._task = get_task(config.task, config.object)
+        self._task = get_task(config.task, config.object, config.reward)
         self._expert: Labeller = simulation_of(config.robot).expert(config)
         self._config = config
         self._branch_env = BranchEnv(ManipEnv.of(config, cameras))
