@@ -13,6 +13,8 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
+_DIGITS = 6  # decimals [m] in which the features of different paths differ
+_SAME = 1e-6  # [m] that sums of a feature may differ by and be the same
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,30 @@ def count_features(demonstrations: Sequence[Demonstration]) -> int:
     return counts.pop()
 
 
+def base_feature(demonstrations: Sequence[Demonstration]) -> int:
+    """Return the first feature that every edge has, such as its length. Raises `ManipError` where there is none."""
+    shortest = np.min([one.problem.features.min(axis=0) for one in demonstrations], axis=0)
+    if not (shortest > 0).any():
+        raise ManipError("no feature is above 0 on every edge, as length is: paths over edges of no cost never end")
+    return int(np.argmax(shortest > 0))
+
+
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:
     """Return what each demonstration competes with: sums of the paths that are cheapest for tastes (n, K), each once.
 
     The demonstration's own sums stand first: (m, K), m at most n + 1.
     """
+    return add_rivals(demonstrations, [one.sums[None] for one in demonstrations], tastes)
+
+
+def add_rivals(demonstrations: Sequence[Demonstration], sums: Sequence[F64], tastes: F64) -> list[F64]:
+    """Return sums (m, K) of each demonstration's rivals, and those for more tastes (n, K) that are not there yet."""
     found = []
-    for one in demonstrations:
-        sums = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
-        others = np.unique(np.array(sums).round(_DIGITS), axis=0)
-        apart = np.abs(others - one.sums).max(axis=1) > 10.0**-_DIGITS
-        found.append(np.concatenate([one.sums[None], others[apart]]))
+    for one, known in zip(demonstrations, sums, strict=True):
+        more = [cheapest_path(one.problem, plan(one.problem, taste), one.start)[1] for taste in tastes]
+        every = np.concatenate([known, more])
+        _, first = np.unique(every.round(_DIGITS), axis=0, return_index=True)
+        found.append(every[np.sort(first)])
     return found
 
 
@@ -71,7 +86,3 @@ def open_features(demonstrations: Sequence[Demonstration], sums: Sequence[F64]) 
     for one, others in zip(demonstrations, sums, strict=True):
         differ |= np.abs(others - one.sums).max(axis=0) > _SAME
     return [int(k) for k in np.flatnonzero(~differ)]
-
-
-_DIGITS = 9  # decimals in which sums of different paths differ
-_SAME = 1e-6  # [m] that sums of a feature may differ by and be the same

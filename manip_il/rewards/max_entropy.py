@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from manip_il.errors import ManipError
-from manip_il.rewards.demonstrations import Demonstration, count_features
+from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features
 from manip_il.rewards.soft import soft_plan
 
 F64 = NDArray[np.float64]
@@ -58,15 +57,12 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
     """Return weights (K,) [1/m] from which on the sum over all paths is finite: a step outweighs the choice of it.
 
     That is log(most edges of a node) over the shortest edge, for the first feature that every edge has; 0 for others.
-    Raises `ManipError` where no feature is on every edge.
+    Raises what `base_feature` raises.
     """
-    found = np.zeros(count_features(demonstrations))
-    shortest = np.min([one.problem.features.min(axis=0) for one in demonstrations], axis=0)
-    if not (shortest > 0).any():
-        raise ManipError("no feature is above 0 on every edge, as length is: paths over edges of no cost never end")
-    base = int(np.argmax(shortest > 0))
+    found, base = np.zeros(count_features(demonstrations)), base_feature(demonstrations)
+    shortest = min(float(one.problem.features[:, base].min()) for one in demonstrations)
     most = max(int(np.bincount(one.problem.edges[:, 0]).max()) for one in demonstrations)
-    found[base] = _ABOVE * np.log(most) / shortest[base]
+    found[base] = _ABOVE * np.log(most) / shortest
     return found
 
 

@@ -138,13 +138,14 @@ class Plan:
 
 
 def plan(problem: PathProblem, weights: F64) -> Plan:
-    """Return the cheapest way from every node for weights (K,), exactly: Dijkstra from the goal backwards.
+    """Return the cheapest way from every node for weights (K,). Raises what `PathProblem.costs` raises."""
+    return plan_edges(problem, problem.costs(weights))
 
-    Raises what `PathProblem.costs` raises.
-    """
-    backwards = problem.backwards(problem.costs(weights))
-    costs, following = dijkstra(backwards, indices=problem.goal, return_predecessors=True)
-    return Plan(costs, np.where(following < 0, NOWHERE, following).astype(np.int64))
+
+def plan_edges(problem: PathProblem, costs: F64) -> Plan:
+    """Return the cheapest way from every node for the edges' costs (E,), 0 or more: Dijkstra backwards from the goal."""
+    found, following = dijkstra(problem.backwards(costs), indices=problem.goal, return_predecessors=True)
+    return Plan(found, np.where(following < 0, NOWHERE, following).astype(np.int64))
 
 
 def costs_to_go(problem: PathProblem, weights: F64) -> F64:

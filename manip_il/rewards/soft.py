@@ -24,7 +24,7 @@ _MOST_EDGES = 20_000  # of a path
 
 @dataclass(frozen=True)
 class SoftPlan:
-    """How paths are distributed.
+    """Distribution of the paths to a goal.
 
     values: soft cost-to-go -log Z of every node, (S,), infinite where no path leads to the goal. chances: with which
     each edge is taken by who is at its beginning, (E,).

@@ -6,7 +6,8 @@ import itertools
 
 import numpy as np
 
-from manip_il.rewards.paths import PathProblem
+from manip_il.rewards.demonstrations import Demonstration
+from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 
 
 def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0) -> PathProblem:
@@ -38,13 +39,22 @@ def acyclic(rng: np.random.Generator, nodes: int = 7, features: int = 3, share: 
     return PathProblem(np.array(pairs), rng.random((len(pairs), features)), nodes, nodes - 1)
 
 
-def all_paths(problem: PathProblem, start: int) -> list[np.ndarray]:
-    """Every path of a graph without circles."""
-    found, open_ = [], [[start]]
-    while open_:
-        path = open_.pop()
-        if path[-1] == problem.goal:
-            found.append(np.array(path))
-            continue
-        open_ += [[*path, int(to)] for to in problem.edges[problem.edges[:, 0] == path[-1], 1]]
+def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> list[Demonstration]:
+    """Cheapest paths for weights, each through a grid of its own."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        problem = grid(rng, **kwargs)
+        start = int(rng.integers(problem.nodes // 2))
+        found.append(Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0]))
     return found
+
+
+def excess(weights: np.ndarray, truth: np.ndarray, seed: int = 1, **kwargs) -> float:
+    """What paths planned with weights cost for the true ones, above the least, on unseen grids."""
+    rng, paid, least = np.random.default_rng(seed), 0.0, 0.0
+    for _ in range(40):
+        problem = grid(rng, **kwargs)
+        start = int(rng.integers(problem.nodes // 2))
+        paid += cheapest_path(problem, plan(problem, weights), start)[1] @ truth
+        least += plan(problem, truth).costs[start]
+    return float(paid / least - 1)

@@ -5,9 +5,10 @@ import pytest
 from scipy.special import logsumexp
 
 from manip_il.errors import ManipError
+from manip_il.rewards.calibration import all_paths
 from manip_il.rewards.paths import PathProblem, costs_to_go
 from manip_il.rewards.soft import log_likelihood, soft_plan
-from tests.rewards.grids import acyclic, all_paths, grid
+from tests.rewards.grids import acyclic, grid
 
 WEIGHTS = np.array([1.0, 0.3, 2.0])
 
