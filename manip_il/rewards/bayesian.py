@@ -1,10 +1,10 @@
 """Bayesian inverse reinforcement learning (Ramachandran & Amir 2007): what the demonstrations leave of the weights.
 
 Prior: the weights are independent, each exponential with mean `PRIOR` [1/m]. Likelihood: of the paths that are the
-cheapest for some taste, and its own, a demonstration takes one with probability proportional to exp(-w .
-features(path)). So a demonstrator chooses between sensible paths, and the better for its taste the likelier; the sum over them is exact,
-and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the posterior,
-which finds the paths that nearly tie. The posterior is drawn by Metropolis steps in log w.
+cheapest for some taste, and its own, a demonstration takes one with a probability in proportion to exp(-w . features).
+So a demonstrator chooses between sensible paths, and the better one is for its taste the likelier; the sum over them is
+exact, and small enough for chains of tens of thousands of steps. Tastes are drawn from the prior, and then from the
+posterior, which finds the paths that nearly tie. The posterior is drawn by Metropolis steps in log w.
 """
 
 from __future__ import annotations

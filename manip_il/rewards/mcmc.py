@@ -68,7 +68,9 @@ def sample(density: Density, start: F64, count: int, warm_up: int, rng: np.rando
 def _fit_steps(seen: F64, root: F64, scale: float) -> tuple[F64, float]:
     """A Cholesky root of the points' covariance, and the scale that keeps a step's size."""
     size = seen.shape[2]
-    found: F64 = np.linalg.cholesky(np.cov(seen.reshape(-1, size).T).reshape(size, size) + _JITTER * np.eye(size))
+    found = np.linalg.cholesky(np.cov(seen.reshape(-1, size).T).reshape(size, size) + _JITTER * np.eye(size)).astype(
+        np.float64
+    )
     same = scale * float(np.linalg.norm(root) / np.linalg.norm(found))
     return found, min(same, 2.38 / size**0.5)
 
@@ -96,7 +98,7 @@ def effective_size(points: F64) -> F64:
 
 
 def agreement(points: F64) -> F64:
-    """Return R-hat of the draws (C, N, K) in halves of chains, (K,); 1 where they agree (Gelman et al. 2013, eq. 11.4)."""
+    """Return R-hat of draws (C, N, K) in halves of chains, (K,); 1 where they agree (Gelman et al. 2013, eq. 11.4)."""
     half = points.shape[1] // 2
     parts = np.concatenate([points[:, :half], points[:, half : 2 * half]])
     within = parts.var(axis=1, ddof=1).mean(axis=0)

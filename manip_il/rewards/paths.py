@@ -143,7 +143,7 @@ def plan(problem: PathProblem, weights: F64) -> Plan:
 
 
 def plan_edges(problem: PathProblem, costs: F64) -> Plan:
-    """Return the cheapest way from every node for the edges' costs (E,), 0 or more: Dijkstra backwards from the goal."""
+    """Return the cheapest way from every node for costs of edges (E,), 0 or more: Dijkstra backwards from the goal."""
     found, following = dijkstra(problem.backwards(costs), indices=problem.goal, return_predecessors=True)
     return Plan(found, np.where(following < 0, NOWHERE, following).astype(np.int64))
 
