@@ -175,9 +175,20 @@ class Carry(PickPlace):
     def unsound(self, world: World) -> str:
         """Return why there is no sound label, empty where there is one: no room for the hand, or no way to the goal."""
         layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
-        if not held(world, OBJECT) and layout.room(at[None])[0] < -ASIDE:
+        if layout.meeting:
+            return "a thing stands in another"
+        if held(world, OBJECT):
+            leads = _at_goal(world) or _look(world)[1] is not None
+        elif layout.room(at[None])[0] < -ASIDE:
             return "no room for the hand beside a thing"
-        return "" if _at_goal(world) or _look(world)[1] is not None else "no free path to the goal"
+        else:
+            leads = descent_of(world).leads(at)
+        return "" if leads else "no free path to the goal"
+
+    @property
+    def taste(self) -> tuple[str, ...]:
+        """Bodies that hold the reward."""
+        return TASTES_OF
 
     def progress(self, world: World) -> float:
         """Return progress by the way to the grasp, then by the cost-to-go in metres of path at the goal."""

@@ -30,6 +30,7 @@ EDGE = "edge"  # the mocap body of the table's edge; its x points away from the 
 TASTES_OF = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
 PARKED = 0.25  # of what is not there, under the table's top [m]
 LEANING = 0.01  # how much farther a hand that leans reaches to all sides [m]
+_ALIKE = 0.005  # radii of parts that count as one [m]
 _PLATE = (0.15, 0.36, 0.0005)  # half of what lies beyond the edge, which is only seen [m]
 _DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
 _CLAY, _WAX, _FLAME = (0.20, 0.45, 0.52), (0.96, 0.93, 0.84), (1.0, 0.62, 0.15)
@@ -99,8 +100,10 @@ def hand_of(scene: Scene) -> Hand:
     lean = LEANING if scene.robot.leans else 0.0
     parts: list[Part] = []
     for bottom, radius in sorted(found):
-        if not parts or radius + lean > parts[-1].radius:
+        if not parts or radius + lean > parts[-1].radius + _ALIKE:
             parts.append(Part(bottom, radius + lean))
+        else:
+            parts[-1] = Part(parts[-1].bottom, max(radius + lean, parts[-1].radius))
     return Hand(tuple(parts), ee.copy())
 
 

@@ -25,8 +25,10 @@ TOP = 0.32  # of the grid over the table, at full scale [m]
 LIFTED = 0.02  # of the object over where it rests, wherever it is not about to be put down [m]
 DOWN = 0.03  # from the goal, sideways, where it may be lower, at full scale [m]
 AHEAD = 3  # cells to which the descent looks from anywhere
+OUTSIDE = 0.12  # from a node with a path, at most, where there is none about, at full scale [m]
 KEPT = 8  # plans of a process
 _STEEP, _SHORT = 0.004, 0.3  # of the descent's average: cost that halves a node's share [m]; price of near nodes
+_QUARTERS = np.array([0.25, 0.5, 0.75])  # of a line, where its room and its costs are looked at
 _LOOK = 24  # points of a path that is snapped, at a quarter of a cell, that one node may stand for
 _WORSE = 1e-4  # of the room at the start, on the way out of where there is none [m]
 
@@ -211,29 +213,51 @@ class Descent:
     costs: F64
     weights: F64
 
+    def leads(self, position: F64) -> bool:
+        """Return whether there are nodes about a position (3,) [m] from which a path leads to the goal."""
+        return len(self._around(position)) > 0
+
+    def _around(self, position: F64) -> I64:
+        """Nodes with a path within `AHEAD` cells of a position (3,) [m]; where there are none, the nearest, (n,)."""
+        nodes = self.grid.near(position)
+        nodes = nodes[np.isfinite(self.costs[nodes])]
+        if len(nodes):
+            return nodes
+        off = np.where(np.isfinite(self.costs), np.linalg.norm(self.grid.points - position, axis=1), np.inf)
+        nearest = int(np.argmin(off))
+        return np.array([nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64)
+
     def look(self, position: F64) -> tuple[float, F64 | None]:
-        """Return the cost-to-go at a position (3,) [m], and where to head from there, at most `AHEAD` cells off, (3,).
+        """Return the cost-to-go at a position (3,) [m], and where to head from there, some `AHEAD` cells off, (3,).
 
         The cost is that of the cheapest straight line to a node and of the path from there: infinite, and None to head
         for, where no free line leads to a node with a path.
         """
-        nodes = self.grid.near(position)
-        nodes = nodes[np.isfinite(self.costs[nodes])]
+        nodes = self._around(position)
         ends = self.grid.points[nodes]
-        layout, starts = self.grid.layout, np.broadcast_to(position, ends.shape)
-        spare = min(0.0, float(layout.room(position[None])[0]) - _WORSE)
-        free = layout.free(starts, ends, spare) if len(nodes) else np.zeros(0, bool)
+        if not len(nodes):
+            return np.inf, None
+        layout, here = self.grid.layout, position[None]
+        spare = min(0.0, float(layout.room(here)[0]) - _WORSE)
+        points = (position + _QUARTERS[:, None, None] * (ends - position)).reshape(-1, 3)
+        free: NDArray[np.bool_] = np.all(layout.room(points).reshape(len(_QUARTERS), -1) >= spare, axis=0)
         if not free.any():
             return np.inf, None
-        nodes, starts, ends = nodes[free], starts[free], ends[free]
-        totals = layout.line_features(starts, ends) @ self.weights + self.costs[nodes]
-        return float(totals.min()), self._heading(position, nodes, ends, totals, spare)
+        price = float(self._prices(here)[0])
+        between = self._prices(points).reshape(len(_QUARTERS), -1)
+        means = (price + np.array([4.0, 2.0, 4.0]) @ between + self._prices(ends)) / 12  # Simpson's rule
+        off = np.linalg.norm(ends - position, axis=1)
+        totals = off * means + self.costs[nodes]
+        nodes, ends, totals, off = nodes[free], ends[free], totals[free], off[free]
+        return float(totals.min()), self._heading(position, price, nodes, ends, totals, off, spare)
 
-    def _heading(self, position: F64, nodes: I64, ends: F64, totals: F64, spare: float) -> F64:
+    def _prices(self, points: F64) -> F64:
+        """What a metre of path costs at points (N, 3), (N,)."""
+        return self.grid.layout.densities(points) @ self.weights
+
+    def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:
         """Average of the best nodes, the farther ones first, so that neighbouring positions head alike, (3,) [m]."""
         layout, radius = self.grid.layout, AHEAD * self.grid.cell
-        off = np.linalg.norm(ends - position, axis=1)
-        price = float(layout.densities(position[None])[0] @ self.weights)
         late = np.where(nodes == self.grid.goal, 0.0, _SHORT * price * (radius - off))
         shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))
         shares *= np.clip((radius - off) / self.grid.cell, 0.0, 1.0) + 1e-6

@@ -6,9 +6,11 @@ whatever has a length, a path of points or an edge of the grid, has their line i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +79,7 @@ class Layout:
             if name not in THINGS:
                 raise UnknownName("thing", name, THINGS)
         numbers = [*self.goal, *(number for _, place in self.places for number in place), *self._edge_numbers()]
-        if not np.isfinite(numbers).all():
+        if not all(map(math.isfinite, numbers)):
             raise ManipError(f"a layout with {numbers}; expected finite numbers")
         if not (self.scale > 0 and self.half > 0):
             raise ManipError(f"a layout of scale {self.scale:g} for an object of {self.half:g} m; expected more than 0")
@@ -91,6 +93,14 @@ class Layout:
         return tuple(
             (name, np.array(place), self.scale * np.array(THINGS[name].half), self.scale * THINGS[name].height)
             for name, place in self.places
+        )
+
+    @cached_property
+    def meeting(self) -> bool:
+        """Whether a thing stands in another."""
+        return any(
+            bool((np.abs(middle - other) < half + its).all())
+            for (_, middle, half, _), (_, other, its, _) in combinations(self._boxes, 2)
         )
 
     def densities(self, points: F64) -> F64:
@@ -113,12 +123,18 @@ class Layout:
         Where it is negative, object or hand come nearer to a thing than `ASIDE` or `ABOVE`.
         """
         found = np.full(len(points), np.inf)
+        bottoms, radii = self._parts
         for _, middle, half, height in self._boxes:
-            off = _beside(points, middle, half)
-            for bottom, radius in self.parts:
-                over = points[:, 2] + bottom - height - ABOVE
-                np.minimum(found, np.maximum(off - radius - ASIDE, over), out=found)
+            over = points[:, 2, None] + (bottoms - (height + ABOVE))
+            beside = _beside(points, middle, half)[:, None] - (radii + ASIDE)
+            np.minimum(found, np.maximum(beside, over).min(axis=1), out=found)
         return found
+
+    @cached_property
+    def _parts(self) -> tuple[F64, F64]:
+        """Bottoms and radii of the parts, (P,) each [m]."""
+        bottoms, radii = np.array(self.parts).T
+        return bottoms, radii
 
     def line_features(self, starts: F64, ends: F64, count: int = 2) -> F64:
         """Return features of lines between points (N, 3) [m], (N, K), by Simpson's rule over `count` pieces."""

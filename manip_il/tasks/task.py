@@ -185,7 +185,15 @@ class TakesShape(Protocol):
 
 @runtime_checkable
 class TakesReward(Protocol):
-    """A task whose way of doing it may be of any taste; what an episode is about lives in the state."""
+    """A task whose way of doing it may be of any taste; what an episode is about lives in the state.
+
+    taste: bodies that hold it, which scenes that are drawn anew of a state keep.
+    """
+
+    @property
+    def taste(self) -> tuple[str, ...]:
+        """Names of the bodies that hold the reward."""
+        ...
 
     def with_reward(self, reward: Reward) -> Task:
         """Return the task with starts that are about a reward."""
