@@ -19,11 +19,10 @@ from manip_il.robots.robot import Robot
 from manip_il.robots.rotations import hand_down
 from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.world import GOAL, World
+from manip_il.tasks.carry_starts import draw_names, draw_things
 from manip_il.tasks.furnishing import (
     TASTES_OF,
     add_things,
-    draw_names,
-    draw_things,
     layout_of,
     observe_things,
     reward_in,
@@ -32,6 +31,7 @@ from manip_il.tasks.furnishing import (
 )
 from manip_il.tasks.grasp import grasp_of
 from manip_il.tasks.grid import Descent, descent
+from manip_il.tasks.hand import fits, hand_of
 from manip_il.tasks.ladder import (
     AT_GOAL,
     CLOSED,
@@ -77,7 +77,9 @@ def _to_goal(world: World) -> Target:
     at, ee = world.pose(OBJECT).position, world.ee.position
     position = ee + (0.0 if heading is None else heading - at)
     position[2] = max(position[2], world.lowest)
-    return Target(position, hand_down(world.ahead(position)), CLOSED, max_step=STEP)
+    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # where a hand that turns would meet a thing
+    yaw = world.hand_yaw if beside else world.ahead(position)
+    return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
 
 
 def _safe_height(world: World) -> float:
@@ -110,6 +112,14 @@ def _approach_progress(world: World) -> float:
     g = grasp_of(world, OBJECT)
     height = max(g.height, _rise(world))
     return nearness(g.off + abs(float(world.ee.position[2]) - g.at[2] - height) + height)
+
+
+def _hand_fits(world: World) -> bool:
+    """Whether the hand is off the things where it grasps the object."""
+    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
+    if layout.room(world.pose(OBJECT).position[None])[0] >= -ASIDE:
+        return True
+    return fits(hand_of(world.scene), np.array(g.at), g.yaw, layout)
 
 
 _RUNGS = (
@@ -179,7 +189,7 @@ class Carry(PickPlace):
             return "a thing stands in another"
         if held(world, OBJECT):
             leads = _at_goal(world) or _look(world)[1] is not None
-        elif layout.room(at[None])[0] < -ASIDE:
+        elif not _hand_fits(world):
             return "no room for the hand beside a thing"
         else:
             leads = descent_of(world).leads(at)

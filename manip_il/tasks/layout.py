@@ -88,7 +88,7 @@ class Layout:
         return (number for pair in self.edge or () for number in pair)
 
     @cached_property
-    def _boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
+    def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
         """Name, middle (2,), half lengths (2,) and height of every thing there is [m]."""
         return tuple(
             (name, np.array(place), self.scale * np.array(THINGS[name].half), self.scale * THINGS[name].height)
@@ -100,7 +100,7 @@ class Layout:
         """Whether a thing stands in another."""
         return any(
             bool((np.abs(middle - other) < half + its).all())
-            for (_, middle, half, _), (_, other, its, _) in combinations(self._boxes, 2)
+            for (_, middle, half, _), (_, other, its, _) in combinations(self.boxes, 2)
         )
 
     def densities(self, points: F64) -> F64:
@@ -108,7 +108,7 @@ class Layout:
         found = np.zeros((len(points), len(FEATURES)))
         found[:, 0] = 1.0
         found[:, 1] = np.maximum(points[:, 2] - self.half, 0.0) / (self.scale * HEIGHT)
-        for name, middle, half, _ in self._boxes:
+        for name, middle, half, _ in self.boxes:
             off = _beside(points, middle, half) / self.scale
             found[:, FEATURES.index(f"above_{name}")] = _bump(off, OVER)
             found[:, FEATURES.index(f"near_{name}")] = _bump(off, NEAR)
@@ -124,7 +124,7 @@ class Layout:
         """
         found = np.full(len(points), np.inf)
         bottoms, radii = self._parts
-        for _, middle, half, height in self._boxes:
+        for _, middle, half, height in self.boxes:
             over = points[:, 2, None] + (bottoms - (height + ABOVE))
             beside = _beside(points, middle, half)[:, None] - (radii + ASIDE)
             np.minimum(found, np.maximum(beside, over).min(axis=1), out=found)
