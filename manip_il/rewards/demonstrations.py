@@ -13,6 +13,7 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.rewards.paths import PathProblem, cheapest_path, plan
 
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
+_FIFTH, _FEW = 5, 5  # of how many demonstrations one is a beginning, and how many are that at least
 _DIGITS = 6  # decimals [m] in which the features of different paths differ
 _SAME = 1e-6  # [m] that sums of a feature may differ by and be the same
 
@@ -59,6 +60,12 @@ def base_feature(demonstrations: Sequence[Demonstration]) -> int:
     if not (shortest > 0).any():
         raise ManipError("no feature is above 0 on every edge, as length is: paths over edges of no cost never end")
     return int(np.argmax(shortest > 0))
+
+
+def stages(demonstrations: Sequence[Demonstration]) -> list[Sequence[Demonstration]]:
+    """Return what to fit one after the other: a fifth of many demonstrations, as a beginning, then all."""
+    few = demonstrations[::_FIFTH]
+    return [few, demonstrations] if len(few) >= _FEW else [demonstrations]
 
 
 def rivals(demonstrations: Sequence[Demonstration], tastes: F64) -> list[F64]:

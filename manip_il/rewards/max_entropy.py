@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features
+from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features, stages
 from manip_il.rewards.soft import soft_plan
 
 F64 = NDArray[np.float64]
-PRIOR = 100.0  # standard deviation of a weight [1/m]
+PRIOR = 300.0  # standard deviation of a weight [1/m]
 _MOST_STEPS = 200
-_ENOUGH = 1e-5  # [m] by which the gradient may miss 0
+_ENOUGH, _SAME = 1e-4, 1e-6  # gradient [m] and relative gain of a step at which it ends
+_LEAST_UNIT, _TINY = 1e-2, 1e-300  # of a feature, in the largest
 _ABOVE = 1.001  # times the least weight for which the sum over all paths is finite
 
 
@@ -67,19 +68,30 @@ def least_weights(demonstrations: Sequence[Demonstration]) -> F64:
 
 
 def fit(demonstrations: Sequence[Demonstration], prior: float = PRIOR) -> Entropy:
-    """Return the most likely weights, each 0 or more, by L-BFGS-B from twice the least ones. prior: [1/m]."""
+    """Return the most likely weights, each 0 or more, by L-BFGS-B. prior: [1/m].
+
+    It begins from twice the least weights on a few of the demonstrations, and goes on from there on all.
+    """
     least = least_weights(demonstrations)
-    start = np.maximum(2 * least, least.max() / 2)
-    evaluations = 0
-
-    def loss(weights: F64) -> tuple[float, F64]:
-        nonlocal evaluations
-        evaluations += 1
-        value, gradient, _ = loss_of(demonstrations, weights, prior)
-        return value, gradient
-
-    options: Any = {"maxiter": _MOST_STEPS, "gtol": _ENOUGH, "ftol": 0.0}
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(low, None) for low in least], options=options)
-    weights = np.asarray(found.x)
+    weights, evaluations = np.maximum(2 * least, least.max() / 2), 0
+    for some in stages(demonstrations):
+        weights, more = _minimise(some, weights, least, prior)
+        evaluations += more
     *_, expected = loss_of(demonstrations, weights, prior)
     return Entropy(weights, expected, np.mean([one.sums for one in demonstrations], axis=0), evaluations)
+
+
+def _minimise(demonstrations: Sequence[Demonstration], start: F64, least: F64, prior: float) -> tuple[F64, int]:
+    """The most likely weights (K,), and evaluations, in units of the features' deviations from what is expected."""
+    missed = [one.sums - soft_plan(one.problem, start).features(one.start) for one in demonstrations]
+    units = np.sqrt(np.mean(np.square(missed), axis=0))
+    units = (units / max(float(units.max()), _TINY)).clip(min=_LEAST_UNIT)
+
+    def loss(scaled: F64) -> tuple[float, F64]:
+        value, gradient, _ = loss_of(demonstrations, scaled / units, prior)
+        return value, gradient / units
+
+    options: Any = {"maxiter": _MOST_STEPS, "gtol": _ENOUGH, "ftol": _SAME}
+    bounds = [(low, None) for low in least * units]
+    found = minimize(loss, start * units, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(found.x / units, np.float64), int(found.nfev)

@@ -15,20 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features
+from manip_il.rewards.demonstrations import Demonstration, base_feature, count_features, stages
 from manip_il.rewards.paths import cheapest_path, plan, plan_edges
 
 F64 = NDArray[np.float64]
 MARGIN = 0.05  # of the base feature's metres: by how much less is paid for what is off the demonstration
 RIDGE = 1e-4  # times half the squared weights, beside a demonstration's metres
-_STEPS = 120
+_STEPS = 50  # of each stage
 _RATE = 1.0  # of AdaGrad: the first step of every weight
 _FLAT = 1e-12
 
 
 @dataclass(frozen=True)
 class Margin:
-    """weights: (K,), the base feature's at least 1. losses: the objective at every step, (n,) [m]."""
+    """weights: (K,), the base feature's at least 1. losses: the objective at every step, on a few first, (n,) [m]."""
 
     weights: F64
     losses: F64
@@ -63,20 +63,23 @@ def loss_of(demonstration: Demonstration, weights: F64, base: int, margin: float
 def fit(demonstrations: Sequence[Demonstration], margin: float = MARGIN) -> Margin:
     """Return the weights of maximum margin planning: the mean of the second half of projected subgradient steps.
 
-    Every weight is at least 0 and the base feature's at least 1, which sets the scale. Steps are AdaGrad's.
+    Every weight is at least 0 and the base feature's at least 1, which sets the scale. Steps are AdaGrad's; the first
+    ones see a few of the demonstrations.
     """
     base = base_feature(demonstrations)
     least = np.eye(count_features(demonstrations))[base]
-    weights, squares = least.copy(), np.zeros_like(least)
-    kept, losses = list[F64](), list[float]()
-    for _ in range(_STEPS):
-        parts = [loss_of(one, weights, base, margin) for one in demonstrations]
-        losses.append(float(np.mean([loss for loss, _ in parts])) + 0.5 * RIDGE * float(weights @ weights))
-        gradient = np.mean([one for _, one in parts], axis=0) + RIDGE * weights
-        squares += gradient**2
-        weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _FLAT), least)
-        kept.append(weights)
-    return Margin(np.mean(kept[_STEPS // 2 :], axis=0), np.array(losses))
+    weights, losses = least, list[float]()
+    for some in stages(demonstrations):
+        squares, kept = np.zeros_like(least), list[F64]()
+        for _ in range(_STEPS):
+            parts = [loss_of(one, weights, base, margin) for one in some]
+            losses.append(float(np.mean([loss for loss, _ in parts])) + 0.5 * RIDGE * float(weights @ weights))
+            gradient = np.mean([one for _, one in parts], axis=0) + RIDGE * weights
+            squares += gradient**2
+            weights = np.maximum(weights - _RATE * gradient / np.sqrt(squares + _FLAT), least)
+            kept.append(weights)
+        weights = np.mean(kept[_STEPS // 2 :], axis=0)
+    return Margin(weights, np.array(losses))
 
 
 def match_features(demonstrations: Sequence[Demonstration], steps: int = 30, enough: float = 1e-3) -> Matching:
