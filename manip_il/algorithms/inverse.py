@@ -33,7 +33,7 @@ _MOVED = 0.004  # from where it stood, at which an object is on its way [m]
 
 @dataclass(frozen=True)
 class Carried:
-    """What was done in an episode. positions: of the object from where it stood to the goal, (T, 3) [m]."""
+    """Path of an episode. positions: of the object from where it stood to the goal, (T, 3) [m]."""
 
     episode: int
     grid: Grid
