@@ -21,7 +21,7 @@ from manip_il.sim.shape import CUBE, Shape
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry_starts import draw_names, draw_things
 from manip_il.tasks.furnishing import (
-    TASTES_OF,
+    TASTE_BODIES,
     add_things,
     layout_of,
     observe_things,
@@ -171,7 +171,7 @@ class Carry(PickPlace):
             fewer = names[: max(1, len(names) - tried // _TOO_MANY)]
             if things := draw_things(rng, world, fewer, at, goal):
                 weights = np.reshape(self.reward.weights, (-1, 3))
-                tastes = {name: (three, UPRIGHT) for name, three in zip(TASTES_OF, weights, strict=True)}
+                tastes = {name: (three, UPRIGHT) for name, three in zip(TASTE_BODIES, weights, strict=True)}
                 return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **things, **tastes})
         raise UsageError(
             f"task {self.name}: none of {_DRAWS} layouts drawn fits within reach of {world.scene.robot.name};"
@@ -198,7 +198,7 @@ class Carry(PickPlace):
     @property
     def taste(self) -> tuple[str, ...]:
         """Bodies that hold the reward."""
-        return TASTES_OF
+        return TASTE_BODIES
 
     def progress(self, world: World) -> float:
         """Return progress by the way to the grasp, then by the cost-to-go in metres of path at the goal."""

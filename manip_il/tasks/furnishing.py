@@ -24,7 +24,7 @@ F64 = NDArray[np.float64]
 Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)
 
 EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
-TASTES_OF = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
+TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
 PARKED = 0.25  # of what is not there, under the table's top [m]
 _PLATE = (0.15, 0.36, 0.0005)  # half of what lies beyond the edge, which is only seen [m]
 _DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
@@ -56,7 +56,7 @@ def add_things(spec: mujoco.MjSpec, scale: float) -> None:
     edge.pos = [0.5, 0, -PARKED]
     plate = scale * np.array(_PLATE)
     _add_look(edge, "BOX", plate, 0.0, _DARK, ahead=float(plate[0]))
-    for name, weights in zip(TASTES_OF, np.reshape(TASTES[DEFAULT].weights, (-1, 3)), strict=True):
+    for name, weights in zip(TASTE_BODIES, np.reshape(TASTES[DEFAULT].weights, (-1, 3)), strict=True):
         add_furniture(spec, name).pos = weights
 
 
@@ -91,7 +91,7 @@ def reward_in(world: World) -> Reward:
 
 
 def _reward(world: World) -> Reward:
-    return Reward(tuple(number for name in TASTES_OF for number in world.pose(name).position.tolist()))
+    return Reward(tuple(number for name in TASTE_BODIES for number in world.pose(name).position.tolist()))
 
 
 def is_there(world: World, name: str) -> bool:

@@ -16,7 +16,7 @@ from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.world import GOAL, World
 from manip_il.tasks.carry import OBJECT, descent_of
-from manip_il.tasks.furnishing import EDGE, TASTES_OF, is_there, layout_of, observed_layout, reward_in
+from manip_il.tasks.furnishing import EDGE, TASTE_BODIES, is_there, layout_of, observed_layout, reward_in
 from manip_il.tasks.layout import THINGS, path_features
 from manip_il.tasks.reward import TASTES
 from manip_il.tasks.starts import UPRIGHT
@@ -83,7 +83,7 @@ def test_the_reward_is_the_states_and_not_observed():
         drive_until(env, "carry")
     low.set_state(careful.get_state())
     assert reward_in(low.world) == TASTES["careful"]
-    for name, weights in zip(TASTES_OF, np.reshape(TASTES["low"].weights, (-1, 3)), strict=True):
+    for name, weights in zip(TASTE_BODIES, np.reshape(TASTES["low"].weights, (-1, 3)), strict=True):
         low.world.place(name, weights, UPRIGHT)
     low.world.update()
     expert = Expert(careful.scene)
