@@ -30,6 +30,7 @@ KEPT = 8  # plans of a process
 _STEEP, _SHORT = 0.004, 0.3  # of the descent's average: cost that halves a node's share [m]; price of near nodes
 _QUARTERS = np.array([0.25, 0.5, 0.75])  # of a line, where its room and its costs are looked at
 _LOOK = 24  # points of a path that is snapped, at a quarter of a cell, that one node may stand for
+_SLACK = 0.003  # of the room on the way from beside a node, which is as near to things as can be [m]
 _WORSE = 1e-4  # of the room at the start, on the way out of where there is none [m]
 
 
@@ -238,7 +239,7 @@ class Descent:
         if not len(nodes):
             return np.inf, None
         layout, here = self.grid.layout, position[None]
-        spare = min(0.0, float(layout.room(here)[0]) - _WORSE)
+        spare = min(-_SLACK, float(layout.room(here)[0]) - _WORSE)
         points = (position + _QUARTERS[:, None, None] * (ends - position)).reshape(-1, 3)
         free: NDArray[np.bool_] = np.all(layout.room(points).reshape(len(_QUARTERS), -1) >= spare, axis=0)
         if not free.any():

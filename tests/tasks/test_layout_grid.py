@@ -97,12 +97,21 @@ def test_the_descent_leads_to_the_goal_past_all_things(seed: int):
             break
         way = heading - position
         position = position + way * min(1.0, 0.01 / np.linalg.norm(way))
-        assert LAYOUT.room(position[None])[0] > min(room, 0.0) - 0.004
+        assert LAYOUT.room(position[None])[0] > min(room, 0.0) - 0.006
         cost, heading = down.look(position)
         costs.append(cost)
     assert math.dist(position, LAYOUT.goal) < 0.005
     assert np.diff(costs).max(initial=0.0) < 0.02 * costs[0] + 0.01
     assert costs[-1] < 0.05
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_descent_leads_on_from_beside_any_node(seed: int):
+    down, rng = descent(LAYOUT, CAREFUL, SPACE), np.random.default_rng(seed)
+    node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
+    position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
+    heading = down.look(position)[1]
+    assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
 
 
 def test_free_nodes_and_edges_keep_their_room():
