@@ -12,7 +12,7 @@ from manip_il.robots.ik import ArmIK
 from manip_il.robots.rotations import angle_between
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Target, objects_in
+from manip_il.tasks.task import Refusing, Target, objects_in
 
 F64 = NDArray[np.float64]
 
@@ -33,6 +33,7 @@ class Expert:
         self._scene, self._world = scene, World(scene)
         self._ik = ArmIK(scene.robot)
         self._task, rungs = get_task(scene.task), get_task(scene.task).rungs
+        self._refusing = self._task if isinstance(self._task, Refusing) else None
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
     def label(self, state: State) -> Label:
@@ -60,7 +61,7 @@ class Expert:
             reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
             if not in_hand and not reaches(position):
                 return f"{name} out of reach"
-        return ""
+        return self._refusing.unsound(world) if self._refusing else ""
 
     def _towards(self, q: F64, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)

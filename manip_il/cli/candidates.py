@@ -219,7 +219,7 @@ def _policy_env(
     if run is not None:
         own = {} if meta is None else {"robot": meta.robot, "task": meta.task, "object": meta.object}
         return run if meta is None else replace(run, control_hz=meta.fps, **own)
-    return group.config(robot, task.type, meta, task.object)
+    return group.config(robot, task.type, meta, task.object, task.reward)
 
 
 def _with_seeds(candidate: Candidate, seeds: set[int | None]) -> Candidate:

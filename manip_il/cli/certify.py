@@ -46,7 +46,7 @@ class CertifyOptions:
         if self.policy.path is not None:
             find_policy(self.policy.path)
         require_new(self.output_dir, overwrite=self.overwrite)
-        self.env.config(self.robot.type, self.task.type, shape=self.task.object)
+        self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
 
     def run(self) -> None:
         """Run the episodes, write `certificate.json`, print the tables."""
@@ -56,7 +56,7 @@ class CertifyOptions:
 
             policy = find_policy(self.policy.path)
             meta = read_meta(policy)
-        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object)
+        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
         if policy is not None:
             check_policy(policy, meta, env, draw=self.engine == "local", trust=self.trust)
         from manip_il.engine.engine import Engine

@@ -13,6 +13,7 @@ from manip_il.sim.config import CameraConfig, EnvConfig, Look
 from manip_il.sim.shape import SHAPE_HELP
 from manip_il.stock import table as stock
 from manip_il.tasks import NAMES
+from manip_il.tasks.reward import Reward
 
 if TYPE_CHECKING:
     from manip_il.learn.checkpoint import CheckpointMeta
@@ -61,6 +62,11 @@ def require_workers(workers: int | None) -> None:
         raise UsageError(f"--workers is {workers}; expected at least 1")
 
 
+def _reward(text: str) -> str:
+    """What a reward is, by its numbers: a file that it came from may change."""
+    return Reward.parse(text).numbers if text else ""
+
+
 @dataclass
 class RobotGroup:
     """`--robot.*`."""
@@ -74,6 +80,10 @@ class TaskGroup:
 
     type: str = option_of(EnvConfig, "task")
     object: str = option_of(EnvConfig, "object")
+    reward: str = option_of(EnvConfig, "reward")
+
+    def __post_init__(self) -> None:
+        self.reward = _reward(self.reward)
 
 
 @dataclass
@@ -91,6 +101,10 @@ class MaybeTaskGroup:
 
     type: str | None = option(None, f"{', '.join(NAMES)}; by default the policy's, else {EnvConfig.task}")
     object: str | None = option(None, f"{SHAPE_HELP}; by default the policy's, else the task's own")
+    reward: str = option_of(EnvConfig, "reward")
+
+    def __post_init__(self) -> None:
+        self.reward = _reward(self.reward)
 
 
 @dataclass
@@ -105,12 +119,17 @@ class EnvGroup:
     success_steps: int = option_of(EnvConfig, "success_steps")
 
     def config(
-        self, robot: str | None, task: str | None, meta: CheckpointMeta | None = None, shape: str | None = None
+        self,
+        robot: str | None,
+        task: str | None,
+        meta: CheckpointMeta | None = None,
+        shape: str | None = None,
+        reward: str = "",
     ) -> EnvConfig:
         """Return the environment; `UnknownName` for a robot or task, `UsageError` for a value.
 
         robot, task, shape (of its object): None for those of the policy. meta: what a policy says of itself, where
-        there is one.
+        there is one. reward: of `carry`, empty for the task's own.
         """
         from manip_il.robots.robot import get_robot
         from manip_il.sim.scene import build_scene
@@ -127,7 +146,7 @@ class EnvGroup:
             get_robot(robot)
             get_task(task)
         hz = (meta.fps if meta else 0) if self.control_hz is None else self.control_hz
-        env = EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon, shape)
+        env = EnvConfig(robot, task, hz, self.tolerance, self.success_steps, self.horizon, shape, reward)
         if env.object:
             build_scene(robot, task, env.object)  # which finds an object that is too wide
         return env
@@ -143,7 +162,7 @@ class EnvOptions:
 
     def env_config(self) -> EnvConfig:
         """Return the environment, see `EnvGroup.config`."""
-        return self.env.config(self.robot.type, self.task.type, shape=self.task.object)
+        return self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
 
 
 @dataclass

@@ -92,7 +92,7 @@ class EvalOptions:
             self._check_space(find_policy(self.policy.path))
         require_suite(self.suite)
         require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
-        self.env.config(self.robot.type, self.task.type, shape=self.task.object)
+        self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
@@ -140,7 +140,7 @@ class EvalOptions:
             from manip_il.learn.checkpoint import read_meta
 
             meta = read_meta(path)
-        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object)
+        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
         if path is not None:
             cameras = check_policy(path, meta, env, draw=self.engine == "local", trust=self.trust)
             if cameras is not None:

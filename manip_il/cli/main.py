@@ -55,6 +55,7 @@ COMMANDS = {
     "study": Command("manip_il.cli.study:StudyOptions", "run, test and compare several methods and training seeds"),
     "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
     "theory": Command("manip_il.cli.theory:TheoryOptions", "see what is proved of cloning and DAgger, on an arm, too"),
+    "irl": Command("manip_il.cli.irl:IrlOptions", "learn a reward from demonstrations of carry"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(

@@ -74,7 +74,7 @@ class ViewOptions:
         require_suite(self.suite)
         if self.robot.type == STOCK:
             raise UsageError(f'--robot.type={STOCK} cannot be viewed; gymnasium shows it: render_mode="human"')
-        self.env.config(self.robot.type, self.task.type, shape=self.task.object)
+        self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
         if self.policy.type == "sliders":
             self._check_sliders()
 
@@ -120,7 +120,7 @@ class ViewOptions:
 
         path = None if self.policy.path is None else find_policy(self.policy.path)
         meta = None if path is None else read_meta(path)
-        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object)
+        env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
         cameras = None if path is None else check_policy(path, meta, env, trust=self.trust)
         if cameras is not None and path is not None:
             say(observation_text(cameras, path))

@@ -47,8 +47,9 @@ def env_fingerprint(config: EnvConfig, cameras: CameraConfig | None = None) -> d
 @cache
 def _fingerprint(config: EnvConfig) -> dict[str, str]:
     settings = asdict(config)
-    if not config.object:  # as before there were any
-        del settings["object"]
+    for name in ("object", "reward"):  # as before there were any
+        if not settings[name]:
+            del settings[name]
     return environment_fingerprint(simulation_of(config.robot).model_bytes(config), settings)
 
 

@@ -33,6 +33,7 @@ from manip_il.sim.variation import completed, with_drawn
 from manip_il.sim.world import World
 from manip_il.tasks.points import point_names
 from manip_il.tasks.table import get_task
+from manip_il.tasks.task import TakesReward
 
 F64 = NDArray[np.float64]
 CHUNK = 25  # frames of one journal
@@ -134,7 +135,7 @@ class _Redrawer:
 
     def __init__(self, config: EnvConfig, cameras: CameraConfig):
         self._env = ManipEnv.of(config, cameras)
-        self._task = get_task(config.task, config.object)
+        self._task = get_task(config.task, config.object, config.reward)
         self._expert: Labeller = simulation_of(config.robot).expert(config)
         self._config = config
         self._branch_env = BranchEnv(ManipEnv.of(config, cameras))
@@ -182,9 +183,12 @@ class _Redrawer:
         world.restore(visited.physics, visited.variation)
         free = self._untouched(world)
         poses = self._task.draw(rng, world).poses
+        kept = self._task.taste if isinstance(self._task, TakesReward) else ()
         new_goals, moved = rng.uniform() < GOALS, list[int]()
         for name, (at, turn) in poses.items():
             body = world.scene.model.body(name).id
+            if name in kept:
+                continue
             if body in self._markers:
                 if new_goals:
                     world.place(name, at, turn)

@@ -129,7 +129,8 @@ class EvalSettings:
 
     horizon, success_steps: control steps. tolerance: distance to the goal that counts as success [m]. suite: the name
     of the conditions, which episodes take in turn. hold: control steps after success at which an episode ends, None
-    where it goes on to the horizon. object: shape and size of what is grasped, empty for the task's own.
+    where it goes on to the horizon. object: shape and size of what is grasped, reward: of `carry`, empty for the
+    task's own.
     """
 
     horizon: int
@@ -140,20 +141,21 @@ class EvalSettings:
     conditions: tuple[Condition, ...] = (NOMINAL,)
     hold: int | None = None
     object: str = ""
+    reward: str = ""
 
     @classmethod
     def of(cls, job: RolloutJob, suite: str = NOMINAL.name) -> EvalSettings:
         """Return those of a job whose conditions are called `suite`."""
         env, conditions = job.env, job.conditions or (NOMINAL,)
         steps, hz = env.success_steps, env.control_hz
-        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object)
+        return cls(env.horizon, env.tolerance, hz, steps, suite, conditions, job.hold, env.object, env.reward)
 
     def env(self, robot: str, task: str) -> EnvConfig:
         """Return the environment that was evaluated in."""
         from manip_il.sim.env import EnvConfig  # here, as reading results needs no simulator
 
-        steps = self.success_steps
-        return EnvConfig(robot, task, self.control_hz, self.tolerance, steps, self.horizon, self.object)
+        limits = self.tolerance, self.success_steps, self.horizon
+        return EnvConfig(robot, task, self.control_hz, *limits, self.object, self.reward)
 
     @property
     def disturbance(self) -> str:
@@ -164,14 +166,15 @@ class EvalSettings:
         rate = f"{self.control_hz} Hz, {self.success_steps} steps in a row"
         ends = "" if self.hold is None else f", ended {self.hold} steps after success"
         shape = f", object {self.object}" if self.object else ""
-        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}{shape}"
+        reward = f", reward {self.reward}" if self.reward else ""
+        return f"horizon {self.horizon}, tolerance {self.tolerance} m, {rate}, suite {self.suite}{ends}{shape}{reward}"
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         plain = ("horizon", "tolerance", "control_hz", "success_steps", "hold", "suite")
         conditions = [condition.to_json() for condition in self.conditions]
-        shape = {"object": self.object} if self.object else {}
-        return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | shape
+        own = {key: getattr(self, key) for key in ("object", "reward") if getattr(self, key)}
+        return {key: getattr(self, key) for key in plain} | {"conditions": conditions} | own
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> EvalSettings:
@@ -190,6 +193,7 @@ class EvalSettings:
             conditions=tuple(Condition.from_mapping(one["name"], own) for one, own in zip(named, ranges, strict=True)),
             hold=None if data.get("hold") is None else checks.whole("hold", data["hold"], 0, LONGEST_EPISODE),
             object=checks.text("object", data.get("object", ""), checks.LONGEST_NAME),
+            reward=checks.text("reward", data.get("reward", "")),
         )
 
 

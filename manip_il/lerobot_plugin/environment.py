@@ -43,8 +43,8 @@ class ManipILEnv(EnvConfig):
     robot: for a task of any robot (`PickPlace-v0`), by name or a YAML; panda where none is said.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
-    tolerance, success_steps, object: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`. render_mode:
-    `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
+    tolerance, success_steps, object, reward: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
+    render_mode: `none` leaves the films of lerobot-eval black, which needs no OpenGL and no time.
 
     Raises `UnknownName` for a task, observation, camera or render mode, `UsageError` for a number out of range.
     """
@@ -60,6 +60,7 @@ class ManipILEnv(EnvConfig):
     tolerance: float = option_of(SimConfig, "tolerance")
     success_steps: int = option_of(SimConfig, "success_steps")
     object: str = option_of(SimConfig, "object")
+    reward: str = option_of(SimConfig, "reward")
     render_mode: str = "rgb_array"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -112,8 +113,8 @@ class ManipILEnv(EnvConfig):
             raise UsageError(
                 f"--env.robot is {self.robot!r}, and --env.task={name} is {robot}'s; leave one of them out"
             )
-        steps = self.success_steps
-        return SimConfig(robot, task, self.fps, self.tolerance, steps, self.episode_length, self.object)
+        limits = self.tolerance, self.success_steps, self.episode_length
+        return SimConfig(robot, task, self.fps, *limits, self.object, self.reward)
 
     def _cameras(self) -> CameraConfig | None:
         if self.observation == "state":

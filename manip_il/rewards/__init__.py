@@ -1,1 +1,1 @@
-"""Finite Markov decision processes, solved exactly."""
+"""Finite Markov decision processes, solved exactly, and rewards inferred from demonstrations in them."""

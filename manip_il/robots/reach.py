@@ -54,14 +54,23 @@ class Reach:
     origin: F64
     errors: F64
 
+    @property
+    def cell(self) -> float:
+        """Distance of the grid's points along each axis [m]."""
+        return _CELL
+
     @cached_property
-    def _arrives(self) -> list[list[list[bool]]]:
-        """For each cell of the grid, whether the hand gets to all its corners."""
+    def arrives(self) -> NDArray[np.bool_]:
+        """Whether the hand gets to all corners of each cell of the grid, (x - 1, y - 1, z - 1)."""
         there = self.errors < ARRIVES
         for axis in range(3):
             low, high = np.delete(there, -1, axis), np.delete(there, 0, axis)
             there = low & high
-        return there.tolist()
+        return there
+
+    @cached_property
+    def _arrives(self) -> list[list[list[bool]]]:
+        return self.arrives.tolist()
 
     @cached_property
     def _corner(self) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ from manip_il.robots import ROBOTS
 from manip_il.sim.shape import CUBE, SHAPE_HELP, Shape
 from manip_il.stock import table as stock
 from manip_il.tasks import NAMES
+from manip_il.tasks.reward import DEFAULT, REWARD_HELP, TASTES, Reward
 
 DT_SIM = 0.002  # longest step of physics [s]
 LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
@@ -21,7 +22,8 @@ MOST_HZ = round(1 / DT_SIM)
 class EnvConfig:
     """Settings of one environment; every field is part of the fingerprint. Raises `UsageError` for a wrong value.
 
-    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own.
+    object: shape and size of what is grasped, as `Shape.parse` reads it; empty for the task's own. reward: of `carry`,
+    as `Reward.parse` reads it, kept as its numbers wherever it came from; empty for the task's own.
     """
 
     robot: str = option("panda", " or ".join([*ROBOTS, stock.ROBOT]))
@@ -33,6 +35,7 @@ class EnvConfig:
     )
     horizon: int = option(0, "control steps in an episode; 0: the task's own")
     object: str = option("", f"{SHAPE_HELP}; by default the task's own")
+    reward: str = option("", f"{REWARD_HELP}; by default {DEFAULT}")
 
     def __post_init__(self) -> None:
         from manip_il.mdp import LONGEST_EPISODE  # here, as help needs no numpy
@@ -40,6 +43,7 @@ class EnvConfig:
         if self.robot == stock.ROBOT:
             stock.take_limits(self)
         self._take_object()
+        self._take_reward()
         if not self.control_hz:
             from manip_il.robots.robot import get_robot  # here, as help needs no robot
 
@@ -63,6 +67,16 @@ class EnvConfig:
         shape = Shape.parse(self.object)
         get_task(self.task, self.object)
         object.__setattr__(self, "object", "" if shape == CUBE else str(shape))
+
+    def _take_reward(self) -> None:
+        """Say the reward by its numbers, the one that is the default not at all."""
+        if not self.reward:
+            return
+        from manip_il.tasks.table import get_task  # here, as help needs no simulator
+
+        reward = Reward.parse(self.reward)
+        get_task(self.task, reward=reward.numbers)
+        object.__setattr__(self, "reward", "" if reward == TASTES[DEFAULT] else reward.numbers)
 
     def _take_limits(self) -> None:
         """Take from the task what is not given."""

@@ -65,7 +65,7 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         self.world = World(
             build_scene(self.config.robot, self.config.task, self.config.object, self.config.physics_step)
         )
-        self._task = get_task(self.config.task, self.config.object)
+        self._task = get_task(self.config.task, self.config.object, self.config.reward)
         self._conditions = tuple(conditions)
         self._begin(0, NOMINAL_VALUES)
         check_render_mode(render_mode, self.metadata["render_modes"])

@@ -25,7 +25,7 @@ from manip_il.sim.home import require_free_home
 from manip_il.sim.variation import Object
 from manip_il.sim.world import Scene
 from manip_il.tasks.table import get_task
-from manip_il.tasks.task import Task
+from manip_il.tasks.task import Fitting, Task
 
 PREFIX = "robot/"  # of everything of the robot's in a scene
 TABLE = "table"  # the name of its geom
@@ -83,7 +83,7 @@ def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:
     copy_options(spec, arm)
     spec.attach(arm, prefix=PREFIX, frame=spec.worldbody.add_frame())
     _add_cameras(spec, robot)
-    task.build(spec)
+    (task.fitted(robot) if isinstance(task, Fitting) else task).build(spec)
     return spec
 
 

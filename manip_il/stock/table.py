@@ -76,6 +76,8 @@ def take_limits(config: Any) -> None:
     get_stock(config.task)
     if config.object:
         raise UsageError(f"object is {config.object}; {ROBOT} is unmodified, leave --task.object out")
+    if config.reward:
+        raise UsageError(f"reward is {config.reward}; {ROBOT} is unmodified, leave --task.reward out")
     own = {"control_hz": CONTROL_HZ, "tolerance": TOLERANCE, "success_steps": 1, "horizon": HORIZON}
     for name, value in own.items():
         given = getattr(config, name)

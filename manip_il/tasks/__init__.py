@@ -12,4 +12,5 @@ NAMES = (
     "insert",
     "insert_tight",
     "sort",
+    "carry",
 )

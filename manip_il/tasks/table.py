@@ -6,6 +6,7 @@ from functools import cache
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.sim.shape import Shape
+from manip_il.tasks.carry import Carry
 from manip_il.tasks.clear_table import ClearTable
 from manip_il.tasks.drawer import Drawer
 from manip_il.tasks.insert import Insert
@@ -14,9 +15,10 @@ from manip_il.tasks.pick_place import PickPlace
 from manip_il.tasks.press import Press
 from manip_il.tasks.push import Push
 from manip_il.tasks.reach import ReachGoal
+from manip_il.tasks.reward import Reward
 from manip_il.tasks.sort import Sort
 from manip_il.tasks.stack import Stack
-from manip_il.tasks.task import TakesShape, Task
+from manip_il.tasks.task import TakesReward, TakesShape, Task
 
 TASKS: dict[str, Task] = {
     "reach": ReachGoal(),
@@ -30,21 +32,29 @@ TASKS: dict[str, Task] = {
     "insert": Insert(),
     "insert_tight": Insert("insert_tight", play=0.0005),
     "sort": Sort(),
+    "carry": Carry(),
 }
 
 
 @cache
-def get_task(name: str, shape: str = "") -> Task:
-    """Return the table's entry, with an object of a shape (`Shape.parse`) where one is given.
+def get_task(name: str, shape: str = "", reward: str = "") -> Task:
+    """Return the table's entry, with an object of a shape (`Shape.parse`) and a reward (`Reward.parse`) where given.
 
-    Raises `UnknownName`, and `UsageError` for a shape that cannot be or a task that has objects of its own.
+    Raises `UnknownName`, and `UsageError` for a shape or reward that cannot be or that the task does not take.
     """
     if name not in TASKS:
         raise UnknownName("task", name, TASKS)
-    if not shape:
-        return TASKS[name]
     task = TASKS[name]
-    if not isinstance(task, TakesShape):
-        takers = ", ".join(one for one in TASKS if isinstance(TASKS[one], TakesShape))
-        raise UsageError(f"object is {shape!r}, but {name} has objects of its own; it is for {takers}")
-    return task.with_shape(Shape.parse(shape))
+    if reward:
+        if not isinstance(task, TakesReward):
+            raise UsageError(f"reward is {reward!r}, but {name} has one way of doing it; it is for {_who(TakesReward)}")
+        task = task.with_reward(Reward.parse(reward))
+    if shape:
+        if not isinstance(task, TakesShape):
+            raise UsageError(f"object is {shape!r}, but {name} has objects of its own; it is for {_who(TakesShape)}")
+        task = task.with_shape(Shape.parse(shape))
+    return task
+
+
+def _who(protocol: type) -> str:
+    return ", ".join(name for name, task in TASKS.items() if isinstance(task, protocol))

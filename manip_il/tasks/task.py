@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError, nearest, shorten
+from manip_il.robots.robot import Robot
 from manip_il.sim.shape import Shape
 from manip_il.sim.world import World
+from manip_il.tasks.reward import Reward
 
 F64 = NDArray[np.float64]
 Observed = Mapping[str, "F64 | float"]
@@ -178,6 +180,41 @@ class TakesShape(Protocol):
 
     def with_shape(self, shape: Shape) -> Task:
         """Return the task with such an object."""
+        ...
+
+
+@runtime_checkable
+class TakesReward(Protocol):
+    """A task whose way of doing it may be of any taste; what an episode is about lives in the state.
+
+    taste: bodies that hold it, which scenes that are drawn anew of a state keep.
+    """
+
+    @property
+    def taste(self) -> tuple[str, ...]:
+        """Names of the bodies that hold the reward."""
+        ...
+
+    def with_reward(self, reward: Reward) -> Task:
+        """Return the task with starts that are about a reward."""
+        ...
+
+
+@runtime_checkable
+class Fitting(Protocol):
+    """A task whose fixed parts are of a size for the arm."""
+
+    def fitted(self, robot: Robot) -> Task:
+        """Return the task for a robot's workspace."""
+        ...
+
+
+@runtime_checkable
+class Refusing(Protocol):
+    """A task with states that the expert has no sound label for, besides objects out of reach."""
+
+    def unsound(self, world: World) -> str:
+        """Return why there is no sound label; empty where there is one."""
         ...
 
 

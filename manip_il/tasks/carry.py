@@ -1,0 +1,231 @@
+"""Carry: the object to the goal over a table on which things stand, past them as a reward likes it.
+
+The way is planned for the object's centre, on a grid of the free space of the episode's layout. The reward's weights
+are part of the state, as places of mocap bodies that are nowhere seen, so that a label is a function of the state.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Self
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import UsageError
+from manip_il.robots.robot import Robot
+from manip_il.robots.rotations import hand_down
+from manip_il.sim.shape import CUBE, Shape
+from manip_il.sim.world import GOAL, World
+from manip_il.tasks.carry_starts import draw_names, draw_things
+from manip_il.tasks.furnishing import (
+    TASTE_BODIES,
+    add_things,
+    layout_of,
+    observe_things,
+    reward_in,
+    scale_of,
+    space_of,
+)
+from manip_il.tasks.grasp import grasp_of
+from manip_il.tasks.grid import Descent, descent
+from manip_il.tasks.hand import fits, hand_of
+from manip_il.tasks.ladder import (
+    AT_GOAL,
+    CLOSED,
+    RISE_FIRST,
+    approach,
+    grasp_rungs,
+    held,
+    nearness,
+)
+from manip_il.tasks.layout import ABOVE, ASIDE, FULL, THINGS
+from manip_il.tasks.pick_place import OBJECT, PickPlace, observe_cube
+from manip_il.tasks.reward import DEFAULT, TASTES, Reward
+from manip_il.tasks.starts import IN_AIR, UPRIGHT, draw_lying
+from manip_il.tasks.task import Limits, Observed, Rung, Start, Target
+
+F64 = NDArray[np.float64]
+
+APART = 0.22  # of the goal from the object at the start, sideways, at full scale [m]
+HIGHEST = 0.2  # of a goal over where the object rests, at full scale [m]
+STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
+OVER, STEEP = 0.012, 8.0  # misalignment at which an empty hand may be down beside things [m]; its rise beyond that
+_DRAWS, _TOO_MANY = 400, 80  # of starts, and those after which there is one thing less
+_GRASPED = 0.5  # progress of an object that is held
+
+
+def descent_of(world: World) -> Descent:
+    """Return the descent of the costs-to-go of a world's episode."""
+    return descent(layout_of(world, OBJECT), reward_in(world), space_of(world.scene.robot))
+
+
+def _look(world: World) -> tuple[float, F64 | None]:
+    """Cost-to-go of the object where it is, and where it is to head; computed once a state."""
+    return world.remember("look", lambda: descent_of(world).look(world.pose(OBJECT).position))
+
+
+def _at_goal(world: World) -> bool:
+    return math.dist(world.pose(OBJECT).position, world.goal) < AT_GOAL
+
+
+def _to_goal(world: World) -> Target:
+    """Carry the object down the costs-to-go; stay where no path is."""
+    heading = world.goal if _at_goal(world) else _look(world)[1]
+    at, ee = world.pose(OBJECT).position, world.ee.position
+    position = ee + (0.0 if heading is None else heading - at)
+    position[2] = max(position[2], world.lowest)
+    beside = layout_of(world, OBJECT).room(at[None])[0] < 0  # where a hand that turns would meet a thing
+    yaw = world.hand_yaw if beside else world.ahead(position)
+    return Target(position, hand_down(yaw), CLOSED, max_step=STEP)
+
+
+def _safe_height(world: World) -> float:
+    """Height of `ee` over the table at which an open hand is over everything on it [m]."""
+    layout = layout_of(world, OBJECT)
+    tallest = max((layout.scale * THINGS[name].height for name, _ in layout.places), default=0.0)
+    return tallest + ABOVE - min(part.bottom for part in layout.parts[1:]) if tallest else 0.0
+
+
+def _rise(world: World) -> float:
+    """How high over its grasp the hand stays for the things around, by how far it is from over the object [m]."""
+    g = grasp_of(world, OBJECT)
+    return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
+
+
+def _approach(world: World) -> Target:
+    """As any object is approached, but above all things until the hand is over it."""
+    target, g, ee = approach(world, OBJECT), grasp_of(world, OBJECT), world.ee.position
+    x, y, z = g.at
+    rise = _rise(world)
+    if z + rise <= target.position[2]:
+        return target
+    sideways = min(1.0, max(0.0, 1.0 - (z + rise - ee[2]) / RISE_FIRST))
+    position = np.array([ee[0] + sideways * (x - ee[0]), ee[1] + sideways * (y - ee[1]), z + rise])
+    return target._replace(position=position)
+
+
+def _approach_progress(world: World) -> float:
+    """Progress of getting the fingers around the object, 0 to 1, by the way that is left, over the things."""
+    g = grasp_of(world, OBJECT)
+    height = max(g.height, _rise(world))
+    return nearness(g.off + abs(float(world.ee.position[2]) - g.at[2] - height) + height)
+
+
+def _hand_fits(world: World) -> bool:
+    """Whether the hand is off the things where it grasps the object."""
+    layout, g = layout_of(world, OBJECT), grasp_of(world, OBJECT)
+    if layout.room(world.pose(OBJECT).position[None])[0] >= -ASIDE:
+        return True
+    return fits(hand_of(world.scene), np.array(g.at), g.yaw, layout)
+
+
+_RUNGS = (
+    Rung("at_goal", "the object is in the hand, at the goal", lambda w: held(w, OBJECT) and _at_goal(w), _to_goal),
+    Rung("carry", "the object is in the hand, on its way past the things", lambda w: held(w, OBJECT), _to_goal),
+    *(rung if rung.name == "grasp" else replace(rung, target=_approach) for rung in grasp_rungs(lambda world: OBJECT)),
+)
+
+
+@dataclass(frozen=True)
+class Carry(PickPlace):
+    """Carry the object's centre to the goal past the things on the table, as cheaply as can be for a reward.
+
+    reward: what starts are about; the expert reads it from the state.
+    """
+
+    name: str = "carry"
+    instruction: str = "Carry the cube past what stands on the table to the green goal."
+    limits: Limits = Limits(horizon=200)
+    rungs: tuple[Rung, ...] = _RUNGS
+    scale: float = 1.0
+    reward: Reward = TASTES[DEFAULT]
+
+    def with_shape(self, shape: Shape) -> Self:
+        """Return the task with another object."""
+        return replace(super().with_shape(shape), limits=Limits(horizon=200 if shape == CUBE else 300))
+
+    def with_reward(self, reward: Reward) -> Self:
+        """Return the task with starts that are about another reward."""
+        return replace(self, reward=reward)
+
+    def fitted(self, robot: Robot) -> Self:
+        """Return the task with things of a size for a robot's workspace."""
+        return replace(self, scale=robot.workspace.half_width / FULL)
+
+    def build(self, spec: mujoco.MjSpec) -> None:
+        """Add the object and the goal, the things, and what holds the reward."""
+        super().build(spec)
+        add_things(spec, self.scale)
+
+    def draw(self, rng: np.random.Generator, world: World) -> Start:
+        """Draw object and goal, one to four things, mostly between the two, and take the task's reward."""
+        names = draw_names(rng)
+        for tried in range(_DRAWS):
+            at, turn = draw_lying(rng, world, OBJECT)
+            goal = _draw_goal(rng, world, at)
+            if not _has_way(world, at, goal):
+                continue
+            fewer = names[: max(1, len(names) - tried // _TOO_MANY)]
+            if things := draw_things(rng, world, fewer, at, goal):
+                weights = np.reshape(self.reward.weights, (-1, 3))
+                tastes = {name: (three, UPRIGHT) for name, three in zip(TASTE_BODIES, weights, strict=True)}
+                return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **things, **tastes})
+        raise UsageError(
+            f"task {self.name}: none of {_DRAWS} layouts drawn fits within reach of {world.scene.robot.name};"
+            " choose another task or robot"
+        )
+
+    def observe(self, world: World) -> Observed:
+        """Return what `pick_place` does, where every thing is and whether it is there, but nothing of the reward."""
+        return {**observe_cube(world, OBJECT), **observe_things(world)}
+
+    def unsound(self, world: World) -> str:
+        """Return why there is no sound label, empty where there is one: no room for the hand, or no way to the goal."""
+        layout, at = layout_of(world, OBJECT), world.pose(OBJECT).position
+        if layout.meeting:
+            return "a thing stands in another"
+        if held(world, OBJECT):
+            leads = _at_goal(world) or _look(world)[1] is not None
+        elif not _hand_fits(world):
+            return "no room for the hand beside a thing"
+        else:
+            leads = descent_of(world).leads(at)
+        return "" if leads else "no free path to the goal"
+
+    @property
+    def taste(self) -> tuple[str, ...]:
+        """Bodies that hold the reward."""
+        return TASTE_BODIES
+
+    def progress(self, world: World) -> float:
+        """Return progress by the way to the grasp, then by the cost-to-go in metres of path at the goal."""
+        if not held(world, OBJECT):
+            return 0.9 * _GRASPED * _approach_progress(world)
+        if _at_goal(world):
+            return 1.0
+        down = descent_of(world)
+        price = float((down.grid.layout.densities(world.goal[None]) @ down.weights)[0])
+        cost = _look(world)[0] / price
+        return _GRASPED + (1 - _GRASPED) * nearness(cost) if math.isfinite(cost) else _GRASPED
+
+
+def _draw_goal(rng: np.random.Generator, world: World, at: F64) -> F64:
+    """Draw a goal, half of the time on the table, (3,) [m]."""
+    space = world.scene.robot.workspace
+    x, y = np.array(space.centre) + rng.uniform(-1, 1, 2) * space.half_width
+    up = rng.uniform(0, HIGHEST * scale_of(world.scene)) if rng.uniform() < IN_AIR else 0.0
+    return np.array([x, y, at[2] + up])
+
+
+def _has_way(world: World, at: F64, goal: F64) -> bool:
+    """Whether a goal is off the object and the hand reaches over all things on the way there, whatever these are."""
+    scale = scale_of(world.scene)
+    if math.dist(at[:2], goal[:2]) < APART * scale or not world.reach.has(goal):
+        return False
+    height = scale * max(thing.height for thing in THINGS.values()) + max(world.extents(OBJECT)) / 2 + 2 * ABOVE
+    over = [np.array([*one[:2], max(height, goal[2])], np.float64) for one in (at, goal)]
+    lines = [np.linspace(start, end, 12) for start, end in ((at, over[0]), (over[0], over[1]), (over[1], goal))]
+    return bool(space_of(world.scene.robot).has(np.concatenate(lines, dtype=np.float64)).all())

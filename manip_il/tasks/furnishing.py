@@ -1,0 +1,164 @@
+"""Things of `carry` as bodies: how a scene gets them, and the layout and the reward that a world has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import MismatchError
+from manip_il.robots.reach import reach_of
+from manip_il.robots.robot import Robot
+from manip_il.sim.world import Scene, World
+from manip_il.tasks.grid import Space
+from manip_il.tasks.hand import hand_of
+from manip_il.tasks.layout import FULL, THINGS, Edge, Layout, Part
+from manip_il.tasks.objects import add_furniture, add_part
+from manip_il.tasks.reward import DEFAULT, FEATURES, TASTES, Reward
+
+F64 = NDArray[np.float64]
+Pose = tuple[F64, F64]  # position (3,) [m], quaternion wxyz (4,)
+
+EDGE = "edge"  # the mocap body of the table's edge; its x points away from the table
+TASTE_BODIES = tuple(f"taste_{number}" for number in range(len(FEATURES) // 3))  # mocap bodies that hold the weights
+PARKED = 0.25  # of what is not there, under the table's top [m]
+_PLATE = (0.15, 0.36, 0.0005)  # half of what lies beyond the edge, which is only seen [m]
+_DARK, _LID, _KEYS = (0.16, 0.17, 0.20), (0.62, 0.64, 0.68), (0.20, 0.21, 0.24)
+_CLAY, _WAX, _FLAME = (0.20, 0.45, 0.52), (0.96, 0.93, 0.84), (1.0, 0.62, 0.15)
+_LOOKS = {  # of a thing: kind, half its size, its middle, in shares of the thing's box; colour
+    "vase": (
+        ("CYLINDER", (0.60, 0.05), 0.05, _CLAY),
+        ("ELLIPSOID", (1.0, 0.36), 0.42, _CLAY),
+        ("CYLINDER", (0.45, 0.15), 0.85, _CLAY),
+        ("CYLINDER", (0.70, 0.02), 0.98, _CLAY),
+    ),
+    "laptop": (("BOX", (1.0, 0.5), 0.5, _LID), ("BOX", (0.85, 0.01), 1.0, _KEYS)),
+    "candle": (("CYLINDER", (1.0, 0.42), 0.42, _WAX), ("ELLIPSOID", (0.45, 0.08), 0.92, _FLAME)),
+}
+
+
+def add_things(spec: mujoco.MjSpec, scale: float) -> None:
+    """Add every thing, solid as its box, the table's edge, and what holds the weights of the reward."""
+    for name, thing in THINGS.items():
+        body = add_furniture(spec, name)
+        body.pos = [0.5, 0, -PARKED]
+        half = scale * np.array([*thing.half, thing.height / 2])
+        add_part(body, name, half.tolist(), (0, 0, half[2]), _LID)
+        body.first_geom().rgba = [0, 0, 0, 0]  # what is seen of it lies within
+        for kind, (wide, tall), middle, colour in _LOOKS[name]:
+            size = half * [wide, wide, 2 * tall]
+            _add_look(body, kind, size if kind != "CYLINDER" else size[[0, 2, 2]], middle * 2 * half[2], colour)
+    edge = add_furniture(spec, EDGE)
+    edge.pos = [0.5, 0, -PARKED]
+    plate = scale * np.array(_PLATE)
+    _add_look(edge, "BOX", plate, 0.0, _DARK, ahead=float(plate[0]))
+    for name, weights in zip(TASTE_BODIES, np.reshape(TASTES[DEFAULT].weights, (-1, 3)), strict=True):
+        add_furniture(spec, name).pos = weights
+
+
+def _add_look(body: object, kind: str, size: F64, up: float, colour: Sequence[float], ahead: float = 0.0) -> None:
+    body.add_geom(  # pyright: ignore[reportAttributeAccessIssue]
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"),
+        size=size.tolist(),
+        pos=[ahead, 0, up],
+        rgba=[*colour, 1],
+        contype=0,
+        conaffinity=0,
+        mass=0,
+    )
+
+
+@cache
+def space_of(robot: Robot) -> Space:
+    """Return a robot's workspace, and where its hand gets to."""
+    reach, space = reach_of(robot), robot.workspace
+    origin = tuple(reach.origin.tolist())
+    return Space((space.centre[0], space.centre[1]), space.half_width, origin, reach.cell, reach.arrives)
+
+
+def scale_of(scene: Scene) -> float:
+    """Return the scale of the things for an arm: its workspace's width in that of `FULL`."""
+    return scene.robot.workspace.half_width / FULL
+
+
+def reward_in(world: World) -> Reward:
+    """Return the reward that an episode is about."""
+    return world.remember("reward", lambda: _reward(world))
+
+
+def _reward(world: World) -> Reward:
+    return Reward(tuple(number for name in TASTE_BODIES for number in world.pose(name).position.tolist()))
+
+
+def is_there(world: World, name: str) -> bool:
+    """Return whether a thing, or the table's edge, is part of an episode."""
+    return bool(world.pose(name).position[2] > -PARKED / 2)
+
+
+def layout_of(world: World, name: str) -> Layout:
+    """Return the layout of an episode in which an object is carried to the goal; computed once a state."""
+    return world.remember(("layout", name), lambda: _layout(world, name))
+
+
+def _layout(world: World, name: str) -> Layout:
+    places = {thing: world.pose(thing).position for thing in THINGS if is_there(world, thing)}
+    edge, turn = world.pose(EDGE)
+    seen = (edge, turn[:, 0]) if is_there(world, EDGE) else None
+    return make_layout(world.scene, world.extents(name), world.goal, places, seen)
+
+
+def make_layout(
+    scene: Scene, lengths: Sequence[float], goal: F64, places: Mapping[str, F64], edge: tuple[F64, F64] | None
+) -> Layout:
+    """Return the layout of an object of lengths (3,) [m], a goal (3,) [m], places of things (3,) [m], and an edge.
+
+    edge: a point on it (3,) [m] and the direction away from the table, (3,).
+    """
+    _, middle, longest = sorted(lengths)
+    own = Part(-longest / 2, math.hypot(middle, longest) / 2)
+    return Layout(
+        scale=scale_of(scene),
+        goal=_numbers(goal),
+        places=tuple((name, _numbers(places[name])[:2]) for name in THINGS if name in places),
+        edge=None if edge is None else Edge(_numbers(edge[0])[:2], _numbers(edge[1])[:2]),
+        half=longest / 2,
+        parts=(own, *hand_of(scene).parts),
+    )
+
+
+def _numbers(vector: F64) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def observed_layout(scene: Scene, name: str, seen: Mapping[str, float]) -> Layout:
+    """Return the layout of an episode with an object by that name, as `environment_state` shows it.
+
+    seen: numbers by name. Raises `MismatchError` where one that it takes is missing.
+    """
+
+    def vector(of: str) -> F64:
+        return np.array([number(f"{of}.{axis}") for axis in "xyz"])
+
+    def number(of: str) -> float:
+        if of not in seen:
+            raise MismatchError("names of environment_state", "a dataset", f"no {of}", "carry", of)
+        return float(seen[of])
+
+    width = number(f"{name}.width")
+    lengths = [width, seen.get(f"{name}.length", width), seen.get(f"{name}.height", width)]
+    places = {thing: vector(thing) for thing in THINGS if number(f"{thing}.here") > 0.5}
+    edge = (vector(EDGE), vector(f"{EDGE}.outwards")) if number(f"{EDGE}.here") > 0.5 else None
+    return make_layout(scene, lengths, vector("goal"), places, edge)
+
+
+def observe_things(world: World) -> dict[str, F64 | float]:
+    """Return where every thing is [m] and whether it is there, and the table's edge: a point on it, its direction."""
+    found: dict[str, F64 | float] = {}
+    for name in (*THINGS, EDGE):
+        found |= {name: world.pose(name).position, f"{name}.here": float(is_there(world, name))}
+    return {**found, f"{EDGE}.outwards": world.pose(EDGE).rotation[:, 0]}

@@ -1,0 +1,275 @@
+"""A grid of the free space of a layout, its costs-to-go for a reward, and their descent from anywhere.
+
+The grid is laid so that the goal is one of its nodes. Its edges have the features of straight lines, by the same
+integral as any path, so that what inverse reinforcement learning compares is of one kind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.rewards.paths import PathProblem, cheapest_path, costs_to_go, plan
+from manip_il.tasks.layout import Layout
+from manip_il.tasks.reward import Reward
+
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
+CELL = 0.02  # of the grid, at full scale [m]
+BEYOND = 0.09  # of the grid beyond half the workspace's width, at full scale [m]
+TOP = 0.32  # of the grid over the table, at full scale [m]
+LIFTED = 0.02  # of the object over where it rests, wherever it is not about to be put down [m]
+DOWN = 0.03  # from the goal, sideways, where it may be lower, at full scale [m]
+AHEAD = 3  # cells to which the descent looks from anywhere
+OUTSIDE = 0.12  # from a node with a path, at most, where there is none about, at full scale [m]
+KEPT = 8  # plans of a process
+_STEEP, _SHORT = 0.004, 0.3  # of the descent's average: cost that halves a node's share [m]; price of near nodes
+_QUARTERS = np.array([0.25, 0.5, 0.75])  # of a line, where its room and its costs are looked at
+_LOOK = 24  # points of a path that is snapped, at a quarter of a cell, that one node may stand for
+_SLACK = 0.003  # of the room on the way from beside a node, which is as near to things as can be [m]
+_WORSE = 1e-4  # of the room at the start, on the way out of where there is none [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Workspace of an arm: its middle on the table (x, y) and half its width [m], and where the hand gets to.
+
+    origin: of the map of that (3,) [m]; cell: of it [m]; there: whether the hand gets to all corners of each cell.
+    """
+
+    centre: tuple[float, float]
+    half_width: float
+    origin: tuple[float, float, float]
+    cell: float
+    there: NDArray[np.bool_]
+
+    def has(self, points: F64) -> NDArray[np.bool_]:
+        """Return whether the hand gets to points (N, 3) [m], (N,)."""
+        index = np.floor((points - np.array(self.origin)) / self.cell).astype(np.int64)
+        last = np.array(self.there.shape) - 1
+        inside = ((index >= 0) & (index <= last)).all(axis=1)
+        return inside & self.there[tuple(index.clip(0, last).T)]
+
+
+class _Links(NamedTuple):
+    """Edges of a grid of a shape, sorted by the node they leave: nodes, places on the grid twice as fine, and cells."""
+
+    edges: I64  # (E, 2)
+    fine: I64  # (E, 3): from, middle, to
+    cells: F64  # (E,): length
+
+
+@lru_cache(4)
+def _links(shape: tuple[int, int, int]) -> _Links:
+    steps = np.array([step for step in np.ndindex(3, 3, 3) if step != (1, 1, 1)]) - 1
+    places = np.argwhere(np.ones(shape, bool))[:, None]
+    to = places + steps
+    inside = ((to >= 0) & (to < shape)).all(axis=2)
+    start = np.broadcast_to(places, to.shape)[inside]
+    end, step = to[inside], np.broadcast_to(steps, to.shape)[inside]
+    fine = tuple(2 * count - 1 for count in shape)
+    nodes = [np.ravel_multi_index(tuple(one.T), shape) for one in (start, end)]
+    doubled = [np.ravel_multi_index(tuple(one.T), fine) for one in (2 * start, 2 * start + step, 2 * end)]
+    return _Links(np.stack(nodes, axis=1), np.stack(doubled, axis=1), np.linalg.norm(step, axis=1))
+
+
+class Grid:
+    """Nodes of a layout's free space, each joined to the 26 around it.
+
+    shape: nodes along x, y and z; origin (3,) [m] and cell [m]; goal: number of the node at the goal.
+    """
+
+    def __init__(self, layout: Layout, space: Space):
+        self.layout, self.cell = layout, CELL * layout.scale
+        half = space.half_width + BEYOND * layout.scale
+        goal, low = np.array(layout.goal), np.array([space.centre[0] - half, space.centre[1] - half, 0.0])
+        sizes = np.array([2 * half, 2 * half, TOP * layout.scale])
+        before = np.floor((goal - low) / self.cell + 1e-9).astype(np.int64)  # nodes on this side of the goal
+        self.origin = goal - self.cell * before
+        counts = np.maximum(np.floor(sizes / self.cell + 1e-9).astype(np.int64), before) + 1
+        self.shape: tuple[int, int, int] = tuple(counts.tolist())
+        self.goal = int(np.ravel_multi_index(tuple(before.clip(0)), self.shape))
+        self._space = space
+
+    @cached_property
+    def points(self) -> F64:
+        """Places of the nodes, (S, 3) [m]."""
+        return self.origin + self.cell * np.argwhere(np.ones(self.shape, bool))
+
+    @cached_property
+    def _fine(self) -> F64:
+        """Places of nodes and of the middles between them, (F, 3) [m]."""
+        fine = tuple(2 * count - 1 for count in self.shape)
+        return self.origin + self.cell / 2 * np.argwhere(np.ones(fine, bool))
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Whether an object may be at each node, (S,): within reach, off things, and lifted."""
+        layout, points = self.layout, self.points
+        off = np.hypot(*(points[:, :2] - np.array(layout.goal[:2])).T)
+        low = (points[:, 2] < layout.half + LIFTED - 1e-9) & (off > DOWN * layout.scale)
+        found = self._space.has(points) & (layout.room(points) >= 0) & ~low
+        found[self.goal] |= bool(layout.room(points[[self.goal]])[0] >= 0)
+        return found
+
+    @cached_property
+    def _links(self) -> _Links:
+        """Those of the edges that are free from end to end."""
+        every = _links(self.shape)
+        kept: NDArray[np.bool_] = np.all(self.free[every.edges], axis=1)
+        middles = every.fine[kept, 1]
+        kept[kept] = self.layout.room(self._fine[middles]) >= 0
+        return _Links(every.edges[kept], every.fine[kept], self.cell * every.cells[kept])
+
+    def _integrals(self, densities: F64) -> F64:
+        """Integrals (E, ...) along the edges of densities (F, ...) at nodes and middles, by Simpson's rule."""
+        start, middle, end = (densities[places] for places in self._links.fine.T)
+        lengths = self._links.cells.reshape(-1, *[1] * (densities.ndim - 1))
+        return lengths * (start + 4 * middle + end) / 6
+
+    @cached_property
+    def problem(self) -> PathProblem:
+        """Edges with the features of straight lines, as inverse reinforcement learning takes them."""
+        features = self._integrals(self.layout.densities(self._fine))
+        return PathProblem(self._links.edges, features, len(self.points), self.goal)
+
+    def costs_to_go(self, weights: F64) -> F64:
+        """Return the cost of the cheapest path to the goal from every node, (S,), for weights (K,)."""
+        costs = self._integrals(self.layout.densities(self._fine) @ weights)
+        problem = PathProblem(self._links.edges, costs[:, None], len(self.points), self.goal)
+        return costs_to_go(problem, np.ones(1))
+
+    def _number(self, index: I64) -> I64:
+        """Numbers (n,) of nodes by their places along x, y and z, (n, 3)."""
+        return np.array(np.ravel_multi_index(tuple(index.T), self.shape), np.int64)
+
+    def near(self, position: F64) -> I64:
+        """Return the nodes within `AHEAD` cells of a position (3,) [m], and the goal where it is, (n,)."""
+        around = np.round((position - self.origin) / self.cell).astype(np.int64) + _AROUND
+        inside = around[((around >= 0) & (around < self.shape)).all(axis=1)]
+        nodes = self._number(inside)
+        nodes = nodes[self.free[nodes]]
+        return nodes[np.linalg.norm(self.points[nodes] - position, axis=1) < AHEAD * self.cell]
+
+    def snap(self, positions: F64) -> I64:
+        """Return the path of free nodes along a path of positions (T, 3) [m], joined by edges, (n,).
+
+        A straight line becomes a path no longer than the grid's shortest. Where there is no free node, it goes the
+        shortest way to the next one; near the goal, it ends there.
+        """
+        dense = _dense(positions, self.cell / 4)
+        index = np.round((dense - self.origin) / self.cell).astype(np.int64).clip(0, np.array(self.shape) - 1)
+        every = self._number(index)
+        nodes: list[int] = every[self.free[every]].tolist()
+        if np.linalg.norm(positions[-1] - self.points[self.goal]) < AHEAD * self.cell:
+            nodes.append(self.goal)
+        path = nodes[:1]
+        while path and path[-1] != nodes[-1]:
+            begin = len(nodes) - 1 - nodes[::-1].index(path[-1])  # where it comes back to, it has not been away
+            nodes = nodes[begin:]
+            ahead = [place for place, node in enumerate(nodes[1:_LOOK], 1) if self.joined(path[-1], node)]
+            last = ahead[-1] if ahead else 1
+            path += [nodes[last]] if ahead else self._between(path[-1], nodes[last])
+            nodes = nodes[last:]
+        return np.array(path, np.int64)
+
+    def joined(self, start: int, end: int) -> bool:
+        """Return whether an edge leads from one node to another."""
+        at = np.searchsorted(self._keys, start * len(self.points) + end)
+        return bool(at < len(self._keys) and self._keys[at] == start * len(self.points) + end)
+
+    @cached_property
+    def _keys(self) -> I64:
+        return self._links.edges @ np.array([len(self.points), 1])
+
+    def _between(self, start: int, end: int) -> list[int]:
+        lengths = PathProblem(self._links.edges, self._links.cells[:, None], len(self.points), end)
+        return cheapest_path(lengths, plan(lengths, np.ones(1)), start)[0][1:].tolist()
+
+
+_AROUND = np.array([step for step in np.ndindex(*[2 * AHEAD + 1] * 3)]) - AHEAD
+
+
+def _dense(positions: F64, step: float) -> F64:
+    """A path (T, 3) with points between, at most `step` apart [m]."""
+    found = [positions[:1]]
+    for start, end in pairwise(positions):
+        count = max(1, int(np.ceil(np.linalg.norm(end - start) / step)))
+        found.append(start + np.linspace(0, 1, count + 1)[1:, None] * (end - start))
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Costs-to-go of a grid, and the way down from anywhere.
+
+    costs: (S,); weights: (K,) per metre.
+    """
+
+    grid: Grid
+    costs: F64
+    weights: F64
+
+    def leads(self, position: F64) -> bool:
+        """Return whether there are nodes about a position (3,) [m] from which a path leads to the goal."""
+        return len(self._around(position)) > 0
+
+    def _around(self, position: F64) -> I64:
+        """Nodes with a path within `AHEAD` cells of a position (3,) [m]; where there are none, the nearest, (n,)."""
+        nodes = self.grid.near(position)
+        nodes = nodes[np.isfinite(self.costs[nodes])]
+        if len(nodes):
+            return nodes
+        off = np.where(np.isfinite(self.costs), np.linalg.norm(self.grid.points - position, axis=1), np.inf)
+        nearest = int(np.argmin(off))
+        return np.array([nearest] if off[nearest] < OUTSIDE * self.grid.layout.scale else [], np.int64)
+
+    def look(self, position: F64) -> tuple[float, F64 | None]:
+        """Return the cost-to-go at a position (3,) [m], and where to head from there, some `AHEAD` cells off, (3,).
+
+        The cost is that of the cheapest straight line to a node and of the path from there: infinite, and None to head
+        for, where no free line leads to a node with a path.
+        """
+        nodes = self._around(position)
+        ends = self.grid.points[nodes]
+        if not len(nodes):
+            return np.inf, None
+        layout, here = self.grid.layout, position[None]
+        spare = min(-_SLACK, float(layout.room(here)[0]) - _WORSE)
+        points = (position + _QUARTERS[:, None, None] * (ends - position)).reshape(-1, 3)
+        free: NDArray[np.bool_] = np.all(layout.room(points).reshape(len(_QUARTERS), -1) >= spare, axis=0)
+        if not free.any():
+            return np.inf, None
+        price = float(self._prices(here)[0])
+        between = self._prices(points).reshape(len(_QUARTERS), -1)
+        means = (price + np.array([4.0, 2.0, 4.0]) @ between + self._prices(ends)) / 12  # Simpson's rule
+        off = np.linalg.norm(ends - position, axis=1)
+        totals = off * means + self.costs[nodes]
+        nodes, ends, totals, off = nodes[free], ends[free], totals[free], off[free]
+        return float(totals.min()), self._heading(position, price, nodes, ends, totals, off, spare)
+
+    def _prices(self, points: F64) -> F64:
+        """What a metre of path costs at points (N, 3), (N,)."""
+        return self.grid.layout.densities(points) @ self.weights
+
+    def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:
+        """Average of the best nodes, the farther ones first, so that neighbouring positions head alike, (3,) [m]."""
+        layout, radius = self.grid.layout, AHEAD * self.grid.cell
+        late = np.where(nodes == self.grid.goal, 0.0, _SHORT * price * (radius - off))
+        shares = np.exp(-(totals + late - (totals + late).min()) / (_STEEP * layout.scale * price))
+        shares *= np.clip((radius - off) / self.grid.cell, 0.0, 1.0) + 1e-6
+        mean = shares @ ends / shares.sum()
+        if layout.free(position[None], mean[None], spare)[0]:
+            return mean
+        return ends[int(np.argmin(totals + late))]
+
+
+@lru_cache(KEPT)
+def descent(layout: Layout, reward: Reward, space: Space) -> Descent:
+    """Return the descent of a layout's costs-to-go for a reward, computed once and kept for a while."""
+    grid, weights = Grid(layout, space), np.array(reward.weights)
+    return Descent(grid, grid.costs_to_go(weights), weights)

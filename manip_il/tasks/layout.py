@@ -1,0 +1,179 @@
+"""Layouts of `carry`: what stands on the table, and what a metre of path costs there, as pure geometry.
+
+Paths are those of the carried object's centre. Features are densities per metre of path, functions of a point alone;
+whatever has a length, a path of points or an edge of the grid, has their line integrals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError, UnknownName
+from manip_il.tasks.reward import FEATURES
+
+F64 = NDArray[np.float64]
+
+
+class Thing(NamedTuple):
+    """Half its lengths along x and y, and its height [m], on the table of an arm whose workspace is 30 cm wide."""
+
+    half: tuple[float, float]
+    height: float
+
+
+THINGS = {
+    "vase": Thing((0.032, 0.032), 0.13),
+    "laptop": Thing((0.065, 0.048), 0.03),
+    "candle": Thing((0.016, 0.016), 0.11),
+}
+FULL = 0.15  # half the width of a workspace in which things have these sizes [m]
+ASIDE, ABOVE = 0.012, 0.012  # room between a thing and what is carried past it, beside it and over it [m]
+HEIGHT = 0.1  # in which the feature `height` counts [m]
+OVER = 0.015  # standard deviation of how "above" ends beside a thing [m]
+NEAR = 0.08  # the same of how near something is [m]
+NEAR_EDGE = 0.05  # the same of the table's edge [m]
+STEP = 0.005  # of the quadrature along a path, at most [m]
+
+
+class Edge(NamedTuple):
+    """Edge of the table: a point on it (x, y) [m], and the direction away from the table, of length 1."""
+
+    at: tuple[float, float]
+    outwards: tuple[float, float]
+
+
+class Part(NamedTuple):
+    """Part of what moves: its lowest point from the object's centre, and how far it reaches to all sides [m]."""
+
+    bottom: float
+    radius: float
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places of what there is, in one episode.
+
+    scale: of all lengths, 1 for a workspace of `FULL`. goal: of the object's centre [m]. places: (x, y) [m] of the
+    things there are, by name. edge: None where none is near. half: of the object's height [m]. parts: of object and
+    hand, as they hang on the object's centre. Raises `UnknownName` for a thing that is none, `ManipError` for a number
+    that is not finite or a length that is not above 0.
+    """
+
+    scale: float
+    goal: tuple[float, float, float]
+    places: tuple[tuple[str, tuple[float, float]], ...]
+    edge: Edge | None
+    half: float
+    parts: tuple[Part, ...]
+
+    def __post_init__(self) -> None:
+        for name, _ in self.places:
+            if name not in THINGS:
+                raise UnknownName("thing", name, THINGS)
+        numbers = [*self.goal, *(number for _, place in self.places for number in place), *self._edge_numbers()]
+        if not all(map(math.isfinite, numbers)):
+            raise ManipError(f"a layout with {numbers}; expected finite numbers")
+        if not (self.scale > 0 and self.half > 0):
+            raise ManipError(f"a layout of scale {self.scale:g} for an object of {self.half:g} m; expected more than 0")
+
+    def _edge_numbers(self) -> Iterator[float]:
+        return (number for pair in self.edge or () for number in pair)
+
+    @cached_property
+    def boxes(self) -> tuple[tuple[str, F64, F64, float], ...]:
+        """Name, middle (2,), half lengths (2,) and height of every thing there is [m]."""
+        return tuple(
+            (name, np.array(place), self.scale * np.array(THINGS[name].half), self.scale * THINGS[name].height)
+            for name, place in self.places
+        )
+
+    @cached_property
+    def meeting(self) -> bool:
+        """Whether a thing stands in another."""
+        return any(
+            bool((np.abs(middle - other) < half + its).all())
+            for (_, middle, half, _), (_, other, its, _) in combinations(self.boxes, 2)
+        )
+
+    def densities(self, points: F64) -> F64:
+        """Return the features of a metre of path at points (N, 3) [m], (N, K)."""
+        found = np.zeros((len(points), len(FEATURES)))
+        found[:, 0] = 1.0
+        found[:, 1] = np.maximum(points[:, 2] - self.half, 0.0) / (self.scale * HEIGHT)
+        for name, middle, half, _ in self.boxes:
+            off = _beside(points, middle, half) / self.scale
+            found[:, FEATURES.index(f"above_{name}")] = _bump(off, OVER)
+            found[:, FEATURES.index(f"near_{name}")] = _bump(off, NEAR)
+        if self.edge is not None:
+            inside = np.maximum((np.array(self.edge.at) - points[:, :2]) @ np.array(self.edge.outwards), 0.0)
+            found[:, FEATURES.index("near_edge")] = _bump(inside / self.scale, NEAR_EDGE)
+        return found
+
+    def room(self, points: F64) -> F64:
+        """Return how much room there is to spare about things for an object carried at points (N, 3), (N,) [m].
+
+        Where it is negative, object or hand come nearer to a thing than `ASIDE` or `ABOVE`.
+        """
+        found = np.full(len(points), np.inf)
+        bottoms, radii = self._parts
+        for _, middle, half, height in self.boxes:
+            over = points[:, 2, None] + (bottoms - (height + ABOVE))
+            beside = _beside(points, middle, half)[:, None] - (radii + ASIDE)
+            np.minimum(found, np.maximum(beside, over).min(axis=1), out=found)
+        return found
+
+    @cached_property
+    def _parts(self) -> tuple[F64, F64]:
+        """Bottoms and radii of the parts, (P,) each [m]."""
+        bottoms, radii = np.array(self.parts).T
+        return bottoms, radii
+
+    def line_features(self, starts: F64, ends: F64, count: int = 2) -> F64:
+        """Return features of lines between points (N, 3) [m], (N, K), by Simpson's rule over `count` pieces."""
+        shares, weights = _simpson(count)
+        points = starts[:, None] + shares[:, None] * (ends - starts)[:, None]
+        densities = self.densities(points.reshape(-1, 3)).reshape(len(starts), len(shares), -1)
+        return np.linalg.norm(ends - starts, axis=1)[:, None] * np.einsum("s,nsk->nk", weights, densities)
+
+    def free(self, starts: F64, ends: F64, spare: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether straight lines from (N, 3) to (N, 3) [m] keep room to spare, (N,)."""
+        shares = np.linspace(0.0, 1.0, _pieces(starts, ends) + 1)
+        points = starts[:, None] + shares[:, None] * (ends - starts)[:, None]
+        return self.room(points.reshape(-1, 3)).reshape(len(starts), -1).min(axis=1) >= spare
+
+
+def path_features(layout: Layout, positions: F64) -> F64:
+    """Return the features of a path of the object's centre, (T, 3) [m], as line integrals along it, (K,)."""
+    if len(positions) < 2:
+        return np.zeros(len(FEATURES))
+    starts, ends = positions[:-1], positions[1:]
+    return layout.line_features(starts, ends, _pieces(starts, ends)).sum(axis=0)
+
+
+def _pieces(starts: F64, ends: F64) -> int:
+    longest = float(np.linalg.norm(ends - starts, axis=1).max(initial=0.0))
+    return max(1, int(np.ceil(longest / (2 * STEP))))
+
+
+def _simpson(count: int) -> tuple[F64, F64]:
+    """Places along a line, 0 to 1, and their weights, which sum to 1, (2 count + 1,) each."""
+    weights = np.ones(2 * count + 1)
+    weights[1::2], weights[2:-1:2] = 4.0, 2.0
+    return np.arange(2 * count + 1) / (2 * count), weights / weights.sum()
+
+
+def _beside(points: F64, middle: F64, half: F64) -> F64:
+    """How far points (N, 3) are from a box along x and y, 0 over it, (N,) [m]."""
+    return np.hypot(*np.maximum(np.abs(points[:, :2] - middle) - half, 0.0).T)
+
+
+def _bump(off: F64, width: float) -> F64:
+    return np.exp(-0.5 * np.square(off / width))

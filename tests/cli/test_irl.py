@@ -1,0 +1,52 @@
+"""`manip-il irl`: bad input is one line; the reward it writes is one that the task takes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.irl import METHODS, IrlOptions
+from manip_il.cli.main import main
+from manip_il.rewards import methods
+from manip_il.tasks.reward import FEATURES, Reward
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+
+
+def test_the_methods_of_the_command_are_those_there_are():
+    assert set(METHODS) == set(methods.METHODS)
+    assert IrlOptions.method in METHODS
+
+
+@pytest.mark.parametrize(
+    ("line", "says", "code"),
+    [
+        ("irl nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        (f"irl {SAMPLE} --method=max_entrpy", "unknown method 'max_entrpy' (did you mean 'max_entropy'?)", 2),
+        (f"irl {SAMPLE} --seed=-1", "seed is -1", 2),
+        (f"irl {SAMPLE}", "lacks vase.x, vase.y, vase.z, laptop.x and", 1),
+    ],
+)
+def test_bad_input_is_one_line(line, says, code, here, error):
+    assert main([*line.split(), "--quiet"]) == code
+    assert says in error()
+    assert list(here.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_reward_is_learnt_from_demonstrations_and_taken_by_the_task(tmp_path, capsys):
+    shown, folder = tmp_path / "carry", tmp_path / "irl"
+    words = ["--robot.type=panda", "--task.type=carry", "--dataset.num_episodes=3", f"--dataset.root={shown}"]
+    assert main(["record", *words, "--dataset.repo_id=a/carry", "--workers=1"]) == 0
+    assert main(["irl", str(shown), "--method=max_margin", f"--output_dir={folder}"]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads((folder / "reward.json").read_text())
+    assert (found["method"], found["demonstrations"]) == ("max_margin", 3)
+    assert {*found["names"], *found["not_identified"]} == set(FEATURES)
+    assert dict(zip(found["names"], found["weights"], strict=True))["length"] == 1
+    for name in found["not_identified"]:
+        assert name in err
+    reward = Reward.parse(str(folder / "reward.json"))
+    assert reward.weights[0] == 1
+    assert f"--policy.type=expert --task.type=carry --task.reward={folder / 'reward.json'}" in out
+    assert "data:image/svg+xml;base64," in (folder / "report.html").read_text()

@@ -1,0 +1,60 @@
+"""Small worlds for inverse reinforcement learning: grids with things on them, and demonstrations of a known taste."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from manip_il.rewards.demonstrations import Demonstration
+from manip_il.rewards.paths import PathProblem, cheapest_path, plan
+
+
+def grid(rng: np.random.Generator, shape: tuple[int, ...] = (6, 5), things: int = 2, step: float = 1.0) -> PathProblem:
+    """A grid with neighbours in all directions: length, then what each of some things, at drawn places, adds near it.
+
+    The goal is the last node.
+    """
+    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, len(shape)) * step
+    number = np.arange(len(places)).reshape(shape)
+    near = [
+        np.exp(-0.5 * (np.linalg.norm(places - rng.uniform(0, step * (np.array(shape) - 1)), axis=1) / step) ** 2)
+        for _ in range(things)
+    ]
+    edges = []
+    for move in itertools.product((-1, 0, 1), repeat=len(shape)):
+        if any(move):
+            here = tuple(slice(max(0, -one), size - max(0, one)) for one, size in zip(move, shape, strict=True))
+            there = tuple(slice(max(0, one), size - max(0, -one)) for one, size in zip(move, shape, strict=True))
+            edges.append(np.stack([number[here].ravel(), number[there].ravel()], axis=1))
+    edges = np.concatenate(edges)
+    length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
+    features = [length, *(length * (one[edges[:, 0]] + one[edges[:, 1]]) / 2 for one in near)]
+    return PathProblem(edges, np.stack(features, axis=1), len(places), len(places) - 1)
+
+
+def acyclic(rng: np.random.Generator, nodes: int = 7, features: int = 3, share: float = 0.6) -> PathProblem:
+    """A random graph without circles: edges lead to higher numbers, one chain through all; the last is the goal."""
+    pairs = [(i, j) for i in range(nodes) for j in range(i + 1, nodes) if j == i + 1 or rng.random() < share]
+    return PathProblem(np.array(pairs), rng.random((len(pairs), features)), nodes, nodes - 1)
+
+
+def demonstrations(count: int, weights: np.ndarray, seed: int = 0, **kwargs) -> list[Demonstration]:
+    """Cheapest paths for weights, each through a grid of its own."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        problem = grid(rng, **kwargs)
+        start = int(rng.integers(problem.nodes // 2))
+        found.append(Demonstration(problem, cheapest_path(problem, plan(problem, weights), start)[0]))
+    return found
+
+
+def excess(weights: np.ndarray, truth: np.ndarray, seed: int = 1, **kwargs) -> float:
+    """What paths planned with weights cost for the true ones, above the least, on unseen grids."""
+    rng, paid, least = np.random.default_rng(seed), 0.0, 0.0
+    for _ in range(40):
+        problem = grid(rng, **kwargs)
+        start = int(rng.integers(problem.nodes // 2))
+        paid += cheapest_path(problem, plan(problem, weights), start)[1] @ truth
+        least += plan(problem, truth).costs[start]
+    return float(paid / least - 1)

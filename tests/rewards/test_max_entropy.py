@@ -1,0 +1,63 @@
+"""Maximum entropy: its gradient is the likelihood's, and its solution has the demonstrations' features."""
+
+import numpy as np
+import pytest
+
+from manip_il.errors import ManipError
+from manip_il.rewards.demonstrations import Demonstration
+from manip_il.rewards.max_entropy import fit, least_weights, loss_of
+from manip_il.rewards.paths import PathProblem
+from manip_il.rewards.soft import soft_plan
+from tests.rewards.grids import grid
+
+WEIGHTS = np.array([3.5, 2.0, 5.0])
+
+
+def demonstrations(count: int, weights: np.ndarray = WEIGHTS, seed: int = 0) -> list[Demonstration]:
+    """Paths drawn from the distribution of the weights, each in a world of its own."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        problem = grid(rng)
+        found.append(Demonstration(problem, soft_plan(problem, weights).draw(int(rng.integers(20)), rng)))
+    return found
+
+
+@pytest.mark.parametrize("prior", [1.0, 100.0])
+def test_the_gradient_is_that_of_central_differences(prior):
+    shown, rng = demonstrations(5), np.random.default_rng(1)
+    for _ in range(3):
+        weights = WEIGHTS * rng.uniform(0.8, 1.5, 3)
+        _, gradient, _ = loss_of(shown, weights, prior)
+        step = 1e-4
+        differences = [
+            (loss_of(shown, weights + move, prior)[0] - loss_of(shown, weights - move, prior)[0]) / (2 * step)
+            for move in step * np.eye(3)
+        ]
+        assert np.abs(gradient - differences).max() / np.abs(gradient).max() <= 1e-6
+
+
+def test_expected_features_are_the_demonstrations():
+    found = fit(demonstrations(40))
+    assert found.expected == pytest.approx(found.demonstrated, abs=1e-3)
+
+
+def test_weights_are_those_that_drew_the_demonstrations():
+    assert fit(demonstrations(300)).weights == pytest.approx(WEIGHTS, abs=0.8)
+
+
+def test_from_the_least_weights_on_all_sums_are_finite():
+    shown = demonstrations(3)
+    least = least_weights(shown)
+    assert least[0] == pytest.approx(np.log(8), rel=0.01)
+    loss_of(shown, least)
+
+
+def test_costs_without_a_base_are_refused():
+    problem = PathProblem(np.array([[0, 1], [1, 2]]), np.array([[0.0], [1.0]]), 3, 2)
+    with pytest.raises(ManipError, match="as length is"):
+        fit([Demonstration(problem, np.array([0, 1, 2]))])
+
+
+def test_without_demonstrations_nothing_is_learnt():
+    with pytest.raises(ManipError, match="no demonstration"):
+        fit([])

@@ -1,0 +1,189 @@
+"""The grid of `carry`: costs are those of paths, paths keep off things, their features are line integrals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manip_il.errors import ManipError, UnknownName
+from manip_il.rewards.paths import cheapest_path, costs_to_go, plan
+from manip_il.robots.reach import reach_of
+from manip_il.robots.robot import get_robot
+from manip_il.tasks.furnishing import space_of
+from manip_il.tasks.grid import Grid, descent
+from manip_il.tasks.layout import THINGS, Edge, Layout, Part, path_features
+from manip_il.tasks.reward import FEATURES, TASTES, Reward
+
+from ..tables import every_robot
+
+PARTS = (Part(-0.025, 0.036), Part(-0.018, 0.072), Part(0.07, 0.105), Part(0.19, 0.139))
+LAYOUT = Layout(
+    scale=1.0,
+    goal=(0.55, 0.12, 0.06),
+    places=(("vase", (0.42, 0.0)), ("laptop", (0.50, -0.10)), ("candle", (0.36, 0.19))),
+    edge=Edge((0.62, 0.0), (1.0, 0.0)),
+    half=0.025,
+    parts=PARTS,
+)
+SPACE = space_of(get_robot("panda"))
+STARTS = np.array([[0.35, -0.13, 0.07], [0.58, -0.12, 0.09], [0.45, 0.0, 0.25], [0.3, 0.1, 0.2]])
+CAREFUL = TASTES["careful"]
+
+
+@cache
+def grid() -> Grid:
+    return Grid(LAYOUT, SPACE)
+
+
+def node_near(position: np.ndarray) -> int:
+    nodes = grid().near(position)
+    return int(nodes[np.argmin(np.linalg.norm(grid().points[nodes] - position, axis=1))])
+
+
+def weights_with(**weights: float) -> np.ndarray:
+    return np.array(Reward.of({"length": 1.0, **weights}).weights)
+
+
+def test_a_layouts_grid_has_ten_thousand_nodes_and_the_goal_is_one_of_them():
+    assert len(grid().points) >= 10_000
+    np.testing.assert_allclose(grid().points[grid().goal], LAYOUT.goal, atol=1e-12)
+    assert grid().free[grid().goal]
+
+
+@pytest.mark.parametrize("taste", TASTES)
+def test_costs_to_go_are_the_cheapest_paths_features_times_the_weights(taste: str):
+    weights, problem = np.array(TASTES[taste].weights), grid().problem
+    costs, planned = grid().costs_to_go(weights), plan(problem, weights)
+    np.testing.assert_allclose(costs, costs_to_go(problem, weights), rtol=1e-9)
+    for start in STARTS:
+        path, features = cheapest_path(problem, planned, node_near(start))
+        assert features @ weights == pytest.approx(costs[path[0]], rel=1e-9)
+
+
+def test_an_edges_features_are_the_line_integrals_of_any_path():
+    for start in STARTS:
+        path, features = cheapest_path(
+            grid().problem, plan(grid().problem, np.array(CAREFUL.weights)), node_near(start)
+        )
+        along = path_features(LAYOUT, grid().points[path])
+        np.testing.assert_allclose(features, along, rtol=0.01, atol=5e-4)
+        assert features[0] == pytest.approx(along[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["above_laptop", "near_vase", "near_candle", "near_edge", "height"])
+def test_a_heavier_weight_keeps_planned_paths_no_nearer(name: str):
+    at, found = FEATURES.index(name), []
+    for weight in (0.0, 0.5, 2.0, 8.0, 30.0):
+        planned = plan(grid().problem, weights_with(**{name: weight}))
+        found.append([cheapest_path(grid().problem, planned, node_near(start))[1][at] for start in STARTS])
+    assert (np.diff(found, axis=0) <= 1e-9).all()
+    assert (np.array(found[-1]) < found[0]).any()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_descent_leads_to_the_goal_past_all_things(seed: int):
+    down, rng = descent(LAYOUT, CAREFUL, SPACE), np.random.default_rng(seed)
+    position = grid().points[rng.choice(np.flatnonzero(grid().free))] + rng.uniform(-0.01, 0.01, 3)
+    cost, heading = down.look(position)
+    room, costs = LAYOUT.room(position[None])[0], [cost]
+    for _ in range(400):
+        if heading is None or math.dist(position, LAYOUT.goal) < 0.005:
+            break
+        way = heading - position
+        position = position + way * min(1.0, 0.01 / np.linalg.norm(way))
+        assert LAYOUT.room(position[None])[0] > min(room, 0.0) - 0.006
+        cost, heading = down.look(position)
+        costs.append(cost)
+    assert math.dist(position, LAYOUT.goal) < 0.005
+    assert np.diff(costs).max(initial=0.0) < 0.02 * costs[0] + 0.01
+    assert costs[-1] < 0.05
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_descent_leads_on_from_beside_any_node(seed: int):
+    down, rng = descent(LAYOUT, CAREFUL, SPACE), np.random.default_rng(seed)
+    node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
+    position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
+    heading = down.look(position)[1]
+    assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
+
+
+def test_free_nodes_and_edges_keep_their_room():
+    assert LAYOUT.room(grid().points[grid().free]).min() >= 0
+    ends = grid().points[grid().problem.edges[::97]]
+    assert LAYOUT.room(ends.mean(axis=1)).min() >= 0
+    over = np.array([[0.50, -0.10, z] for z in (0.04, 0.06, 0.10)])  # the laptop is flat: there is a way over it
+    alone = replace(LAYOUT, places=LAYOUT.places[1:2])
+    assert (alone.room(over) >= 0).tolist() == [False, False, True]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_straight_line_becomes_a_path_no_longer_than_the_grids_shortest(seed: int):
+    empty = Grid(replace(LAYOUT, places=(), edge=None), SPACE)
+    rng = np.random.default_rng(seed)
+    start = np.array([0.45, 0.0, 0.17]) + rng.uniform(-1, 1, 3) * [0.15, 0.15, 0.1]
+    line = np.linspace(start, LAYOUT.goal, 15) + rng.normal(0, 5e-4, (15, 3))
+    path = empty.snap(line)
+    shortest = empty.costs_to_go(weights_with())[path[0]]
+    assert path[-1] == empty.goal
+    assert empty.problem.sums(path)[0] <= shortest * 1.06
+
+
+def test_a_path_that_is_snapped_costs_about_what_it_does():
+    down = descent(LAYOUT, CAREFUL, SPACE)
+    weights = down.weights
+    for start in STARTS:
+        position, path = start, [start]
+        while (heading := down.look(position)[1]) is not None and math.dist(position, LAYOUT.goal) > 0.004:
+            way = heading - position
+            position = position + way * min(1.0, 0.02 / np.linalg.norm(way))
+            path.append(position)
+        snapped = grid().snap(np.array(path))
+        cost, planned = grid().problem.sums(snapped) @ weights, down.costs[snapped[0]]
+        assert planned <= cost * (1 + 1e-9)
+        assert cost < 1.15 * planned
+        assert abs(cost - path_features(LAYOUT, np.array(path)) @ weights) < 0.15 * cost
+
+
+def test_where_no_free_path_is_there_is_nowhere_to_head_for():
+    shut = replace(LAYOUT, places=(("vase", LAYOUT.goal[:2]),))
+    down = descent(shut, CAREFUL, SPACE)
+    assert np.isinf(np.delete(down.costs, down.grid.goal)).all()
+    assert down.look(STARTS[0]) == (np.inf, None)
+    assert not down.leads(STARTS[0])
+
+
+def test_a_path_has_no_features_of_things_that_are_not_there_and_its_parts_add_up():
+    bare = replace(LAYOUT, places=(), edge=None)
+    path = np.cumsum(np.vstack([STARTS[0], np.random.default_rng(0).normal(0, 0.02, (20, 3))]), axis=0)
+    whole = path_features(bare, path)
+    assert (whole[2:] == 0).all()
+    assert whole[0] == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    parts = path_features(LAYOUT, path[:9]) + path_features(LAYOUT, path[8:])
+    np.testing.assert_allclose(parts, path_features(LAYOUT, path), rtol=1e-3, atol=1e-5)
+    assert (path_features(LAYOUT, path[:1]) == 0).all()
+
+
+@every_robot
+def test_a_space_is_the_map_of_where_the_hand_gets_to(robot: str):
+    space, reach = space_of(get_robot(robot)), reach_of(get_robot(robot))
+    points = np.array([*space.centre, 0.1]) + np.random.default_rng(0).uniform(-0.4, 0.4, (500, 3)) * [1, 1, 0.5]
+    assert space.has(points).tolist() == [reach.has(point) for point in points]
+    assert 0 < space.has(points).sum() < len(points)
+
+
+def test_a_layout_refuses_what_cannot_stand_on_a_table():
+    with pytest.raises(UnknownName, match=r"unknown thing 'case' .did you mean 'vase'"):
+        replace(LAYOUT, places=(("case", (0.4, 0.0)),))
+    with pytest.raises(ManipError, match="expected finite numbers"):
+        replace(LAYOUT, goal=(0.4, math.nan, 0.0))
+    with pytest.raises(ManipError, match="scale 0 for an object"):
+        replace(LAYOUT, scale=0.0)
+    assert not LAYOUT.meeting
+    assert replace(LAYOUT, places=tuple((name, (0.4, 0.0)) for name in THINGS)).meeting
