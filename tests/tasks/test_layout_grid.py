@@ -111,6 +111,7 @@ def test_the_descent_leads_on_from_beside_any_node(seed: int):
     node = rng.choice(np.flatnonzero(np.isfinite(down.costs)))
     position = grid().points[node] + rng.uniform(-1e-3, 1e-3, 3)
     heading = down.look(position)[1]
+    assert heading is not None
     assert node == grid().goal or np.linalg.norm(heading - position) > 0.005
 
 
