@@ -13,7 +13,6 @@ from manip_il.cli.outputs import open_output, require_new
 from manip_il.cli.progress import progress, say, warn
 from manip_il.errors import UnknownName
 from manip_il.option import option
-from manip_il.seeding import stream_base
 
 METHODS = ("max_margin", "bayesian", "max_entropy")
 
@@ -34,6 +33,8 @@ class IrlOptions:
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
+        from manip_il.seeding import stream_base  # here, as help needs no numpy
+
         if self.method not in METHODS:
             raise UnknownName("method", self.method, METHODS)
         stream_base("training", self.seed)
@@ -54,7 +55,7 @@ class IrlOptions:
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.evaluation.results import write_json
         from manip_il.rewards.methods import learn
-        from manip_il.seeding import rng_for
+        from manip_il.seeding import rng_for, stream_base
 
         info, begin, timings = dataset_info(self.dataset), time.monotonic(), dict[str, float]()
         with progress(info.episodes, f"irl {self.dataset}") as bar:

@@ -196,7 +196,7 @@ class PolicyTrainer:
 
         Every process takes its share of them.
         """
-        held_out, size = self.samples.held_out, self.batch_size
+        held_out, size = self.samples.held_out, self.config.samples_per_step
         if len(held_out) == 0:
             return {}
         policy = self.accelerator.unwrap_model(self.policy)

@@ -17,6 +17,8 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "datasets/demos": "record --dataset.root=datasets/demos",
     "datasets/demos.journals": "record --dataset.root=datasets/demos",
     "datasets/seen": "record --cameras=front,wrist --dataset.root=datasets/seen",
+    "datasets/carry": "record --task.type=carry --dataset.root=datasets/carry",
+    "runs/irl": "irl datasets/carry --output_dir=runs/irl",
     "demos_mcap": "mcap export datasets/demos demos_mcap",
     "runs/act": "train --policy.type=act --dataset.root=datasets/demos --output_dir=runs/act",
     "runs/cloned": "train --dataset.root=datasets/demos --output_dir=runs/cloned",

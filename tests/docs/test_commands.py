@@ -138,8 +138,14 @@ def test_every_block_of_a_page_is_of_a_kind_that_the_tests_know(page: str):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_every_line_is_one_that_the_command_line_takes(page: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(ROOT)
+def test_every_line_is_one_that_the_command_line_takes(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    for one in ROOT.iterdir():
+        if one.name != "runs":
+            (tmp_path / one.name).symlink_to(one)
+    reward = tmp_path / "runs" / "irl" / "reward.json"  # read with the options, as it says what the task is
+    reward.parent.mkdir(parents=True)
+    reward.write_text('{"names": ["length"], "weights": [1.0]}')
+    monkeypatch.chdir(tmp_path)
     for line in page_lines(page):
         if line.words[0] == PROGRAM:
             name, own = command_of(line.words[1:])

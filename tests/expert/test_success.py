@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from manip_il.data.schema import LABEL_VALID
 from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.expert import Expert
 from manip_il.seeding import stream_seeds
@@ -61,13 +62,20 @@ def test_the_expert_solves_every_task_from_40_starts(robot: str, task: str, cond
     assert failures(condition, robot, task, 40) == []
 
 
+# Where it leaves the object in no sound state: in a gap beside a laptop that the hand does not fit into.
+UNSOUND = {("panda", "carry", "moved", 6)}
+
+
 @pytest.mark.parametrize(("robot", "task", "kind", "at"), CHANGED)
-def test_the_expert_recovers(robot: str, task: str, kind: str, at: int):
+def test_the_expert_recovers_or_says_that_it_cannot(robot: str, task: str, kind: str, at: int):
     seed = stream_seeds("certificate", 20)[at]
     config, condition = EnvConfig(robot, task, horizon=at + TASKS[task].limits.horizon), Perturbation(kind, {seed: at})
     [episode] = run_job(RolloutJob(config, "expert", hold=0, conditions=(condition,)), [seed])
-    assert episode.success
     assert len(episode) > at
+    if (robot, task, kind, at) in UNSOUND:
+        assert not episode.columns[LABEL_VALID][at:].any()
+    else:
+        assert episode.success
 
 
 @pytest.mark.parametrize("x", [0.2, 0.25, 0.86])  # near the base and far from it [m]
