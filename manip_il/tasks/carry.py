@@ -53,7 +53,7 @@ APART = 0.22  # of the goal from the object at the start, sideways, at full scal
 HIGHEST = 0.2  # of a goal over where the object rests, at full scale [m]
 STEP = 0.05  # how far ahead of the hand its target runs while it carries [m]
 OVER, STEEP = 0.012, 8.0  # misalignment at which an empty hand may be down beside things [m]; its rise beyond that
-_DRAWS, _TOO_MANY = 400, 80  # of starts, and those after which there is one thing less
+_DRAWS, _TOO_MANY = 4_000, 80  # of starts, and those after which there is one thing less
 _GRASPED = 0.5  # progress of an object that is held
 
 
@@ -174,7 +174,7 @@ class Carry(PickPlace):
                 tastes = {name: (three, UPRIGHT) for name, three in zip(TASTE_BODIES, weights, strict=True)}
                 return Start({OBJECT: (at, turn), GOAL: (goal, UPRIGHT), **things, **tastes})
         raise UsageError(
-            f"task {self.name}: none of {_DRAWS} layouts drawn fits within reach of {world.scene.robot.name};"
+            f"task {self.name}: none of {_DRAWS:,} layouts drawn fits within reach of {world.scene.robot.name};"
             " choose another task or robot"
         )
 

@@ -12,6 +12,7 @@ from manip_il.cli.main import main
 from manip_il.engine.redraw import _Redrawer
 from manip_il.expert import Expert
 from manip_il.mdp import State
+from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state, environment_state_names
 from manip_il.sim.world import GOAL, World
@@ -216,3 +217,10 @@ def test_a_reward_of_a_file_drives_an_evaluation(tmp_path: Path, capsys: pytest.
 def test_things_are_of_a_size_for_the_arm():
     widths = {robot: float(ManipEnv(robot, "carry").scene.model.geom("vase").size[0]) for robot in ("panda", "so101")}
     assert widths["so101"] == pytest.approx(0.6 * widths["panda"])
+
+
+def test_starts_are_found_where_few_layouts_fit_within_reach():
+    env = ManipEnv.of(EnvConfig("so101", "carry"))
+    for seed in (6_000_097, *stream_seeds("held_out", 40, 0)):  # the first one fits after 400 drawn layouts alone
+        env.start(seed)
+        assert not touched(env)
