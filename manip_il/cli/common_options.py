@@ -63,7 +63,7 @@ def require_workers(workers: int | None) -> None:
 
 
 def _reward(text: str) -> str:
-    """What a reward is, by its numbers: a file that it came from may change."""
+    """Return a reward as its numbers: a file that it came from may change."""
     return Reward.parse(text).numbers if text else ""
 
 

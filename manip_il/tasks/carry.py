@@ -90,13 +90,13 @@ def _safe_height(world: World) -> float:
 
 
 def _rise(world: World) -> float:
-    """How high over its grasp the hand stays for the things around, by how far it is from over the object [m]."""
+    """Return the height over its grasp that the hand keeps for the things around, by how far off it is [m]."""
     g = grasp_of(world, OBJECT)
     return min(STEEP * max(0.0, g.off - OVER), max(0.0, _safe_height(world) - g.at[2]))
 
 
 def _approach(world: World) -> Target:
-    """As any object is approached, but above all things until the hand is over it."""
+    """Approach as any object is, but above all things until the hand is over it."""
     target, g, ee = approach(world, OBJECT), grasp_of(world, OBJECT), world.ee.position
     x, y, z = g.at
     rise = _rise(world)

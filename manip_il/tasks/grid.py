@@ -118,7 +118,7 @@ class Grid:
 
     @cached_property
     def _links(self) -> _Links:
-        """Those of the edges that are free from end to end."""
+        """Return those of the edges that are free from end to end."""
         every = _links(self.shape)
         kept: NDArray[np.bool_] = np.all(self.free[every.edges], axis=1)
         middles = every.fine[kept, 1]
@@ -253,7 +253,7 @@ class Descent:
         return float(totals.min()), self._heading(position, price, nodes, ends, totals, off, spare)
 
     def _prices(self, points: F64) -> F64:
-        """What a metre of path costs at points (N, 3), (N,)."""
+        """Return what a metre of path costs at points (N, 3), (N,)."""
         return self.grid.layout.densities(points) @ self.weights
 
     def _heading(self, position: F64, price: float, nodes: I64, ends: F64, totals: F64, off: F64, spare: float) -> F64:

@@ -171,7 +171,7 @@ def _simpson(count: int) -> tuple[F64, F64]:
 
 
 def _beside(points: F64, middle: F64, half: F64) -> F64:
-    """How far points (N, 3) are from a box along x and y, 0 over it, (N,) [m]."""
+    """Return how far points (N, 3) are from a box along x and y, 0 over it, (N,) [m]."""
     return np.hypot(*np.maximum(np.abs(points[:, :2] - middle) - half, 0.0).T)
 
 
