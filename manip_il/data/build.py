@@ -8,6 +8,7 @@ import itertools
 import json
 import logging
 import re
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
@@ -24,6 +25,7 @@ from manip_il.data.lerobot_read import (
     UNKNOWN_TASK,
     DatasetInfo,
     camera_keys,
+    check_dataset,
     dataset_info,
     read_episodes,
     read_fingerprint,
@@ -166,7 +168,8 @@ def merge_datasets(
 
     The fingerprint is the first one's unless given; where theirs differ, a warning is logged. The provenance names the
     sources and theirs, beside what is given. Datasets with cameras are joined by LeRobot, which copies their videos;
-    its statistics of pictures are approximate. Raises `MismatchError` naming both sides where the specs differ.
+    its statistics of pictures are approximate. One of them alone is copied as it is. Raises `MismatchError` naming both
+    sides where the specs differ.
     """
     if not roots:
         raise ManipError("no datasets to merge")
@@ -180,7 +183,8 @@ def merge_datasets(
     origin = {**(provenance or {}), "merged": sources}
     fingerprint = first if fingerprint is None else fingerprint
     if any(camera_keys(source) for source in roots):
-        return _join_by_lerobot(roots, root, repo_id, own_file(repo_id, spec, fingerprint, origin))
+        about = own_file(repo_id, spec, fingerprint, origin)
+        return _copy(roots[0], root, about) if len(roots) == 1 else _join_by_lerobot(roots, root, repo_id, about)
     episodes = itertools.chain.from_iterable(read_episodes(source) for source in roots)
     return write_dataset(episodes, root, spec, repo_id=repo_id, fingerprint=fingerprint, provenance=origin)
 
@@ -192,6 +196,15 @@ def dataset_sha256(root: Path) -> str:
         with path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+def _copy(source: Path, root: Path, about: Mapping[str, Any]) -> DatasetInfo:
+    """Copy files with their times of change, by which decoded pictures are found again."""
+    check_dataset(source)
+    with new_folder(root) as folder:
+        shutil.copytree(source, folder, dirs_exist_ok=True)
+        layout.write_json(folder / layout.OURS, about)
+    return dataset_info(root)
 
 
 def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Mapping[str, Any]) -> DatasetInfo:

@@ -26,6 +26,7 @@ Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` o
 
 _VERSION = 1  # of what is stored: another one makes all caches stale
 _PART_BYTES = 32 * 1024 * 1024  # of pictures that are decoded at once
+_PART_ROWS = 500  # of a data file, at least: opening one that has a row group an episode takes long
 _LEAST = 32  # frames that are, however large: decoding starts at the last key frame before them
 _PLACES = ("length", "dataset_from_index")
 _SEE_DOCTOR = "run `manip-il doctor` to see what is wrong"
@@ -48,16 +49,18 @@ class VideoPart:
 
 @dataclass(frozen=True)
 class ParquetPart:
-    """The pictures that one row group of a data file holds."""
+    """The pictures that row groups `first` to `first + count - 1` of a data file hold."""
 
     path: str
-    group: int
+    first: int
+    count: int
 
     def read(self, root: Path, key: str, fps: int) -> Iterator[Rows]:
         """Decode them, one by one. Raises `ManipError` where one cannot be."""
         try:
             with pq.ParquetFile(root / self.path) as file:
-                for batch in file.iter_batches(64, [self.group], [key, layout.INDEX], use_threads=False):
+                groups = range(self.first, self.first + self.count)
+                for batch in file.iter_batches(64, groups, [key, layout.INDEX], use_threads=False):
                     rows, stored = (batch.column(name).to_pylist() for name in (layout.INDEX, key))
                     for row, picture in zip(rows, stored, strict=True):
                         yield row, decode_picture(picture["bytes"])[None]
@@ -200,10 +203,15 @@ def _row_groups(root: Path, info: Info) -> Iterator[ParquetPart]:
     for shard in _whole_shards(root, layout.DATA_FILES):
         try:
             rows += [integers(table, layout.INDEX) for table in shard.tables([layout.INDEX])]
-            groups = pq.read_metadata(shard.path).num_row_groups
+            held = pq.read_metadata(shard.path)
         except UNREADABLE as error:
             raise ManipError(f"cannot read {shard.path}: {error}; {_SEE_DOCTOR}") from error
-        yield from (ParquetPart(shard.name, group) for group in range(groups))
+        first = pending = 0
+        for group in range(held.num_row_groups):
+            pending += held.row_group(group).num_rows
+            if pending >= _PART_ROWS or group == held.num_row_groups - 1:
+                yield ParquetPart(shard.name, first, group + 1 - first)
+                first, pending = group + 1, 0
     if not rows or not np.array_equal(np.sort(np.concatenate(rows)), np.arange(info.frames)):
         raise ManipError(f"{root}: its data files do not hold each of {info.frames} frames once; {_SEE_DOCTOR}")
 

@@ -72,7 +72,12 @@ class Posterior:
 
 
 def draw_posterior(
-    choices: Choices, rng: np.random.Generator, prior: float = PRIOR, count: int = _DRAWS, warm_up: int = _WARM_UP
+    choices: Choices,
+    rng: np.random.Generator,
+    prior: float = PRIOR,
+    count: int = _DRAWS,
+    warm_up: int = _WARM_UP,
+    chains: int = CHAINS,
 ) -> Posterior:
     """Return draws of the weights given what was chosen. prior: mean of a weight [1/m]. count: of every chain."""
 
@@ -80,7 +85,7 @@ def draw_posterior(
         weights = np.exp(logs)
         return choices.log_likelihood(weights) - weights.sum(axis=1) / prior + logs.sum(axis=1)  # d w = w d log w
 
-    start = np.log(prior * rng.uniform(0.5, 1.5, (CHAINS, choices.excess.shape[1])))
+    start = np.log(prior * rng.uniform(0.5, 1.5, (chains, choices.excess.shape[1])))
     logs = sample(density, start, count, warm_up, rng)
     points = logs.points
     return Posterior(Draws(np.exp(points), logs.accepted), effective_size(points), agreement(points))

@@ -82,7 +82,7 @@ def test_no_reader_hands_a_picture_to_ghostscript(marker, pictured):
     text = "the picture in row 0 cannot be decoded: it is not a PNG or JPEG (1 row like this)"
     assert any(text in line for line in found)
     for read in (
-        lambda: list(ParquetPart(DATA, 0).read(pictured, KEY, 20)),
+        lambda: list(ParquetPart(DATA, 0, 1).read(pictured, KEY, 20)),
         lambda: list(stored_pictures(pictured, KEY)),
         lambda: decode_picture(EPS),
     ):

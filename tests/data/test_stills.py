@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 
 from manip_il.data import schema as s
 from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.frame_source import find_frames
 from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.lerobot_read import camera_keys, read_episodes, read_frames, read_spec
 from manip_il.data.lerobot_write import write_dataset
@@ -53,6 +55,17 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
     np.testing.assert_array_equal(read_frames(root, SIDE, 2), seen[2].columns[SIDE])
     blind = next(read_episodes(root, pictures=False))
     assert FRONT not in blind.columns
+
+
+def test_data_files_with_a_row_group_a_frame_are_read_in_few_parts(root, tmp_path):
+    [path] = root.glob("data/*/*.parquet")
+    table, whole = pq.read_table(path), open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "before")
+    pq.write_table(table, path, row_group_size=1)
+    assert len(find_frames(root, FRONT).parts) == -(-table.num_rows // 500)
+    again = open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "after")
+    assert whole is not None
+    assert again is not None
+    np.testing.assert_array_equal(again[FRONT], whole[FRONT])
 
 
 def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):

@@ -17,7 +17,8 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data import video
-from manip_il.data.build import merge_datasets
+from manip_il.data.build import dataset_sha256, merge_datasets
+from manip_il.data.frame_source import find_frames
 from manip_il.data.lerobot_read import (
     camera_keys,
     dataset_info,
@@ -215,6 +216,14 @@ def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root)
         for episode in range(6):
             here, there = read_frames(tmp_path / "merged", camera, episode), read_frames(root, camera, episode % 3)
             np.testing.assert_array_equal(here, there)
+
+
+def test_one_dataset_with_cameras_alone_is_copied_as_it_is(tmp_path, root):
+    merge_datasets([root], tmp_path / "copied", repo_id="x/y", provenance={"made": "here"})
+    assert read_provenance(tmp_path / "copied")["made"] == "here"
+    assert dataset_sha256(tmp_path / "copied") == dataset_sha256(root)
+    here, there = (find_frames(one, FRONT).fingerprint for one in (tmp_path / "copied", root))
+    assert here == there  # so pictures that are decoded already are found
 
 
 def test_a_dataset_with_cameras_tells_of_itself(tmp_path, root, filmed, two):
