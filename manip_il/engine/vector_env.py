@@ -116,7 +116,9 @@ class ActionRange:
     @property
     def space(self) -> spaces.Box:
         """Normalised actions within the range."""
-        low, high = (np.where(self.scale > 0, self.normalised(one), sign) for one, sign in ((self.low, -1), (self.high, 1)))
+        low, high = (
+            np.where(self.scale > 0, self.normalised(one), sign) for one, sign in ((self.low, -1), (self.high, 1))
+        )
         return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, override
-
-import math
 
 import torch
 from gymnasium import spaces
@@ -70,7 +69,7 @@ class ActorCritic(ActorCriticPolicy):
 
     @property
     def log_std(self) -> Tensor:
-        """Log-deviations of the numbers of an action that vary, in normalised units."""
+        """Log-deviations of the numbers of an action that vary, (m,), in normalised units."""
         return floored_log_std(_head(self.actor).raw_log_std)[self._free > 0]
 
     @property

@@ -108,7 +108,11 @@ class Discriminator(nn.Module, ABC):
         """Return two hidden layers and one number, (B, inputs) to (B, 1)."""
         width, wrap = self.config.width, spectral_norm if self.config.regulariser == "spectral_norm" else _plain
         return nn.Sequential(
-            wrap(nn.Linear(inputs, width)), nn.ReLU(), wrap(nn.Linear(width, width)), nn.ReLU(), wrap(nn.Linear(width, 1))
+            wrap(nn.Linear(inputs, width)),
+            nn.ReLU(),
+            wrap(nn.Linear(width, width)),
+            nn.ReLU(),
+            wrap(nn.Linear(width, 1)),
         )
 
     def _encode(self, rows: Transitions, log_probs: F32) -> Batch:

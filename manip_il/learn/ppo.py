@@ -23,8 +23,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from manip_il.errors import NotFiniteError, UsageError
-from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.actor_critic import EXTRA, ActorCritic, set_log_std
+from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.transitions import F32, Transitions
 
@@ -39,7 +39,9 @@ class Learner:
 
     def __init__(self, network: MLPNetwork, config: PPOConfig, env: VecEnv, horizon: int, log_std: float | None = None):
         if env.num_envs % config.minibatches:
-            raise UsageError(f"episodes is {env.num_envs}; expected a multiple of ppo.minibatches ({config.minibatches})")
+            raise UsageError(
+                f"episodes is {env.num_envs}; expected a multiple of ppo.minibatches ({config.minibatches})"
+            )
         self.network = network
         if log_std is not None:
             set_log_std(network, log_std)
@@ -74,10 +76,10 @@ class Learner:
         """Run one episode in every environment; return all steps, those of a time together."""
         env, buffer = self.ppo.env, self.ppo.rollout_buffer
         assert env is not None
-        self.ppo._last_obs = env.reset()  # noqa: SLF001
-        self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)  # noqa: SLF001
+        self.ppo._last_obs = env.reset()
+        self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
-        after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])  # noqa: SLF001
+        after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
         states, next_states = (rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after))
         low, high = self.ppo.action_space.low, self.ppo.action_space.high  # pyright: ignore[reportAttributeAccessIssue]
         actions = np.clip(buffer.actions, low, high).reshape(len(states), -1) * (1.0 - states[:, -1:])
@@ -126,7 +128,7 @@ class Learner:
 
 @contextmanager
 def lent_generators(seed: int) -> Generator[None]:
-    """Lend torch and numpy generators of our own in place of the global ones, which stable-baselines3 draws from."""
+    """Replace the global generators of torch and numpy, which stable-baselines3 draws from, while the `with` lasts."""
     before = np.random.get_state()  # noqa: NPY002
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

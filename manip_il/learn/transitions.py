@@ -14,6 +14,7 @@ where the learner arrives as fast as it was shown.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from manip_il.data.lerobot_read import read_table, read_tables
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
-from manip_il.learn.columns import EPISODE_INDEX, learning_rows
+from manip_il.learn.columns import EPISODE_INDEX
 from manip_il.mdp import Actor
 
 F32 = NDArray[np.float32]
@@ -116,7 +117,7 @@ def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32
 def read_demonstrations(
     roots: Sequence[Path], encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 ) -> Demonstrations:
-    """Read the expert's whole episodes from datasets. encode: `Conversion.encode`.
+    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
 
     Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
     says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
@@ -134,7 +135,7 @@ def read_demonstrations(
             raise NotFiniteError(f"column {name}, row {int(np.argmin(sound_rows))} is not finite")
     index = table[EPISODE_INDEX].reshape(-1)
     bounds = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
-    pieces = [slice(*pair) for pair in zip(bounds[:-1], bounds[1:], strict=True)]
+    pieces = [slice(*pair) for pair in itertools.pairwise(bounds)]
     solved = table[SUCCESS].reshape(-1) != 0 if SUCCESS in table else np.ones(len(index), dtype=bool)
     pieces = [piece for piece in pieces if sound[piece].all() and solved[piece].any()]
     if not pieces:
