@@ -168,13 +168,18 @@ class LearningRun:
             return self._learner.log_prob(rows)
 
     def discriminate(self, d: Discriminator, learner: Transitions) -> None:
-        """Fit a discriminator to the demonstrations and the learner's steps."""
+        """Fit a discriminator to the demonstrations and the learner's steps.
+
+        The demonstrated actions get noise as wide as the learner's spread: it is then known by where it aims. Without
+        it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
+        """
         if self._expert is None:
             raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")
-        log_probs = self.log_prob(self._expert), self.log_prob(learner)
         rng = rng_for(self._stream(self._number, "discriminator"), "batches")
         with threads(1):
-            found = d.fit(self._expert, learner, log_probs, rng)
+            expert = self._learner.explored(self._expert, rng)
+            log_probs = self._learner.log_prob(expert), self._learner.log_prob(learner)
+            found = d.fit(expert, learner, log_probs, rng)
         self._metrics |= {f"discriminator_{name}": value for name, value in found.items()}
 
     def improve(self, rewards: F32) -> None:

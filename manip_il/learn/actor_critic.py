@@ -73,6 +73,11 @@ class ActorCritic(ActorCriticPolicy):
         return floored_log_std(_head(self.actor).raw_log_std)[self._free > 0]
 
     @property
+    def spread(self) -> Tensor:
+        """Deviations of the numbers of an action, (n,), in normalised units; 0 where they never change."""
+        return floored_log_std(_head(self.actor).raw_log_std).exp().detach() * self._free
+
+    @property
     def _free(self) -> Tensor:
         return (self.actor.target_scale > 0).float()
 

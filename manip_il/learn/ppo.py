@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
@@ -81,8 +82,7 @@ class Learner:
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
         after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
         states, next_states = (rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after))
-        low, high = self.ppo.action_space.low, self.ppo.action_space.high  # pyright: ignore[reportAttributeAccessIssue]
-        actions = np.clip(buffer.actions, low, high).reshape(len(states), -1) * (1.0 - states[:, -1:])
+        actions = np.clip(buffer.actions, *self._bounds).reshape(len(states), -1) * (1.0 - states[:, -1:])
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
 
     def improve(self, rewards: F32, *, actor: bool = True) -> dict[str, float]:
@@ -108,6 +108,18 @@ class Learner:
         with torch.no_grad():
             _, log_prob, _ = self.policy.evaluate_actions(obs, torch.from_numpy(rows.actions))
         return log_prob.numpy()
+
+    def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
+        """Return the same rows, N, with noise of the actor's spread on their actions, within the actions' range."""
+        noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self.policy.spread.numpy()
+        actions = np.clip(rows.actions + noise, *self._bounds) * (1.0 - rows.states[:, -1:])
+        return Transitions(rows.states, actions.astype(np.float32), rows.next_states)
+
+    @property
+    def _bounds(self) -> tuple[F32, F32]:
+        space = self.ppo.action_space
+        assert isinstance(space, Box)
+        return space.low, space.high
 
     def save(self, folder: Path, modules: Mapping[str, Any]) -> None:
         """Write weights and optimisers' states of actor, critic and `modules`, by name, into `folder`."""
