@@ -56,6 +56,10 @@ COMMANDS = {
     "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
     "theory": Command("manip_il.cli.theory:TheoryOptions", "see what is proved of cloning and DAgger, on an arm, too"),
     "irl": Command("manip_il.cli.irl:IrlOptions", "learn a reward from demonstrations of carry"),
+    "gail": Command(
+        "manip_il.cli.adversarial:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"
+    ),
+    "airl": Command("manip_il.cli.adversarial:AirlOptions", "imitate by AIRL, which learns a reward, too"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(

@@ -188,6 +188,12 @@ class Stages:
         self._bar.advance()
         self.check()
 
+    def reach(self, step: int, **fields: object) -> None:
+        """Show that a stage has reached a step, and what `fields` say of it."""
+        self._bar.advance(step - self._done, **fields)
+        self._done = step
+        self.check()
+
     def log(self, record: dict[str, Any]) -> None:
         """Show a fit's metrics at a step; {} where there are none."""
         if record:

@@ -127,7 +127,7 @@ class Trainer:
         self.peak_lr = lerobot.optimizer().lr
         self.step = 0
         train, held_out = split_by_episode(rows.episodes, config.eval_split, config.seed)
-        self.policy = _new_policy(lerobot, spec)
+        self.policy = new_policy(lerobot, spec)
         network = self.policy.model
         network.set_statistics(fit_statistics(rows.inputs[train], rows.targets[train], network.loss))
         self.policy.to(self.policy.config.device)
@@ -194,14 +194,8 @@ class Trainer:
         """
         final = output_dir / "checkpoints" / f"{self.step:06d}"
         with unpublished(final) as new:
-            folder, state = new / PRETRAINED_MODEL, new / TRAINING_STATE
-            folder.mkdir()
-            self.policy.save_pretrained(folder)
-            processors = make_pre_post_processors(self.policy.config)
-            if is_in_processors(self.policy.config.type, self.conversion):
-                add_steps(*processors, self.conversion)
-            for processor in processors:
-                processor.save_pretrained(folder)
+            state = new / TRAINING_STATE
+            save_policy(self.policy, self.conversion, new / PRETRAINED_MODEL)
             state.mkdir()
             save_optimizer_state(self.optimizer, state)
             write_own_files(new, meta, {"step": self.step, **resume_key})
@@ -223,6 +217,17 @@ class Trainer:
         return value
 
 
+def save_policy(policy: MLPPolicy, conversion: Conversion, folder: Path) -> None:
+    """Write configuration, weights and processors of an mlp to a new folder, as LeRobot has them."""
+    folder.mkdir()
+    policy.save_pretrained(folder)
+    processors = make_pre_post_processors(policy.config)
+    if is_in_processors(policy.config.type, conversion):
+        add_steps(*processors, conversion)
+    for processor in processors:
+        processor.save_pretrained(folder)
+
+
 def lr_at(step: int, steps: int, peak: float) -> float:
     """Return the learning rate of an update, from 0 to `steps` - 1: linear warm-up, then a cosine down to zero."""
     warmup = min(WARMUP_STEPS, steps // 10)
@@ -241,7 +246,8 @@ def _drawn(table: Table, rows: Rows, config: FitConfig, sources: Sources | None)
     return drawn
 
 
-def _new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
+def new_policy(lerobot: LeRobotFit, spec: RobotTaskSpec) -> MLPPolicy:
+    """Return an mlp for data of `spec`, with weights drawn from the fit's seed."""
     n, k = len(spec.joint_names), len(spec.environment_state_names)
     policy_config = copy.deepcopy(lerobot.policy)
     assert isinstance(policy_config, MLPConfig)

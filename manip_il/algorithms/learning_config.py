@@ -1,0 +1,76 @@
+"""The options of a run of reinforcement learning, from demonstrations or from a reward."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from manip_il.errors import UsageError
+from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig, PPOConfig
+from manip_il.option import option
+from manip_il.seeding import stream_base
+from manip_il.sim.config import EnvConfig
+
+_AT_LEAST_1 = ("steps", "episodes", "validation_every", "validation_episodes")
+LONGER = 1.5  # times the longest demonstration, by default
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningConfig:
+    """Options of `LearningRun`. datasets: demonstrations. start: the `pretrained_model` folder of a clone.
+
+    Raises `UsageError` for a number out of range.
+    """
+
+    env: EnvConfig
+    datasets: tuple[Path, ...] = ()
+    start: Path | None = None
+    steps: int = option(200_000, "simulated control steps in all")
+    episodes: int = option(32, "of an iteration, side by side")
+    episode_steps: int = option(
+        0, "control steps of an episode while learning; 0: half as many again as the longest demonstration has"
+    )
+    action_space: str | None = option(
+        None, "what the policy's actions are: ee_delta, joint_delta or joint_target; by default ee_delta, or --init's"
+    )
+    log_std: float | None = option(
+        None,
+        "log of the first spread of actions, in deviations of the demonstrations'; by default -0.5, or -2 of a clone",
+    )
+    warmup: int | None = option(
+        None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init"
+    )
+    reward: str = option("logit", ", ".join(REWARDS))
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
+    validation_every: int = option(20_000, "steps from one validation to the next")
+    validation_episodes: int = option(100, "episodes of a validation, by which the best policy is chosen")
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in _AT_LEAST_1:
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")
+        if self.episodes % self.ppo.minibatches:
+            raise UsageError(f"episodes is {self.episodes}; expected a multiple of ppo.minibatches")
+        if self.episode_steps < 0 or self.episode_steps > self.env.horizon:
+            raise UsageError(f"episode_steps is {self.episode_steps}; expected at most the horizon, {self.env.horizon}")
+        if self.log_std is not None and not -4 <= self.log_std <= 2:
+            raise UsageError(f"log_std is {self.log_std}; expected -4 to 2")
+        if self.warmup is not None and self.warmup < 0:
+            raise UsageError(f"warmup is {self.warmup}; expected at least 0")
+        stream_base("reinforcement", self.seed)
+
+    @property
+    def first_log_std(self) -> float:
+        """Log of the first spread of actions; of a clone small, so that it explores close to what it does."""
+        if self.log_std is not None:
+            return self.log_std
+        return -0.5 if self.start is None else -2.0
+
+    @property
+    def warmup_iterations(self) -> int:
+        """Iterations before the actor moves: a critic that knows nothing destroys a clone."""
+        if self.warmup is not None:
+            return self.warmup
+        return 0 if self.start is None else 10

@@ -1,0 +1,278 @@
+"""One run of reinforcement learning on disk: environments, learner, and what is kept of every iteration.
+
+checkpoints/last/    the last finished iteration: its policy, and all that the next one needs
+validation/          every validation's eval.json, by iteration
+best/                the policy with the highest validation success, the later of equals
+
+An iteration is whole episodes from seeds of its own, and draws from random streams of its own: a run that was killed
+goes on from its last finished iteration to the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from manip_il.algorithms.learning_config import LONGER, LearningConfig
+from manip_il.algorithms.run import BEST, Watch
+from manip_il.data.atomic import new_folder
+from manip_il.data.lerobot_read import read_spec
+from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.vector_env import ActionRange, Lockstep, RobotEpisode
+from manip_il.errors import ManipError, UsageError
+from manip_il.evaluation.results import FILE_NAME, EvalResult
+from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.learn.checkpoint import (
+    PRETRAINED_MODEL,
+    TRAINING_STATE,
+    CheckpointMeta,
+    last_checkpoint,
+    read_step,
+    readable_state,
+    unpublished,
+    write_own_files,
+)
+from manip_il.learn.discriminators import Discriminator
+from manip_il.learn.limits import threads
+from manip_il.learn.network import MLPNetwork
+from manip_il.learn.ppo import Learner, lent_generators
+from manip_il.learn.start import start_conversion, start_policy
+from manip_il.learn.train import save_policy
+from manip_il.learn.transitions import Demonstrations, Transitions, read_demonstrations
+from manip_il.mdp import F32, F64
+from manip_il.seeding import rng_for, stream_base, stream_seeds
+
+VALIDATION = "validation"
+Kept = TypeVar("Kept", bound=Discriminator)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """Outcome of an iteration. steps: simulated so far. validation: of its policy, None where none was due."""
+
+    number: int
+    steps: int
+    metrics: dict[str, float]
+    policy: Path
+    validation: EvalResult | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the line of `metrics.jsonl`."""
+        success = None if self.validation is None else self.validation.success.rate
+        return {"iteration": self.number, "steps": self.steps, **self.metrics, "validation_success": success}
+
+
+class LearningRun:
+    """The steps of one run in `folder`. absorbing: episodes end after success, as the demonstrations do.
+
+    Raises what `start_conversion` and `read_demonstrations` raise, `UsageError` for options that do not fit those.
+    """
+
+    def __init__(
+        self,
+        config: LearningConfig,
+        folder: Path,
+        engine: Engine,
+        watch: Watch | None = None,
+        *,
+        absorbing: bool = True,
+    ):
+        self.config, self.folder = config, folder
+        self._engine, self._watch = engine, watch or Watch()
+        self._modules: dict[str, Discriminator] = {}
+        self._number, self._simulated, self._metrics = 0, 0, dict[str, float]()
+        self._validated_at = 0
+        spec = read_spec(config.datasets[0]) if config.datasets else env_spec(config.env)
+        self._spec = spec
+        self._conversion = start_conversion(config.start, config.action_space, spec)
+        demonstrations = read_demonstrations(config.datasets, self._conversion.encode) if config.datasets else None
+        with threads(1), lent_generators(self._stream(0, "weights")):
+            self._policy = start_policy(
+                config.start, self._conversion.space, spec, stream_base("training", config.seed),
+                demonstrations.stacked if demonstrations else None,
+            )  # fmt: skip
+            network = self._policy.model
+            names = ("target_mean", "target_scale", "target_low", "target_high")
+            self._actions = ActionRange(*(getattr(network, name).numpy().copy() for name in names))
+            self.horizon = _episode_steps(config, demonstrations)
+            hold = demonstrations.hold if demonstrations and absorbing else None
+            self._envs = Lockstep(
+                [RobotEpisode(config.env, self._conversion, hold) for _ in range(config.episodes)],
+                self._actions, self.horizon,
+            )  # fmt: skip
+            self._learner = Learner(network, config.ppo, self._envs, self.horizon, config.first_log_std)
+        self._expert = demonstrations.padded(self.horizon, self._actions.normalised) if demonstrations else None
+        self.frames = len(demonstrations.stacked[0]) if demonstrations else 0
+
+    def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
+        """Return a discriminator that belongs to the run and is saved with it. make: of the actor's network."""
+        with lent_generators(self._stream(0, "discriminator")):
+            self._modules["discriminator"] = made = make(self._policy.model)
+        return made
+
+    @property
+    def last(self) -> Iteration | None:
+        """The last finished iteration on disk, None where there is none."""
+        checkpoint = last_checkpoint(self.folder, resume=True)
+        if checkpoint is None:
+            return None
+        step = read_step(checkpoint)
+        number = int(step["step"])
+        return Iteration(
+            number, int(step["simulated"]), step["metrics"], checkpoint / PRETRAINED_MODEL, self._validation(number)
+        )
+
+    def iterations(self) -> Iterator[int]:
+        """Yield the numbers, from 1 or from the last finished iteration's on, until all steps are simulated."""
+        self._resume()
+        if self._number == 0 and self.config.start is not None:
+            self._validate(0, self.config.start)
+        while self._simulated < self.config.steps:
+            self._number += 1
+            self._metrics = {}
+            yield self._number
+
+    def rollouts(self, number: int) -> Transitions:
+        """Run the learner's episodes of an iteration; return all steps, those of absorbing states too."""
+        self._number = number
+        seeds = stream_seeds("reinforcement", number * self.config.episodes, self.config.seed)
+        self._envs.seeds = seeds[-self.config.episodes :]
+        with threads(1), lent_generators(self._stream(number, "rollouts")):
+            self._rows = self._learner.collect()
+        self._simulated += self._envs.simulated
+        self._metrics["success"] = float(self._envs.solved.mean())
+        self._metrics["absorbing"] = float(self._rows.absorbing.mean())
+        return self._rows
+
+    def executed(self) -> tuple[F32, F32, F64, F32, F32]:
+        """Return the last rollouts as datasets have them.
+
+        That is joint states (N, n), environment states (N, k), actions (N, n), and both states after these.
+        """
+        n = len(self._spec.joint_names)
+        before, after = self._rows.states[:, :-1], self._rows.next_states[:, :-1]
+        actions = np.concatenate(self._envs.executed)
+        return before[:, :n], before[:, n:], actions, after[:, :n], after[:, n:]
+
+    def log_prob(self, rows: Transitions) -> F32:
+        """Return the log-density of rows' actions for the learner [nats], (N,)."""
+        with threads(1):
+            return self._learner.log_prob(rows)
+
+    def discriminate(self, d: Discriminator, learner: Transitions) -> None:
+        """Fit a discriminator to the demonstrations and the learner's steps.
+
+        The demonstrated actions get noise as wide as the learner's spread: it is then known by where it aims. Without
+        it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
+        """
+        if self._expert is None:
+            raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")
+        rng = rng_for(self._stream(self._number, "discriminator"), "batches")
+        with threads(1):
+            expert = self._learner.explored(self._expert, rng)
+            log_probs = self._learner.log_prob(expert), self._learner.log_prob(learner)
+            found = d.fit(expert, learner, log_probs, rng)
+        self._metrics |= {f"discriminator_{name}": value for name, value in found.items()}
+
+    def improve(self, rewards: F32) -> None:
+        """Let PPO learn from the rewards (N,) of the last rollouts."""
+        self._metrics["return"] = float(rewards.sum() / self.config.episodes)
+        moves = self._number > self.config.warmup_iterations
+        with threads(1), lent_generators(self._stream(self._number, "updates")):
+            self._metrics |= self._learner.improve(rewards, actor=moves)
+
+    def finish(self) -> Iteration:
+        """Write the iteration, which ends it; validate its policy where that is due."""
+        meta = CheckpointMeta.of(
+            self._spec, env_fingerprint(self.config.env), self._options(), action_space=self._conversion.space
+        )
+        step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
+        with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
+            save_policy(self._policy, self._conversion, new / PRETRAINED_MODEL)
+            (new / TRAINING_STATE).mkdir()
+            self._learner.save(new / TRAINING_STATE, self._modules)
+            write_own_files(new, meta, step | {"validated_at": self._validated_at})
+        for other in (self.folder / "checkpoints").iterdir():
+            if not other.is_symlink() and other.name != f"{self._number:06d}":
+                shutil.rmtree(other, ignore_errors=True)
+        self._watch.on_step()
+        policy = self.folder / "checkpoints" / "last" / PRETRAINED_MODEL
+        return Iteration(self._number, self._simulated, self._metrics, policy, self._validate_if_due(policy))
+
+    def _validate_if_due(self, policy: Path) -> EvalResult | None:
+        every = self.config.validation_every
+        if self._simulated < self.config.steps and self._simulated // every == self._validated_at // every:
+            return None
+        self._validated_at = self._simulated
+        return self._validate(self._number, policy)
+
+    def _validate(self, number: int, policy: Path) -> EvalResult:
+        """Evaluate a policy on the validation's seeds, unless that has been done; keep it where it is the best."""
+        if (found := self._validation(number)) is None:
+            job = RolloutJob(self.config.env, "policy", policy=policy, label="last", hold=HOLD)
+            seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
+            found = evaluate(self._engine, job, seeds, f"iteration {number}", self._watch.on_episode)
+            found.write(self._eval_file(number))
+        if number == best_validation(validations(self.folder)):
+            with new_folder(self.folder / BEST, replace=True) as new:
+                shutil.copytree(policy, new / PRETRAINED_MODEL)
+        return found
+
+    def _validation(self, number: int) -> EvalResult | None:
+        path = self._eval_file(number)
+        return EvalResult.read(path) if path.is_file() else None
+
+    def _eval_file(self, number: int) -> Path:
+        return self.folder / VALIDATION / f"{number:06d}" / FILE_NAME
+
+    def _resume(self) -> None:
+        """Go on from the last finished iteration, whose validation is made up for where it is missing."""
+        checkpoint = last_checkpoint(self.folder, resume=True)
+        if checkpoint is None:
+            return
+        step = read_step(checkpoint)
+        with readable_state(checkpoint), threads(1):
+            self._learner.load(checkpoint / TRAINING_STATE, self._modules)
+            self._number, self._simulated = int(step["step"]), int(step["simulated"])
+            self._validated_at = int(step["validated_at"])
+        self._validate_if_due(checkpoint / PRETRAINED_MODEL)
+
+    def _options(self) -> dict[str, Any]:
+        """The options that a checkpoint names."""
+        config = self.config
+        kept = replace(config, datasets=(), start=None)
+        values = {name: value for name, value in asdict(kept).items() if name not in ("env", "datasets", "start")}
+        start = None if config.start is None else str(config.start)
+        return {**values, "datasets": [str(root) for root in config.datasets], "init": start}
+
+    def _stream(self, number: int, purpose: str) -> int:
+        """A seed for one purpose of an iteration."""
+        base = stream_base("reinforcement", self.config.seed)
+        return int(rng_for(base + number, purpose).integers(2**63))
+
+
+def validations(folder: Path) -> dict[int, EvalResult]:
+    """Return a run's validations by iteration, in order; raises `ManipError` for one that cannot be read."""
+    return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
+
+
+def best_validation(found: dict[int, EvalResult]) -> int:
+    """Return the iteration with the highest validation success, the later of equals."""
+    if not found:
+        raise ManipError("the run has no validation; expected one at its end")
+    return max(found, key=lambda number: (found[number].success.rate, number))
+
+
+def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None) -> int:
+    """Control steps of an episode while learning."""
+    if config.episode_steps or demonstrations is None:
+        return config.episode_steps or config.env.horizon
+    return min(config.env.horizon, math.ceil(LONGER * demonstrations.longest))

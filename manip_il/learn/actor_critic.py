@@ -1,0 +1,108 @@
+"""The `mlp` policy's network as the actor of stable-baselines3's on-policy learners, with a critic of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, override
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import Tensor, nn
+
+from manip_il.learn.losses import MIN_LOG_STD, GaussianHead, floored_log_std
+from manip_il.learn.network import MLPNetwork
+
+EXTRA = 2  # numbers of an observation behind the policy's inputs: flag of the absorbing state, share of time gone
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class ActorCritic(ActorCriticPolicy):
+    """Actor and critic. Observations (B, d + 2): raw inputs, whether the state is absorbing, share of time gone.
+
+    The actor sees the inputs alone, so that it is the policy that is saved; the critic sees all: an episode has a last
+    step, before which less is to come. In the absorbing state actions do nothing, so their density is 1 there and
+    teaches the actor nothing. The same holds for a number of the action that never changed in the demonstrations.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Callable[[float], float],
+        network: MLPNetwork,
+        width: int = 256,
+        **settings: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, lr_schedule, **settings)
+        inputs = network.input_mean.shape[0] + EXTRA
+        self.actor = network
+        self.critic = nn.Sequential(
+            nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
+        )
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5)
+
+    @override
+    def _build(self, lr_schedule: Callable[[float], float]) -> None:
+        """Build nothing: what the base class would make is not used."""
+
+    @override
+    def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions (B, n), values (B, 1) and log-densities (B,)."""
+        mean, log_std = self._gaussian(obs)
+        actions = mean if deterministic else mean + log_std.exp() * torch.randn_like(mean)
+        return actions, self.predict_values(obs), self._log_prob(obs, actions, mean, log_std)
+
+    @override
+    def evaluate_actions(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return values (B, 1), log-densities (B,) and entropies (B,) [nats]."""
+        mean, log_std = self._gaussian(obs)
+        entropy = ((log_std + 0.5 + _HALF_LOG_2PI) * self._free).sum() * _live(obs)
+        return self.predict_values(obs), self._log_prob(obs, actions, mean, log_std), entropy
+
+    @override
+    def predict_values(self, obs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return values, (B, 1)."""
+        x = self.actor.encode(obs[:, :-EXTRA]) * _live(obs).unsqueeze(1)
+        return self.critic(torch.cat([x, obs[:, -EXTRA:]], dim=1))
+
+    @property
+    def log_std(self) -> Tensor:
+        """Log-deviations of the numbers of an action that vary, (m,), in normalised units."""
+        return floored_log_std(_head(self.actor).raw_log_std)[self._free > 0]
+
+    @property
+    def spread(self) -> Tensor:
+        """Deviations of the numbers of an action, (n,), in normalised units; 0 where they never change."""
+        return floored_log_std(_head(self.actor).raw_log_std).exp().detach() * self._free
+
+    @property
+    def _free(self) -> Tensor:
+        return (self.actor.target_scale > 0).float()
+
+    def _gaussian(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        mean = self.actor.layers(self.actor.encode(obs[:, :-EXTRA]))
+        return mean, floored_log_std(_head(self.actor).raw_log_std)
+
+    def _log_prob(self, obs: Tensor, actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
+        each = -0.5 * ((actions - mean) * torch.exp(-log_std)).square() - log_std - _HALF_LOG_2PI
+        return (each * self._free).sum(1) * _live(obs)
+
+
+def set_log_std(network: MLPNetwork, log_std: float) -> None:
+    """Set the log-deviation of every number of an action, in normalised units; at least `MIN_LOG_STD`."""
+    raw = MIN_LOG_STD + math.log(math.expm1(max(log_std - MIN_LOG_STD, 1e-3)))
+    with torch.no_grad():
+        _head(network).raw_log_std.fill_(raw)
+
+
+def _head(network: MLPNetwork) -> GaussianHead:
+    head = network.head
+    assert isinstance(head, GaussianHead)
+    return head
+
+
+def _live(obs: Tensor) -> Tensor:
+    """1 where the state is not absorbing, (B,)."""
+    return 1.0 - obs[:, -EXTRA]

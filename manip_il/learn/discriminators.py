@@ -1,0 +1,182 @@
+"""Discriminators of adversarial imitation: who acted, the expert or the learner? Their answer is the reward.
+
+Both learn D = P(expert | transition) by logistic loss. `GailDiscriminator` is any function of state and action (Ho &
+Ermon, Generative adversarial imitation learning, NeurIPS 2016). `AirlDiscriminator` has the form
+
+    D = exp f / (exp f + pi(a | s)),    f(s, a, s') = g(s, a) + gamma h(s') - h(s)
+
+so that at the optimum g is a reward up to shaping (Fu, Luo & Levine, Learning robust rewards with adversarial inverse
+reinforcement learning, ICLR 2018, equations 4 and 7).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import override
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
+from torch.nn.utils.parametrizations import spectral_norm
+
+from manip_il.errors import UnknownName
+from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig
+from manip_il.learn.network import MLPNetwork
+from manip_il.learn.transitions import F32, Transitions
+
+LARGEST_REWARD = 10.0
+Batch = tuple[Tensor, Tensor, Tensor, Tensor]  # states (B, e), actions (B, n), next states (B, e), log pi (B,)
+
+
+class Discriminator(nn.Module, ABC):
+    """A discriminator, its optimiser and its units. network: the actor, whose statistics scale the inputs."""
+
+    mean: Tensor
+    scale: Tensor
+    clamp: Tensor
+    free: Tensor
+
+    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork) -> None:
+        super().__init__()
+        self.config = config
+        for name, value in (("mean", network.input_mean), ("scale", network.input_scale)):
+            self.register_buffer(name, value.clone())
+        self.register_buffer("clamp", torch.tensor(network.clamp))
+        self.register_buffer("free", (network.target_scale > 0).float())
+        self.build(len(self.mean) + 1, len(self.free))
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr)
+
+    @abstractmethod
+    def build(self, e: int, n: int) -> None:
+        """Make the layers, for encoded states of e numbers and actions of n."""
+
+    @abstractmethod
+    def logits(self, batch: Batch) -> Tensor:
+        """Return log D - log(1 - D), (B,)."""
+
+    @abstractmethod
+    def rewards_of(self, logits: Tensor) -> Tensor:
+        """Return the learner's reward, (B,)."""
+
+    def reward(self, learner: Transitions, log_probs: F32) -> F32:
+        """Return the reward of every transition, (N,), within +-10. log_probs: of its action for the learner, (N,)."""
+        with torch.no_grad():
+            rewards = self.rewards_of(self.logits(self._encode(learner, log_probs)))
+        return rewards.clamp(-LARGEST_REWARD, LARGEST_REWARD).numpy().astype(np.float32)
+
+    def fit(
+        self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32], rng: np.random.Generator
+    ) -> dict[str, float]:
+        """Take an iteration's gradient steps; return the loss, and accuracies before them.
+
+        log_probs: of the expert's and the learner's actions for the learner, (N,) each.
+        """
+        data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs, strict=True)]
+        with torch.no_grad():
+            right = [(self.logits(data[0]) > 0).float().mean().item(), (self.logits(data[1]) < 0).float().mean().item()]
+        losses = [self._step(data, rng) for _ in range(self.config.steps)]
+        return {"loss": float(np.mean(losses)), "accuracy_expert": right[0], "accuracy_learner": right[1]}
+
+    def _step(self, data: Sequence[Batch], rng: np.random.Generator) -> float:
+        expert, learner = (_drawn(one, self.config.batch_size, rng) for one in data)
+        logits = torch.cat([self.logits(expert), self.logits(learner)])
+        labels = torch.cat([torch.ones(len(expert[0])), torch.zeros(len(learner[0]))])
+        loss = binary_cross_entropy_with_logits(logits, labels)
+        total = loss
+        if self.config.regulariser == "gradient_penalty":
+            total = loss + self.config.penalty * self._gradient_penalty(expert, learner, rng)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        self.optimizer.step()
+        return loss.item()
+
+    def _gradient_penalty(self, expert: Batch, learner: Batch, rng: np.random.Generator) -> Tensor:
+        """Mean of (|gradient of the logit| - 1)^2 between the two (Gulrajani et al., Improved training of WGANs)."""
+        share = torch.from_numpy(rng.random((len(expert[0]), 1), dtype=np.float32))
+        mixed = [a * share + b * (1 - share) for a, b in zip(expert[:3], learner[:3], strict=True)]
+        inputs = [one.requires_grad_() for one in mixed]
+        log_prob = expert[3] * share[:, 0] + learner[3] * (1 - share[:, 0])
+        logits = self.logits((inputs[0], inputs[1], inputs[2], log_prob))
+        found = torch.autograd.grad(logits.sum(), inputs, create_graph=True, allow_unused=True)
+        gradients = torch.cat([one for one in found if one is not None], dim=1)
+        return (gradients.norm(dim=1) - 1.0).square().mean()
+
+    def perceptron(self, inputs: int) -> nn.Sequential:
+        """Return two hidden layers and one number, (B, inputs) to (B, 1)."""
+        width, wrap = self.config.width, spectral_norm if self.config.regulariser == "spectral_norm" else _plain
+        return nn.Sequential(
+            wrap(nn.Linear(inputs, width)),
+            nn.ReLU(),
+            wrap(nn.Linear(width, width)),
+            nn.ReLU(),
+            wrap(nn.Linear(width, 1)),
+        )
+
+    def _encode(self, rows: Transitions, log_probs: F32) -> Batch:
+        actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
+        return self._state(rows.states), actions, self._state(rows.next_states), torch.from_numpy(log_probs)
+
+    def _state(self, states: F32) -> Tensor:
+        given = torch.from_numpy(states)
+        x, absorbing = (given[:, :-1] - self.mean) * self.scale, given[:, -1:]
+        return torch.cat([x.clamp(-self.clamp, self.clamp) * (1.0 - absorbing), absorbing], dim=1)
+
+
+class GailDiscriminator(Discriminator):
+    """D(s, a). form: the reward, `logit` is log D - log(1 - D), `log_d` log D, the other -log(1 - D)."""
+
+    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, form: str = "logit") -> None:
+        if form not in REWARDS:
+            raise UnknownName("reward", form, REWARDS)
+        self._form = form
+        super().__init__(config, network)
+
+    @override
+    def build(self, e: int, n: int) -> None:
+        self.d = self.perceptron(e + n)
+
+    @override
+    def logits(self, batch: Batch) -> Tensor:
+        states, actions, _, _ = batch
+        return self.d(torch.cat([states, actions], dim=1)).squeeze(1)
+
+    @override
+    def rewards_of(self, logits: Tensor) -> Tensor:
+        if self._form == "logit":
+            return logits
+        return logsigmoid(logits) if self._form == "log_d" else -logsigmoid(-logits)
+
+
+class AirlDiscriminator(Discriminator):
+    """f(s, a, s') against the learner's log-density, as above; the reward is log D - log(1 - D) = f - log pi."""
+
+    def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float) -> None:
+        self._gamma = gamma
+        super().__init__(config, network)
+
+    @override
+    def build(self, e: int, n: int) -> None:
+        self.g, self.h = self.perceptron(e + n), self.perceptron(e)
+
+    @override
+    def logits(self, batch: Batch) -> Tensor:
+        states, actions, next_states, log_prob = batch
+        g = self.g(torch.cat([states, actions], dim=1))
+        return (g + self._gamma * self.h(next_states) - self.h(states)).squeeze(1) - log_prob
+
+    @override
+    def rewards_of(self, logits: Tensor) -> Tensor:
+        return logits
+
+
+def _plain(layer: nn.Linear) -> nn.Linear:
+    return layer
+
+
+def _drawn(data: Batch, count: int, rng: np.random.Generator) -> Batch:
+    rows: NDArray[np.int64] = rng.integers(len(data[0]), size=count)
+    index = torch.from_numpy(rows)
+    return data[0][index], data[1][index], data[2][index], data[3][index]

@@ -1,0 +1,157 @@
+"""Transitions of episodes of one length: what discriminators see of demonstrations and of the learner.
+
+Learning needs episodes of one length H: where an episode that succeeds ends early, a reward that is positive (or
+negative) everywhere rewards (or punishes) living on, whatever was demonstrated (Kostrikov et al., Discriminator-actor-
+critic, ICLR 2019, section 4.2; Orsini et al., What matters for adversarial imitation learning?, NeurIPS 2021, section
+4). So an episode that has ended goes on in an absorbing state, marked by a flag, until step H. Demonstrations are
+padded in the same way.
+
+An episode ends the demonstrations' `hold` steps after success. To go on acting after it would be no sounder: nobody
+demonstrated how to stay at the goal for long, so that the learner's many states there would look unlike the
+demonstrations' few, and arriving late would pay. In the absorbing state both have the same share of time exactly
+where the learner arrives as fast as it was shown.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.data.lerobot_read import read_table, read_tables
+from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
+from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
+from manip_il.learn.columns import EPISODE_INDEX
+from manip_il.mdp import Actor
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """Steps of episodes, N rows. states, next_states: (N, d + 1), raw inputs and the flag of the absorbing state.
+
+    actions: (N, n), normalised as the policy's head has them, within their range. Raises `MismatchError` where lengths
+    differ, `NotFiniteError` for a number that is none.
+    """
+
+    states: F32
+    actions: F32
+    next_states: F32
+
+    def __post_init__(self) -> None:
+        for name in ("actions", "next_states"):
+            if len(getattr(self, name)) != len(self.states):
+                raise MismatchError("rows", "states", len(self.states), name, len(getattr(self, name)))
+        for name in ("states", "actions", "next_states"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise NotFiniteError(f"{name} of transitions hold a number that is not finite")
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @property
+    def absorbing(self) -> NDArray[np.bool_]:
+        """Whether each row's state is absorbing, (N,)."""
+        return self.states[:, -1] > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstrations:
+    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, and whether it succeeded.
+
+    Targets are in the space of a conversion, raw. hold: steps from success to the end. names: of the datasets.
+    """
+
+    inputs: tuple[F32, ...]
+    targets: tuple[F32, ...]
+    succeeded: tuple[bool, ...]
+    hold: int
+
+    @property
+    def longest(self) -> int:
+        """Frames of the longest episode."""
+        return max(map(len, self.inputs))
+
+    @cached_property
+    def stacked(self) -> tuple[F32, F32]:
+        """All inputs (N, d) and targets (N, n), raw."""
+        return np.concatenate(self.inputs), np.concatenate(self.targets)
+
+    def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
+        """Return all episodes as `steps` transitions each. encode: raw targets (T, n) to normalised ones.
+
+        An episode that did not succeed is not padded: how it would have gone on is not known.
+        Raises `UsageError` where one is longer.
+        """
+        if self.longest > steps:
+            raise UsageError(f"episode_steps is {steps}; expected at least {self.longest}, the longest demonstration")
+        made = [
+            padded_episode(inputs, encode(targets), steps if ended else 0)
+            for inputs, targets, ended in zip(self.inputs, self.targets, self.succeeded, strict=True)
+        ]
+        return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
+
+
+def padded_episode(inputs: F32, actions: F32, steps: int) -> tuple[F32, F32, F32]:
+    """Return states (N, d + 1), actions (N, n) and next states (N, d + 1) of an episode of T steps that ended.
+
+    N: T, or `steps` where it is larger: the rest is absorbing. steps 0: it did not end; N is T - 1.
+    """
+    states = np.pad(inputs, ((0, 0), (0, 1)))
+    if not steps:
+        return states[:-1], actions[:-1], states[1:]
+    rest = np.zeros((max(1, steps - len(states) + 1), states.shape[1]), np.float32)
+    rest[:, -1] = 1.0
+    states = np.concatenate([states, rest])
+    actions = np.pad(actions, ((0, len(states) - 1 - len(actions)), (0, 0)))
+    return states[:-1], actions, states[1:]
+
+
+def read_demonstrations(
+    roots: Sequence[Path], encode: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
+) -> Demonstrations:
+    """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
+
+    Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
+    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
+    raises.
+    """
+    table = read_tables(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
+    sound = np.ones(len(table[ACTION]), dtype=bool)
+    if LABEL_VALID in table:
+        sound &= table[LABEL_VALID].reshape(-1) != 0
+    if ACTOR in table:
+        sound &= table[ACTOR].reshape(-1) == Actor.EXPERT
+    for name in (STATE, ENVIRONMENT_STATE, ACTION):
+        sound_rows = np.isfinite(table[name]).all(axis=1)
+        if not sound_rows.all():
+            raise NotFiniteError(f"column {name}, row {int(np.argmin(sound_rows))} is not finite")
+    index = table[EPISODE_INDEX].reshape(-1)
+    bounds = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
+    pieces = [slice(*pair) for pair in itertools.pairwise(bounds)]
+    solved = table[SUCCESS].reshape(-1) != 0 if SUCCESS in table else np.ones(len(index), dtype=bool)
+    pieces = [piece for piece in pieces if sound[piece].all() and solved[piece].any()]
+    if not pieces:
+        raise NothingToLearnError(
+            f"none of the {len(bounds) - 1} episodes in {', '.join(map(str, roots))} is the expert's from beginning to "
+            "success; record demonstrations with manip-il record"
+        )
+    kept = {key: table[key] for key in (STATE, ENVIRONMENT_STATE, ACTION)}
+    inputs = np.concatenate([kept[STATE], kept[ENVIRONMENT_STATE]], axis=1).astype(np.float32)
+    targets = [encode(kept[ACTION][piece], kept[STATE][piece]).astype(np.float32) for piece in pieces]
+    held = [len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in pieces] if SUCCESS in table else [0]
+    ended = (SUCCESS in table,) * len(pieces)
+    return Demonstrations(tuple(inputs[piece] for piece in pieces), tuple(targets), ended, min(held))
+
+
+def _optional(roots: Sequence[Path]) -> list[str]:
+    """The columns beside those of learning that every dataset has."""
+    known = [set(read_table(root, episodes=[0])) for root in roots]
+    return [name for name in (LABEL_VALID, ACTOR, SUCCESS) if all(name in names for names in known)]

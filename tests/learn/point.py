@@ -1,0 +1,61 @@
+"""A point that is to come to a place: an environment of one number, and what a learner on it is made of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from manip_il.engine.vector_env import ActionRange, Lockstep
+from manip_il.learn.adversarial_config import PPOConfig
+from manip_il.learn.network import MLPNetwork, Shape, Statistics
+from manip_il.learn.ppo import Learner, lent_generators
+
+STEPS, EPISODES = 10, 8
+ACTIONS = ActionRange(*(np.array(values, np.float32) for values in ([0, 0], [0.5, 0], [-1, 0], [1, 0])))
+
+
+class Point:
+    """Observes its place x and the goal 0; an action moves it. It has ended once it is at the goal."""
+
+    def __init__(self, ends: bool = True):
+        self.ends, self.x, self.moves = ends, 0.0, 0
+
+    def start(self, seed: int) -> None:
+        self.x, self.moves = float(np.random.default_rng(seed).uniform(-2, 2)), 0
+
+    def inputs(self) -> np.ndarray:
+        return np.array([self.x, 0.0, 1.0], np.float32)
+
+    def advance(self, target: np.ndarray) -> np.ndarray:
+        self.x, self.moves = self.x + float(target[0]), self.moves + 1
+        return target.astype(np.float64)
+
+    @property
+    def solved(self) -> bool:
+        return abs(self.x) < 0.1
+
+    @property
+    def ended(self) -> bool:
+        return self.ends and self.solved
+
+
+def network() -> MLPNetwork:
+    made = MLPNetwork(3, 2, Shape(32, 2, "silu", "gaussian", 1, 2, 10.0, action_space="joint_target"))
+    statistics = vars(Statistics.identity(3, 2))
+    for name in ("mean", "scale", "low", "high"):
+        statistics[f"target_{name}"].copy_(_tensor(getattr(ACTIONS, name)))
+    made.set_statistics(Statistics(**statistics))
+    return made
+
+
+def learner(seed: int = 0, ends: bool = True, **options: float) -> tuple[Learner, Lockstep]:
+    """A learner on points, drawn from a seed."""
+    with lent_generators(seed):
+        env = Lockstep([Point(ends) for _ in range(EPISODES)], ACTIONS, STEPS)
+        config = PPOConfig(**{"minibatches": 4, **options})
+        return Learner(network(), config, env, STEPS, log_std=-0.5), env
+
+
+def _tensor(values: np.ndarray):
+    import torch
+
+    return torch.from_numpy(values)

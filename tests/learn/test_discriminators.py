@@ -1,0 +1,105 @@
+"""Discriminators: they learn who acted, their rewards prefer the expert, and both regularisers bound them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig
+from manip_il.learn.discriminators import LARGEST_REWARD, AirlDiscriminator, GailDiscriminator
+from manip_il.learn.ppo import lent_generators
+from manip_il.learn.transitions import Transitions
+
+from .point import network
+
+N = 400
+
+
+def rows(action: float, seed: int = 0) -> Transitions:
+    """Steps of somebody whose actions are about `action`."""
+    rng = np.random.default_rng(seed)
+    states = np.pad(rng.normal(size=(N, 3)), ((0, 0), (0, 1))).astype(np.float32)
+    actions = np.stack([rng.normal(action, 0.3, N), np.zeros(N)], axis=1).astype(np.float32)
+    return Transitions(states, actions, states + 0.1 * np.float32([1, 0, 0, 0]))
+
+
+def log_density(steps: Transitions, mean: float) -> np.ndarray:
+    return (-0.5 * ((steps.actions[:, 0] - mean) / 0.3) ** 2 - np.log(0.3 * np.sqrt(2 * np.pi))).astype(np.float32)
+
+
+def make(kind: str, **options):
+    with lent_generators(0):
+        config = DiscriminatorConfig(**{"width": 32, "steps": 200, **options})
+        return GailDiscriminator(config, network()) if kind == "gail" else AirlDiscriminator(config, network(), 0.9)
+
+
+def trained(kind: str, **options):
+    d, expert, learner = make(kind, **options), rows(0.5), rows(-0.5, seed=1)
+    logs = log_density(expert, -0.5), log_density(learner, -0.5)
+    d.fit(expert, learner, logs, np.random.default_rng(0))
+    return d, d.fit(expert, learner, logs, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("kind", ["gail", "airl"])
+def test_it_learns_who_acted(kind):
+    _, found = trained(kind)
+    assert found["accuracy_expert"] > 0.85
+    assert found["accuracy_learner"] > 0.85
+
+
+@pytest.mark.parametrize("form", REWARDS)
+def test_every_form_of_the_reward_prefers_the_expert(form):
+    d, _ = trained("gail")
+    d._form = form
+    zeros = np.zeros(N, np.float32)
+    expert, learner = (d.reward(rows(action, seed=7), zeros).mean() for action in (0.5, -0.5))
+    assert expert > learner
+    assert (expert > 0, learner > 0) == {"logit": (True, False), "log_d": (False, False)}.get(form, (True, True))
+
+
+def test_the_reward_of_airl_is_f_less_the_log_density():
+    d, _ = trained("airl")
+    steps = rows(0.0, seed=3)
+    logs = log_density(steps, 0.0)
+    with torch.no_grad():
+        states, actions, after, _ = d._encode(steps, logs)
+        f = d.g(torch.cat([states, actions], 1)) + 0.9 * d.h(after) - d.h(states)
+    expected = (f.squeeze(1).numpy() - logs).clip(-LARGEST_REWARD, LARGEST_REWARD)
+    np.testing.assert_allclose(d.reward(steps, logs), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_in_the_absorbing_state_nothing_but_the_flag_is_seen():
+    d, _ = trained("gail")
+    states = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
+    states[:, -1] = 1.0
+    found = d.reward(Transitions(states, np.float32([[1, 0], [-1, 0]]), states), np.zeros(2, np.float32))
+    assert found[0] == found[1]
+
+
+def test_the_penalty_holds_the_slope_near_one_and_the_spectral_norm_below_it():
+    slopes = {}
+    for name, options in {
+        "none": {"regulariser": "none"},
+        "penalty": {"regulariser": "gradient_penalty", "penalty": 10.0},
+        "norm": {"regulariser": "spectral_norm"},
+    }.items():
+        d, _ = trained("gail", **options)
+        zeros = np.zeros(N, np.float32)
+        states, actions, after, log_prob = d._encode(rows(0.0), zeros)
+        actions.requires_grad_()
+        [slope] = torch.autograd.grad(d.logits((states, actions, after, log_prob)).sum(), [actions])
+        slopes[name] = slope.norm(dim=1).mean().item()
+    assert slopes["none"] > 1.5
+    assert slopes["penalty"] < 1.2
+    assert slopes["norm"] <= 1.01
+
+
+def test_names_and_numbers_out_of_range_are_refused():
+    with pytest.raises(UnknownName, match="unknown reward 'logits'"):
+        GailDiscriminator(DiscriminatorConfig(), network(), "logits")
+    with pytest.raises(UnknownName, match=r"unknown discriminator\.regulariser"):
+        DiscriminatorConfig(regulariser="weights")
+    with pytest.raises(UsageError, match=r"discriminator\.steps is 0"):
+        DiscriminatorConfig(steps=0)

@@ -1,0 +1,130 @@
+"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on bit-equal."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from manip_il.errors import NotFiniteError, UsageError
+from manip_il.learn.adversarial_config import PPOConfig
+from manip_il.learn.ppo import lent_generators
+from manip_il.learn.transitions import Transitions
+
+from .point import EPISODES, STEPS, learner
+
+
+def weights(one) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in one.policy.state_dict().items()}
+
+
+def iterate(one, env, number: int, actor: bool = True) -> Transitions:
+    with lent_generators(number):
+        env.seeds = range(number * EPISODES, (number + 1) * EPISODES)
+        rows = one.collect()
+        one.improve(-np.abs(rows.next_states[:, 0]), actor=actor)
+    return rows
+
+
+def test_the_density_is_that_of_the_policy_network():
+    one, env = learner()
+    rng = np.random.default_rng(1)
+    states = np.pad(rng.normal(size=(20, 3)).astype(np.float32), ((0, 0), (0, 1)))
+    actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
+    raw = torch.from_numpy(env.actions.raw(actions))
+    with torch.no_grad():
+        log_std = one.policy.actor.head.raw_log_std  # of the number that never changes: it is left out
+        theirs = one.network.log_prob(torch.from_numpy(states[:, :3]), raw)
+        still = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))[:, 1]
+        spread = one.policy.log_std[0]
+        constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
+    assert len(log_std) == 2
+    assert len(one.policy.log_std) == 1
+    ours = one.log_prob(Transitions(states, actions, states))
+    np.testing.assert_allclose(ours, (theirs - constant).numpy(), rtol=1e-4, atol=1e-4)
+
+
+def test_in_the_absorbing_state_every_action_is_as_likely():
+    one, _ = learner()
+    states = np.zeros((2, 4), np.float32)
+    states[:, -1] = 1.0
+    assert one.log_prob(Transitions(states, np.array([[0, 0], [2, 0]], np.float32), states)).tolist() == [0, 0]
+
+
+def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_step():
+    one, env = learner()
+    env.seeds = range(EPISODES)
+    with lent_generators(0):
+        rows = one.collect()
+    flags = rows.absorbing.reshape(STEPS, EPISODES)
+    assert len(rows) == STEPS * EPISODES
+    assert (np.diff(flags.astype(int), axis=0) >= 0).all(), "an absorbing state is never left"
+    assert env.simulated == (~flags).sum()
+    assert not rows.actions[rows.absorbing].any()
+    assert not rows.states[rows.absorbing][:, :-1].any()
+    after = rows.next_states.reshape(STEPS, EPISODES, -1)
+    assert np.array_equal(rows.states.reshape(STEPS, EPISODES, -1)[1:], after[:-1])
+
+
+def test_it_learns_what_the_reward_asks_for():
+    one, env = learner(ends=False, epochs=10)
+    first = np.abs(iterate(one, env, 0).next_states[:, 0]).mean()
+    for number in range(1, 40):
+        rows = iterate(one, env, number)
+    assert np.abs(rows.next_states[:, 0]).mean() < 0.6 * first
+
+
+def test_while_the_actor_rests_only_the_critic_learns():
+    one, env = learner()
+    before = weights(one)
+    iterate(one, env, 0, actor=False)
+    changed = {name.split(".")[0] for name, value in weights(one).items() if not torch.equal(value, before[name])}
+    assert changed == {"critic"}
+    iterate(one, env, 1)
+    assert not torch.equal(one.policy.state_dict()["actor.layers.0.weight"], before["actor.layers.0.weight"])
+
+
+def test_what_was_saved_goes_on_to_the_same_bits(tmp_path):
+    one, env = learner()
+    iterate(one, env, 0)
+    one.save(tmp_path, {})
+    iterate(one, env, 1)
+    other, its_env = learner(seed=5)
+    other.load(tmp_path, {})
+    iterate(other, its_env, 1)
+    assert all(torch.equal(value, other.policy.state_dict()[name]) for name, value in weights(one).items())
+
+
+def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
+    one, env = learner()
+    rows = Transitions(*(np.zeros((4000, width), np.float32) for width in (4, 2, 4)))
+    noisy = one.explored(rows, np.random.default_rng(0)).actions
+    assert noisy[:, 0].std() == pytest.approx(np.exp(-0.5), rel=0.05)
+    assert not noisy[:, 1].any()
+    assert noisy[:, 0].max() <= env.actions.space.high[0]
+
+
+def test_a_reward_that_is_not_finite_is_refused():
+    one, env = learner()
+    one.collect()
+    with pytest.raises(NotFiniteError, match="a reward is nan"):
+        one.improve(np.full(STEPS * EPISODES, np.nan, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("lr", 0), ("gamma", 1.1), ("epochs", 0), ("minibatches", 0), ("target_kl", float("nan")), ("entropy", -1)],
+)
+def test_an_option_out_of_range_is_named(option, value):
+    with pytest.raises(UsageError, match=rf"ppo\.{option} is {value}"):
+        PPOConfig(**{option: value})
+
+
+def test_the_global_generators_are_as_they_were_after_being_lent():
+    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()
+    with lent_generators(3):
+        first = torch.rand(1).item(), np.random.random()
+    with lent_generators(3):
+        assert (torch.rand(1).item(), np.random.random()) == first
+    assert torch.equal(torch.random.get_rng_state(), before[0])
+    assert np.array_equal(np.random.get_state()[1], before[1])

@@ -1,0 +1,103 @@
+"""Demonstrations as episodes of one length: what is padded, what is left out, what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
+from manip_il.learn import transitions
+from manip_il.learn.transitions import Demonstrations, Transitions, read_demonstrations
+from manip_il.mdp import Actor
+
+from .conftest import EPISODES, LENGTH, make_table
+
+
+def two(succeeded=(True, True)) -> Demonstrations:
+    inputs = tuple(np.full((length, 3), length, np.float32) for length in (4, 6))
+    targets = tuple(np.full((length, 2), length, np.float32) for length in (4, 6))
+    return Demonstrations(inputs, targets, succeeded, hold=2)
+
+
+def doubled(values):
+    return values * 2
+
+
+def test_a_demonstration_goes_on_in_the_absorbing_state_until_the_last_step():
+    rows = two().padded(8, doubled)
+    assert len(rows) == 16
+    assert rows.absorbing.tolist() == [False] * 4 + [True] * 4 + [False] * 6 + [True] * 2
+    assert rows.actions[0].tolist() == [8, 8]
+    assert not rows.actions[rows.absorbing].any()
+    assert rows.next_states[3].tolist() == [0, 0, 0, 1]
+
+
+def test_a_demonstration_that_fills_the_episode_still_ends_in_the_absorbing_state():
+    rows = two().padded(6, doubled)
+    assert len(rows) == 12
+    assert rows.next_states[-1].tolist() == [0, 0, 0, 1]
+
+
+def test_one_that_did_not_succeed_is_not_padded():
+    rows = two((False, True)).padded(8, doubled)
+    assert len(rows) == 3 + 8
+    assert rows.next_states[2].tolist() == [4, 4, 4, 0]
+
+
+def test_episodes_shorter_than_a_demonstration_are_refused():
+    with pytest.raises(UsageError, match="episode_steps is 5; expected at least 6"):
+        two().padded(5, doubled)
+
+
+def test_transitions_of_unequal_length_or_with_nan_are_refused():
+    one, other = np.zeros((3, 4), np.float32), np.zeros((2, 4), np.float32)
+    with pytest.raises(MismatchError, match="states has 3, actions has 2"):
+        Transitions(one, other, one)
+    with pytest.raises(NotFiniteError, match="next_states"):
+        Transitions(one, one, one * np.float32(np.nan))
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """Reads a table in place of a dataset."""
+
+    def run(**changes):
+        table = make_table()
+        table["label_valid"] = table["label_valid"].reshape(-1)
+        table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
+        table["next.success"] = table["frame_index"] >= LENGTH - 5
+        table |= {name.replace("__", "."): value for name, value in changes.items()}
+        monkeypatch.setattr(transitions, "read_tables", lambda roots, columns: {name: table[name] for name in columns})
+        monkeypatch.setattr(transitions, "read_table", lambda root, episodes: table)
+        return read_demonstrations(["demos"], lambda actions, states: actions - states)
+
+    return run
+
+
+def test_the_steps_after_success_are_those_of_the_demonstrations(read):
+    found = read()
+    assert (len(found.inputs), found.longest, found.hold) == (EPISODES, LENGTH, 4)
+    assert found.inputs[0].shape == (LENGTH, 10)
+    assert all(found.succeeded)
+
+
+def test_episodes_that_a_learner_drove_or_that_failed_or_have_no_label_are_left_out(read):
+    actor = np.full(EPISODES * LENGTH, Actor.EXPERT)
+    actor[0] = Actor.LEARNER
+    success = np.tile(np.arange(LENGTH) >= LENGTH - 5, EPISODES)
+    success[LENGTH : 2 * LENGTH] = False
+    valid = np.ones(EPISODES * LENGTH, np.int64)
+    valid[2 * LENGTH] = 0
+    assert len(read(actor=actor, next__success=success, label_valid=valid).inputs) == EPISODES - 3
+
+
+def test_no_demonstration_is_one_line(read):
+    with pytest.raises(NothingToLearnError, match="none of the 12 episodes in demos is the expert's"):
+        read(actor=np.full(EPISODES * LENGTH, Actor.LEARNER))
+
+
+def test_a_number_that_is_not_finite_is_named(read):
+    action = make_table()["action"]
+    action[7, 1] = np.nan
+    with pytest.raises(NotFiniteError, match="column action, row 7"):
+        read(action=action)
