@@ -25,6 +25,7 @@ _STREAMS = {
     "held_out": 6,
     "redraw": 7,
     "theory": 8,
+    "preferences": 9,
 }
 _FIRST_ROUND = 10  # rounds take blocks 10, 11, ...
 _BLOCKS_PER_SEED = _FIRST_ROUND + MAX_ROUNDS

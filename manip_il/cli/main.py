@@ -56,6 +56,13 @@ COMMANDS = {
     "certify": Command("manip_il.cli.certify:CertifyOptions", "measure from which states the expert recovers"),
     "theory": Command("manip_il.cli.theory:TheoryOptions", "see what is proved of cloning and DAgger, on an arm, too"),
     "irl": Command("manip_il.cli.irl:IrlOptions", "learn a reward from demonstrations of carry"),
+    "preferences pairs": Command("manip_il.cli.preferences:PairsOptions", "choose pairs of clips to compare"),
+    "preferences ask": Command("manip_il.cli.preferences:AskOptions", "make a page that asks which clip is better"),
+    "preferences answer": Command(
+        "manip_il.cli.preferences:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"
+    ),
+    "preferences fit": Command("manip_il.cli.preferences:PreferencesFitOptions", "learn a reward from answers"),
+    "score": Command("manip_il.cli.score:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(
