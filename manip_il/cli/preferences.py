@@ -24,8 +24,8 @@ _PAIRS = "pairs.json of manip-il preferences pairs"
 class PairsOptions:
     """Choose pairs of clips of one task's datasets, to be compared by people (ask) or simulated teachers (answer).
 
-    A SOURCE is a dataset or a run: each round's dataset of a DAgger run is a source. Every source is in as many pairs as
-    any other. Clips are whole: episodes that are shorter than --clip are left out.
+    A SOURCE is a dataset or a run: each round's dataset of a DAgger run is a source. Every source is in as many pairs
+    as any other. Clips are whole: episodes that are shorter than --clip are left out.
     """
 
     example: ClassVar[str] = "manip-il preferences pairs runs/dagger --count=200 --output=pairs.json"
@@ -97,7 +97,8 @@ class AskOptions:
             films = render_films(clips, str(self.robot) if self.robot else None, bar.advance)
         page = render_page(clips.pairs, clips.frames[0].spec.instruction, films)
         atomic_write(self.output, page)
-        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.output}; open it in a browser and save the answers")
+        say(f"{len(clips.pairs):,} pairs, {len(page) / 1e6:.1f} MB: {self.output}")
+        say("open it in a browser, compare, and save the answers as preferences.json")
         say(f"next: manip-il preferences fit {self.pairs} preferences.json --output_dir=runs/reward")
 
 
@@ -106,8 +107,8 @@ class AnswerOptions:
     """Answer pairs by a simulated teacher, who compares the clips' true progress (B-Pref, Lee et al. 2021).
 
     perfect; boltzmann:TEMPERATURE, who is less sure where returns are near; mistaken:EPSILON, the wrong way round in a
-    share of the pairs; myopic:GAMMA, for whom a clip's end counts most; skipping:DELTA, who skips pairs in which neither
-    clip has DELTA of the mean return. A clip's return is the sum of progress over its steps.
+    share of the pairs; myopic:GAMMA, for whom a clip's end counts most; skipping:DELTA, who skips pairs in which
+    neither clip has DELTA of the mean return. A clip's return is the sum of progress over its steps.
     """
 
     example: ClassVar[str] = "manip-il preferences answer pairs.json --teacher=mistaken:0.1 --output=preferences.json"
@@ -184,8 +185,8 @@ class PreferencesFitOptions:
         given = [Preferences.read(path, pairs) for path in self.answers]
         begin, answers, clips = time.monotonic(), join_answers(given), read_clips(pairs)
         with progress(None, f"fit {len(answers.better):,} answers") as bar:
-            shape, seed = RewardShape(self.members, ways=ways_of(clips.frames[0].spec)), stream_base("training", self.seed)
-            found = fit_answers(clips, answers, shape, seed, bar.advance)
+            shape = RewardShape(self.members, ways=ways_of(clips.frames[0].spec))
+            found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
         timings = {"fit": time.monotonic() - begin}
         who = [one.who or "somebody" for one in given]
         with open_output(self) as folder:

@@ -69,15 +69,16 @@ class ScoreOptions:
         for line in fact_lines(scores):
             say(line)
         say(f"report: {page}")
-        say(f"next: manip-il train --dataset.root={self.dataset} --weights={folder / WEIGHTS_FILE} --output_dir=runs/weighted")
+        weights = f"--weights={folder / WEIGHTS_FILE}"
+        say(f"next: manip-il train --dataset.root={self.dataset} {weights} --output_dir=runs/weighted")
 
     def _scores(self, data: Frames) -> NDArray[np.float64]:
         """Score of every frame, (N,)."""
         import numpy as np
 
         from manip_il.errors import ManipError
-        from manip_il.learn.reward import PREFERENCE
         from manip_il.learn.pretrained import read_config
+        from manip_il.learn.reward import PREFERENCE
 
         if self.reward == PROGRESS:
             if data.progress is None:

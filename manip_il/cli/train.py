@@ -141,7 +141,7 @@ class TrainOptions:
         if self.weights is None:
             return
         if not self.weights.is_file():
-            raise UsageError(f"--weights is {self.weights}, which is no file; expected a parquet file of manip-il score")
+            raise UsageError(f"--weights is {self.weights}, which is no file; expected rabc.parquet of manip-il score")
         if len(self.dataset.root) > 1 or self.redraw:
             raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
 

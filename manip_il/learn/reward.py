@@ -53,7 +53,7 @@ class LearnedReward:
         """
         config = read_config(path)
         if config["type"] != PREFERENCE:
-            raise ManipError(f"{path} holds a {checks.shorten(config['type'])}; expected a reward of type {PREFERENCE!r}")
+            raise ManipError(f"{path} is of type {checks.shorten(config['type'])}; expected a reward, {PREFERENCE!r}")
         meta = read_meta(path)
         if meta is None:
             raise ManipError(f"{path} does not say for which robot and task it is: manip_il.json is missing")
@@ -85,7 +85,7 @@ class LearnedReward:
         rewards = np.concatenate(parts) if parts else np.empty(0, np.float32)
         if not np.isfinite(rewards).all():
             row = int(np.argmin(np.isfinite(rewards)))
-            raise NotFiniteError(f"the reward of row {row} is {rewards[row]}: its numbers, or the weights, are not finite")
+            raise NotFiniteError(f"the reward of row {row} is {rewards[row]}: its inputs or the weights are not finite")
         return rewards
 
     @torch.inference_mode()

@@ -61,5 +61,5 @@ def rabc_weights(progress: F64, episodes: I64, ahead: int) -> F64:
     weights = np.where(delta > KAPPA, 1.0, np.where(delta >= 0, soft, 0.0))
     weights[np.isnan(delta)] = FALLBACK
     if not weights.any():
-        raise ManipError(f"all {len(weights)} frames weigh 0, as progress falls from each of them: nothing to learn from")
+        raise ManipError(f"all {len(weights)} frames weigh 0: progress falls from each of them; nothing to learn from")
     return weights

@@ -85,7 +85,7 @@ class Preferences:
             if one.pair >= len(pairs):
                 raise ManipError(f"{path} has an answer about pair {one.pair}; there are pairs 0 to {len(pairs) - 1}")
         if found.pairs != pairs.sha256:
-            raise MismatchError("hash of the pairs", str(path), found.pairs[:12], "the file of pairs", pairs.sha256[:12])
+            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", pairs.sha256[:12])
         return found
 
 

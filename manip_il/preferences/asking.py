@@ -30,7 +30,10 @@ _CAMERA = "front"
 _LARGEST_PAGE = 200_000_000  # [bytes]; phones refuse more
 
 
-def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], None] = lambda: None) -> list[list[bytes]]:
+Films = list[list[bytes]]  # of every pair, left and right: MP4
+
+
+def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], None] = lambda: None) -> Films:
     """Return an MP4 of the left and the right clip of every pair.
 
     robot: the YAML of the sources' robot, where that does not ship. Raises `RenderError` without off-screen OpenGL and
@@ -40,7 +43,7 @@ def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], N
     opened = [open_source(Path(source.root), robot) for source in pairs.sources]
     states = [read_table(source.root, [schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
     every = -(-pairs.control_hz // MOST_FPS)
-    found: list[list[bytes]] = []
+    found: Films = []
     size = 0
     for number, pair in enumerate(pairs.pairs):
         films: list[bytes] = []
@@ -55,8 +58,8 @@ def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], N
     return found
 
 
-def render_page(pairs: Pairs, instruction: str, films: list[list[bytes]]) -> str:
-    """Return the page as one string of HTML. films: of every pair, left and right, MP4."""
+def render_page(pairs: Pairs, instruction: str, films: Films) -> str:
+    """Return the page as one string of HTML."""
     script = (files("manip_il.preferences") / "templates" / "ask.js").read_text(encoding="utf-8")
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -64,7 +67,8 @@ def render_page(pairs: Pairs, instruction: str, films: list[list[bytes]]) -> str
         "pairs": pairs.sha256,
         "films": [[base64.b64encode(film).decode("ascii") for film in pair] for pair in films],
     }
-    return _environment().get_template("ask.html.j2").render(
+    template = _environment().get_template("ask.html.j2")
+    return template.render(
         title=f"{pairs.robot} {pairs.task}",
         instruction=instruction,
         count=len(pairs),

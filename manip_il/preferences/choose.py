@@ -45,11 +45,13 @@ class Supply:
 
 
 def open_supply(roots: Sequence[Path], length: int) -> Supply:
-    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` where no episode is long enough."""
+    """Read datasets. Raises `MismatchError` unless they are of one task, `ManipError` where all episodes are short."""
     return Supply(tuple(roots), tuple(read_all(roots)), length)
 
 
-def choose_pairs(supply: Supply, count: int, seed: int, rng: np.random.Generator, members: Members | None = None) -> Pairs:
+def choose_pairs(
+    supply: Supply, count: int, seed: int, rng: np.random.Generator, members: Members | None = None
+) -> Pairs:
     """Return pairs; with `members`, those of `POOL` times as many about which the ensemble disagrees most.
 
     The disagreement about a pair is the standard deviation over the ensemble of P(left is better) (Christiano et al.
@@ -58,7 +60,7 @@ def choose_pairs(supply: Supply, count: int, seed: int, rng: np.random.Generator
     wanted = count * (POOL if members is not None else 1)
     drawn = _draw(supply, wanted, rng)
     if len(drawn) < count:
-        raise ManipError(f"--count is {count}; the sources have but {len(drawn)} pairs of clips of {supply.length} steps")
+        raise ManipError(f"--count is {count}; {len(drawn)} pairs of clips of {supply.length} steps were found")
     spec = supply.frames[0].spec
     made = Pairs(
         robot=spec.robot,

@@ -14,7 +14,8 @@ from manip_il.preferences.fitting import TIE, Bin, Fitted
 from manip_il.preferences.pairs import Clips
 
 _MODEL = (
-    f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g},   R(clip) = Σ r(state, action)",
+    f"P(left is better) = {1 - BY_CHANCE:g} sigmoid(R(left) - R(right)) + {BY_CHANCE / 2:g}",
+    "R(clip) = Σ r(state, action)",
 )
 
 
@@ -22,10 +23,13 @@ def agreement_table(found: Fitted) -> Table:
     """Return with what the reward agrees on held-out pairs, and how far the answers do themselves."""
     rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
     if found.true is not None:
-        rows.append(("true progress", found.true, f"{found.ties} pairs whose progress differs by less than {TIE:g} left out"))
+        rows.append(
+            ("true progress", found.true, f"without {found.ties} pairs that differ by less than {TIE:g}")
+        )
     if found.teachers is not None:
         rows.append(("the answers themselves with true progress", found.teachers, ""))
-    return Table(("with", "agreement", "of", "note"), tuple((a, str(p), f"{p.n:,}", note) for a, p, note in rows)).filled()
+    cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
+    return Table(("with", "agreement", "of", "note"), cells).filled()
 
 
 def calibration_table(bins: Sequence[Bin]) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,10 @@ EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of what is foretold about the clip tha
 
 @dataclass(frozen=True)
 class Bin:
-    """Answers whose likelier clip was foretold with a probability from low to high. foretold: mean; given: the share."""
+    """Answers whose likelier clip was foretold with a probability from low to high.
+
+    foretold: its mean; given: the share of answers that preferred that clip.
+    """
 
     low: float
     high: float
@@ -34,9 +38,9 @@ class Bin:
 class Fitted:
     """A fit, and its agreement on pairs that were held out, each by one network of the ensemble.
 
-    answered: with the answers left and right; true: with the clips' true progress, None where there is none; ties: pairs
-    left out of that, as their progress differs by less than `TIE`. teachers: answers' own agreement with true progress.
-    brier: mean square of answer minus probability.
+    answered: with the answers left and right; true: with the clips' true progress, None where there is none; ties:
+    pairs left out of that, as their progress differs by less than `TIE`. teachers: answers' own agreement with true
+    progress. brier: mean square of answer minus probability.
     """
 
     fit: Fit
@@ -67,7 +71,8 @@ def fit_answers(
 ) -> Fitted:
     """Fit a reward and measure it on held-out pairs. Raises what `fit_reward` raises."""
     rows = clips.rows[answers.pair]
-    fit = fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], answers.better, answers.pair), shape, seed, on_epoch)
+    compared = Compared(rows[:, 0], rows[:, 1], answers.better, answers.pair)
+    fit = fit_reward(clips.inputs, compared, shape, seed, on_epoch)
     decided = answers.better != 0.5
     right = (fit.logits > 0) == (answers.better > 0.5)
     probability = probabilities(fit.logits)
@@ -112,7 +117,7 @@ def calibration(probability: F64, better: F64, edges: Sequence[float] = EDGES) -
     given = np.where(probability >= 0.5, better, 1 - better)
     place = np.clip(np.searchsorted(edges, likelier, side="right") - 1, 0, len(edges) - 2)
     found: list[Bin] = []
-    for number, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for number, (low, high) in enumerate(itertools.pairwise(edges)):
         inside = place == number
         if inside.any():
             found.append(Bin(low, high, float(likelier[inside].mean()), _proportion(given[inside] > 0.5)))

@@ -1,6 +1,7 @@
 """Simulated teachers, who compare clips by true progress (B-Pref, Lee et al. 2021, section 3).
 
-    P(left is better) = sigmoid(beta (G(left) - G(right))),    G(clip) = sum over its L steps of gamma^(L - t) progress_t
+    P(left is better) = sigmoid(beta (G(left) - G(right)))
+    G(clip) = sum over its steps t = 1 ... L of gamma^(L - t) progress_t
 
 A clip's return is the sum of progress over its steps, as B-Pref's is of the task's reward: progress is what is true of
 a state, so a clip that is farther on is the better one, and one that gets on faster is, too.

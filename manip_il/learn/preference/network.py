@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import override
@@ -67,7 +68,7 @@ class RewardNetwork(nn.Module):
         self.register_buffer("ways", ways, persistent=False)
         inputs += len(shape.ways)
         sizes = [inputs, *[shape.width] * shape.depth, 1]
-        layers = list(zip(sizes[:-1], sizes[1:], strict=True))
+        layers = list(itertools.pairwise(sizes))
         self.weights = nn.ParameterList(torch.zeros(shape.members, fan_in, out) for fan_in, out in layers)
         self.biases = nn.ParameterList(torch.zeros(shape.members, 1, out) for _, out in layers)
         self.register_buffer("mean", torch.zeros(inputs))
@@ -76,7 +77,7 @@ class RewardNetwork(nn.Module):
         self.register_buffer("high", torch.ones(()))
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw the weights: normal, of variance 2 / fan-in (He et al. 2015), the last layer's a hundredth of that wide."""
+        """Draw the weights: normal, of variance 2 / fan-in (He et al. 2015), the last layer's a hundredth as wide."""
         with torch.no_grad():
             for number, weight in enumerate(self.weights):
                 last = number == len(self.weights) - 1
