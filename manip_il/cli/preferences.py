@@ -156,7 +156,7 @@ class PreferencesFitOptions:
     example: ClassVar[str] = "manip-il preferences fit pairs.json preferences.json --output_dir=runs/reward"
     pairs: Path = option(MISSING, _PAIRS, positional=True)
     answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True)
-    members: int = option(5, "networks of the ensemble, and folds of the pairs; at least 3")
+    members: int = option(8, "networks of the ensemble, and folds of the pairs; at least 3")
     seed: int = option(0, "seed of weights, folds and batches, 0 to 1000")
     output_dir: Path = option(Path("runs/reward"), "folder of pretrained_model and report.html")
     overwrite: bool = option(False, "replace an existing one")

@@ -23,9 +23,7 @@ def agreement_table(found: Fitted) -> Table:
     """Return with what the reward agrees on held-out pairs, and how far the answers do themselves."""
     rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
     if found.true is not None:
-        rows.append(
-            ("true progress", found.true, f"without {found.ties} pairs that differ by less than {TIE:g}")
-        )
+        rows.append(("true progress", found.true, f"without {found.ties} pairs that differ by less than {TIE:g}"))
     if found.teachers is not None:
         rows.append(("the answers themselves with true progress", found.teachers, ""))
     cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)

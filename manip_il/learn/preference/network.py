@@ -27,7 +27,7 @@ class RewardShape:
     far things are apart is most of what progress is, and a few hundred answers are few to learn a square root from.
     """
 
-    members: int = 5
+    members: int = 8
     width: int = 32
     depth: int = 2
     ways: tuple[tuple[int, int, int], ...] = ()
