@@ -29,8 +29,8 @@ def score_by_lerobot(
     """
     if not trust:
         raise ManipError(
-            f"{folder} is a reward model of LeRobot's, which loads models by name and may run code that comes with them; "
-            "if you trust its source, add --trust=true"
+            f"{folder} is a reward model of LeRobot's, which loads models by name and may run code that comes with "
+            "them; if you trust its source, add --trust=true"
         )
     meta = read_metadata(root)
     config, model, preprocessor = _load(folder, meta)

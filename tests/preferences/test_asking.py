@@ -12,13 +12,15 @@ from playwright.sync_api import Browser
 
 from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import Preferences
-from manip_il.preferences.asking import render_page
+from manip_il.preferences.asking import render_films, render_page
 from manip_il.preferences.pairs import Pairs
 
 from ..evaluation.browser import Opened, chromium, opened
+from .made import clips_of
 
 pytestmark = pytest.mark.slow
 COUNT = 4
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
 
 
 @pytest.fixture(scope="module")
@@ -133,3 +135,13 @@ def test_a_name_is_asked_for_before_the_answers_are_saved(browser, page):
     with opened(browser, page, 1280) as window:
         window.page.click("form button")
         assert window.evaluate("document.activeElement.id") == "who"
+
+
+@pytest.mark.gl
+def test_films_are_the_recorded_states_of_the_clips():
+    clips = clips_of([SAMPLE], 2, 4)
+    calls: list[None] = []
+    films = render_films(clips, on_pair=lambda: calls.append(None))
+    assert len(calls) == len(films) == 2
+    assert all(film[4:8] == b"ftyp" for pair in films for film in pair)
+    assert films[0][0] != films[0][1]

@@ -43,7 +43,7 @@ def folder(fitted, clips, tmp_path_factory):
 def test_a_reward_learns_what_its_answers_are_about(fitted, clips):
     with torch.no_grad():
         reward = fitted.fit.network(torch.from_numpy(clips.inputs)).numpy()
-    assert np.corrcoef(reward, clips.progress)[0, 1] > 0.85
+    assert np.corrcoef(reward, clips.progress)[0, 1] > 0.75
     assert fitted.true.rate > 0.85
     assert fitted.teachers.rate == 1
     assert np.quantile(reward, [0.01, 0.99]) == pytest.approx([0, 1], abs=0.02)
@@ -136,7 +136,7 @@ def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
     ("change", "says"),
     [
         ({"members": 10_000}, "members is 10000"),
-        ({"width": 1024, "depth": 8}, "much larger network than its weights"),
+        ({"members": 64, "width": 1024, "depth": 8}, "much larger network than its weights"),
         ({"ways": [[0, 1, 99]]}, "a way has column 99; there are"),
         ({"ways": [[0, 1]]}, "expected columns of x, y and z"),
         ({"width": 8}, "size mismatch"),
