@@ -87,11 +87,11 @@ def disagreement(clips: Clips, members: Members) -> F64:
 
 
 def _draw(supply: Supply, count: int, rng: np.random.Generator) -> list[tuple[Clip, Clip]]:
-    """Different pairs of clips, the sources of each in turn, so that every source is in as many as any other."""
+    """Different pairs of clips; every source is in as many as any other, with another or itself."""
     long, found = supply.long, dict[tuple[Clip, Clip], None]()
     sources = [number for number, places in enumerate(long) if len(places)]
-    order = [int(one) for _ in range(-(-2 * count // len(sources))) for one in rng.permutation(sources)]
-    for left, right in zip(order[: 2 * count : 2], order[1 : 2 * count : 2], strict=True):
+    order = rng.permutation(np.resize(sources, 2 * count)).reshape(count, 2).tolist()
+    for left, right in order:
         for _ in range(_TRIES):
             pair = _clip(supply, long, left, rng), _clip(supply, long, right, rng)
             if pair[0] != pair[1] and pair not in found and pair[::-1] not in found:
