@@ -60,6 +60,13 @@ COMMANDS = {
         "manip_il.cli.adversarial:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"
     ),
     "airl": Command("manip_il.cli.adversarial:AirlOptions", "imitate by AIRL, which learns a reward, too"),
+    "preferences pairs": Command("manip_il.cli.preferences:PairsOptions", "choose pairs of clips to compare"),
+    "preferences ask": Command("manip_il.cli.preferences:AskOptions", "make a page that asks which clip is better"),
+    "preferences answer": Command(
+        "manip_il.cli.preferences:AnswerOptions", "answer pairs by a simulated teacher, who knows true progress"
+    ),
+    "preferences fit": Command("manip_il.cli.preferences:PreferencesFitOptions", "learn a reward from answers"),
+    "score": Command("manip_il.cli.score:ScoreOptions", "score a dataset's episodes by a reward, to find bad ones"),
     "doctor": Command("manip_il.cli.doctor:DoctorOptions", "check a dataset, and repair it from its journals"),
     "health": Command("manip_il.cli.health:HealthOptions", "check that this machine can evaluate and render"),
     "push": Command(

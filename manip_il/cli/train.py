@@ -21,6 +21,9 @@ from manip_il.learn.fit_config import FitConfig, check_weights
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:  # the learner takes a second to import
+    import numpy as np
+    from numpy.typing import NDArray
+
     from manip_il.data.schema import RobotTaskSpec
     from manip_il.learn.lerobot_config import LeRobotFit
     from manip_il.learn.sources import Sources
@@ -58,6 +61,9 @@ class TrainOptions:
     redraw: int = option(
         0, "learn from so many scenes that are drawn anew from the dataset's states (manip-il redraw), for pictures"
     )
+    weights: Path | None = option(
+        None, "draw frames by the progress in this file of manip-il score, as LeRobot's RA-BC weighs them"
+    )
     policy: Open = option_of(FitConfig, "policy")
     action_space: Literal["joint_target", "joint_delta", "ee_delta"] | None = option_of(FitConfig, "action_space")
     observation: Literal["state", "images", "both"] | None = option_of(FitConfig, "observation")
@@ -88,6 +94,7 @@ class TrainOptions:
         for root in self.dataset.root:
             require_dataset(root)
         self._check_redraw()
+        self._check_weights()
         if _is_first_process():
             require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
 
@@ -104,8 +111,9 @@ class TrainOptions:
             spec, fingerprint, sources = self._read_sources(lerobot, (root,) if root else tuple(self.dataset.root))
             if root is None:
                 self._prepare(held)
+            weights = self._frame_weights(lerobot, sources.roots[0])
             fit = self._fit_mlp if config.is_mlp else self._fit_policy
-            path = fit(config, spec, fingerprint, sources)
+            path = fit(config, spec, fingerprint, sources, weights)
         if _is_first_process():
             say(f"checkpoint: {path}")
             robot = common.own_robot(spec.robot, suffix=".yaml")
@@ -128,6 +136,27 @@ class TrainOptions:
             raise UsageError("--redraw is for policies on pictures; use --policy.type=cnn, or --observation=images")
         if self.redraw and RANK in os.environ:
             raise UsageError("--redraw is not for processes that were started together; redraw by manip-il redraw")
+
+    def _check_weights(self) -> None:
+        if self.weights is None:
+            return
+        if not self.weights.is_file():
+            raise UsageError(f"--weights is {self.weights}, which is no file; expected rabc.parquet of manip-il score")
+        if len(self.dataset.root) > 1 or self.redraw:
+            raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
+
+    def _frame_weights(self, lerobot: LeRobotFit, root: Path) -> NDArray[np.float64] | None:
+        """How often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
+        if self.weights is None:
+            return None
+        from manip_il.data.lerobot_read import dataset_info, read_table
+        from manip_il.learn.weights import rabc_weights, read_progress
+
+        episodes = read_table(root, ["episode_index"])["episode_index"].astype("int64")
+        ahead = getattr(lerobot.policy, "chunk_size", None) or dataset_info(root).fps
+        weights = rabc_weights(read_progress(self.weights, episodes), episodes, ahead)
+        say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
+        return weights
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:
         """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
@@ -173,7 +202,14 @@ class TrainOptions:
         steps = config.steps_per_checkpoint
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
-    def _fit_mlp(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any], sources: Sources) -> Path:
+    def _fit_mlp(
+        self,
+        config: FitConfig,
+        spec: Any,
+        fingerprint: Mapping[str, Any],
+        sources: Sources,
+        weights: NDArray[np.float64] | None,
+    ) -> Path:
         from manip_il.data.lerobot_read import read_tables
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
@@ -189,11 +225,19 @@ class TrainOptions:
                 fingerprint=fingerprint,
                 on_log=stages.log,
                 resume=self.resume,
+                weights=weights,
                 sources=sources,
                 repo_id=f"local/{'_'.join(root.name for root in sources.roots)}",
             )
 
-    def _fit_policy(self, config: FitConfig, spec: Any, fingerprint: Mapping[str, Any], sources: Sources) -> Path:
+    def _fit_policy(
+        self,
+        config: FitConfig,
+        spec: Any,
+        fingerprint: Mapping[str, Any],
+        sources: Sources,
+        weights: NDArray[np.float64] | None,
+    ) -> Path:
         from manip_il.learn.fit_policy import begin_fit
 
         with contextlib.ExitStack() as stack:
@@ -207,6 +251,7 @@ class TrainOptions:
                         fingerprint=fingerprint,
                         look=_look(sources.roots),
                         resume=self.resume,
+                        weights=weights,
                         sources=sources,
                         on_frames=on_frames,
                     )

@@ -203,6 +203,11 @@ def camera_keys(root: Path) -> list[str]:
     return [key for key, value in _read_info(root)["features"].items() if value["dtype"] in PICTURES]
 
 
+def column_names(root: Path) -> list[str]:
+    """Return names of all columns, pictures among them."""
+    return list(_read_info(root)["features"])
+
+
 def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:
     try:
         return s.RobotTaskSpec.from_json(ours["spec"])

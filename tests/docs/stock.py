@@ -25,6 +25,9 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "policy": "train --dataset.root=datasets/demos --output_dir=policy",
     "runs/dagger": "dagger --output_dir=runs/dagger",
     "runs/cloning": "dagger --method=cloning --output_dir=runs/cloning",
+    "pairs.json": "preferences pairs runs/dagger --output=pairs.json",
+    "preferences.json": "preferences answer pairs.json --output=preferences.json",
+    "runs/reward": "preferences fit pairs.json preferences.json --output_dir=runs/reward",
     "runs/eval": f"{_EXPERT} --output_dir=runs/eval",
     "out/0": f"{_EXPERT} --eval.first=0 --output_dir=out/0",
     "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
@@ -54,7 +57,7 @@ class Stock:
                 continue
             made = self._made(name)
             if made != target / name:
-                shutil.copytree(made, target / name)
+                (shutil.copytree if made.is_dir() else shutil.copy)(made, target / name)
 
     def _made(self, name: str) -> Path:
         if name == SAMPLE:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from . import datasets, files, policies, remotes
+from . import datasets, files, policies, preferences, remotes
 from .target import Target
 
-TARGETS: tuple[Target, ...] = (*datasets.TARGETS, *policies.TARGETS, *files.TARGETS, *remotes.TARGETS)
+TARGETS: tuple[Target, ...] = (
+    *datasets.TARGETS,
+    *policies.TARGETS,
+    *files.TARGETS,
+    *preferences.TARGETS,
+    *remotes.TARGETS,
+)

@@ -1,0 +1,104 @@
+"""An ensemble of reward networks of equal shape, evaluated together."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import override
+
+import torch
+from torch import Tensor, nn
+
+from manip_il import checks
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError
+
+LEAST_MEMBERS, MOST_MEMBERS = 3, 64  # each learns from some folds of pairs, stops by one and leaves one out
+MOST_UNITS, MOST_LAYERS = 1_024, 8
+MOST_INPUTS, MOST_WAYS = 100_000, 1_000
+
+
+@dataclass(frozen=True)
+class RewardShape:
+    """Sizes of the networks. members: of the ensemble; width: units a layer; depth: hidden layers.
+
+    ways: columns x, y and z of inputs that are the way from one thing to another [m]; its length is an input, too. How
+    far things are apart is most of what progress is, and a few hundred answers are few to learn a square root from.
+    """
+
+    members: int = 8
+    width: int = 32
+    depth: int = 2
+    ways: tuple[tuple[int, int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        checks.whole("members", self.members, LEAST_MEMBERS, MOST_MEMBERS)
+        checks.whole("width", self.width, 1, MOST_UNITS)
+        checks.whole("depth", self.depth, 1, MOST_LAYERS)
+        for way in checks.array("ways", self.ways, MOST_WAYS):
+            if len(checks.array("a way", way, 3)) != 3:
+                raise ManipError(f"a way is {checks.shorten(way)}; expected columns of x, y and z")
+            for column in way:
+                checks.whole("column of a way", column, 0, MOST_INPUTS - 1)
+
+
+def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, int, int], ...]:
+    """Return the columns of every way in a dataset's environment state, such as `goal_from_object`, after its state."""
+    place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
+    names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
+    axes = [tuple(f"{name}.{axis}" for axis in "xyz") for name in names]
+    return tuple((place[x], place[y], place[z]) for x, y, z in axes if {x, y, z} <= place.keys())
+
+
+class RewardNetwork(nn.Module):
+    """M perceptrons from (state, environment state, action) to a reward.
+
+    Inputs are standardised and clamped to `CLAMP` standard deviations, so that a state far off the data has the reward
+    of the border. `low`, `high`: rewards of the mean network that `forward` puts at 0 and 1.
+    """
+
+    CLAMP = 5.0
+
+    def __init__(self, inputs: int, shape: RewardShape) -> None:
+        super().__init__()
+        if any(column >= inputs for way in shape.ways for column in way):
+            raise ManipError(f"a way has column {max(map(max, shape.ways))}; there are {inputs} inputs")
+        ways = torch.tensor(shape.ways, dtype=torch.int64).reshape(-1, 3)
+        self.register_buffer("ways", ways, persistent=False)
+        inputs += len(shape.ways)
+        sizes = [inputs, *[shape.width] * shape.depth, 1]
+        layers = list(itertools.pairwise(sizes))
+        self.weights = nn.ParameterList(torch.zeros(shape.members, fan_in, out) for fan_in, out in layers)
+        self.biases = nn.ParameterList(torch.zeros(shape.members, 1, out) for _, out in layers)
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("std", torch.ones(inputs))
+        self.register_buffer("low", torch.zeros(()))
+        self.register_buffer("high", torch.ones(()))
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw the weights: normal, of variance 2 / fan-in (He et al. 2015), the last layer's a hundredth as wide."""
+        with torch.no_grad():
+            for number, weight in enumerate(self.weights):
+                last = number == len(self.weights) - 1
+                spread = math.sqrt(2 / weight.shape[1]) * (0.01 if last else 1.0)
+                weight.copy_(spread * torch.randn(weight.shape, generator=generator))
+
+    def features(self, inputs: Tensor) -> Tensor:
+        """Return inputs (B, d) with the lengths of their ways, (B, d + K)."""
+        return torch.cat([inputs, inputs[:, self.ways].norm(dim=-1)], dim=-1)
+
+    def members(self, inputs: Tensor) -> Tensor:
+        """Return each network's reward, (M, B), of inputs (B, d), in the units in which preferences are log-odds."""
+        x = ((self.features(inputs) - self.mean) / self.std).clamp(-self.CLAMP, self.CLAMP)
+        hidden = x.expand(len(self.weights[0]), *x.shape)
+        for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            hidden = torch.baddbmm(bias, hidden, weight)
+            if number < len(self.weights) - 1:
+                hidden = nn.functional.silu(hidden)
+        return hidden.squeeze(-1)
+
+    @override
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return the mean network's reward, (B,), of inputs (B, d): 0 at `low`, 1 at `high`."""
+        return (self.members(inputs).mean(0) - self.low) / (self.high - self.low)

@@ -1,0 +1,117 @@
+"""A reward of states and actions, and the one that was learnt from preferences, read without LeRobot."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+
+from manip_il import checks
+from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError, NotFiniteError
+from manip_il.learn.checkpoint import CheckpointMeta, check_fits, read_meta
+from manip_il.learn.limits import Budget, threads
+from manip_il.learn.preference.network import MOST_WAYS, RewardNetwork, RewardShape
+from manip_il.learn.pretrained import CONFIG, WEIGHTS, read_config
+
+F32 = NDArray[np.float32]
+PREFERENCE = "preference"  # its type, in LeRobot's config.json
+INPUTS = (STATE, ENVIRONMENT_STATE, ACTION)
+_PREFIX = "model."  # of the network's tensors
+_ROWS = 16_384  # evaluated at once
+
+
+class Reward(Protocol):
+    """A reward of what was seen and done."""
+
+    def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
+        """Return the reward of every row, (B,): states (B, n), environment states (B, k), absolute actions (B, n)."""
+        ...
+
+
+class LearnedReward:
+    """A reward that was learnt from preferences. meta: robot, task and columns that it is for.
+
+    About 0 at the poorest and 1 at the best of the states it was learnt on.
+    """
+
+    def __init__(self, network: RewardNetwork, meta: CheckpointMeta) -> None:
+        self.network, self.meta = network.eval(), meta
+        self._widths = len(meta.joint_names), len(meta.environment_state_names), len(meta.joint_names)
+
+    @classmethod
+    def load(cls, path: Path) -> LearnedReward:
+        """Load a folder of `manip-il preferences fit`, from JSON and safetensors alone.
+
+        Raises `ManipError` for a folder that is not whole or is no such reward.
+        """
+        config = read_config(path)
+        if config["type"] != PREFERENCE:
+            raise ManipError(f"{path} is of type {checks.shorten(config['type'])}; expected a reward, {PREFERENCE!r}")
+        meta = read_meta(path)
+        if meta is None:
+            raise ManipError(f"{path} does not say for which robot and task it is: manip_il.json is missing")
+        width = sum(_width(path, config, key) for key in INPUTS)
+        reward = cls(_read_network(path, config, width), meta)
+        if width != sum(reward._widths):
+            raise MismatchError("width of the inputs", str(path / CONFIG), width, "manip_il.json", sum(reward._widths))
+        return reward
+
+    def check_fits(self, name: str, spec: RobotTaskSpec) -> None:
+        """Raise `MismatchError` unless a dataset's columns, and its task, are those of this reward. name: of it."""
+        if self.meta.task != spec.task:
+            raise MismatchError("task", "the reward", self.meta.task, name, spec.task)
+        check_fits(self.meta, spec)
+
+    def __call__(self, states: F32, environment_states: F32, actions: F32) -> F32:
+        """Return the reward of every row, (B,); see `Reward`. Raises `MismatchError` for other widths."""
+        given = (states, environment_states, actions)
+        for key, one, width in zip(INPUTS, given, self._widths, strict=True):
+            if one.ndim != 2 or one.shape != (len(states), width):
+                raise MismatchError(f"shape of {key}", "the reward", f"({len(states)}, {width})", "the rows", one.shape)
+        return self.of_inputs(np.concatenate(given, axis=1, dtype=np.float32))
+
+    @torch.inference_mode()
+    def of_inputs(self, inputs: F32) -> F32:
+        """Return the reward of inputs (B, n + k + n) that are one array, (B,). Raises `NotFiniteError` for others."""
+        with threads(1):
+            parts = [self.network(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
+        rewards = np.concatenate(parts) if parts else np.empty(0, np.float32)
+        if not np.isfinite(rewards).all():
+            row = int(np.argmin(np.isfinite(rewards)))
+            raise NotFiniteError(f"the reward of row {row} is {rewards[row]}: its inputs or the weights are not finite")
+        return rewards
+
+    @torch.inference_mode()
+    def members(self, inputs: F32) -> NDArray[np.float64]:
+        """Return every network's reward, (M, B), of inputs (B, n + k + n), in units of log-odds a step."""
+        with threads(1):
+            parts = [self.network.members(part).numpy() for part in torch.from_numpy(inputs).split(_ROWS)]
+        return np.concatenate(parts, axis=1).astype(np.float64)
+
+
+def _width(path: Path, config: dict[str, Any], key: str) -> int:
+    feature = checks.mapping(f"{path / CONFIG}: {key}", config["input_features"].get(key))
+    shape = checks.array(f"{path / CONFIG}: shape of {key}", feature.get("shape"), 1)
+    return math.prod(checks.whole(f"{path / CONFIG}: width of {key}", side, 1, 100_000) for side in shape)
+
+
+def _read_network(path: Path, config: dict[str, Any], width: int) -> RewardNetwork:
+    try:
+        ways = tuple(map(tuple, checks.array("ways", config.get("ways"), MOST_WAYS)))
+        sizes: dict[str, Any] = {name: config.get(name) for name in ("members", "width", "depth")}
+        shape = RewardShape(**sizes, ways=ways)
+        with Budget(path / WEIGHTS):
+            network = RewardNetwork(width, shape)
+        tensors = load_file(path / WEIGHTS)
+        network.load_state_dict({name.removeprefix(_PREFIX): value for name, value in tensors.items()})
+    except (ManipError, SafetensorError, OSError, RuntimeError, TypeError) as error:
+        line = " ".join(str(error).split())
+        raise ManipError(f"{path} cannot be read: {line[:300]}") from error
+    return network

@@ -1,0 +1,132 @@
+"""A reward from pairs and answers, and how well it foretells what it has not learnt from."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.evaluation.intervals import Proportion
+from manip_il.learn.preference.fitting import BY_CHANCE, Compared, Fit, fit_reward
+from manip_il.learn.preference.network import RewardShape
+from manip_il.preferences.answers import Answers
+from manip_il.preferences.pairs import Clips
+
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
+TIE = 0.01  # difference of the clips' mean progress below which none is the better one
+EDGES = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of what is foretold about the clip that is likelier to be preferred
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Answers whose likelier clip was foretold with a probability from low to high.
+
+    foretold: its mean; given: the share of answers that preferred that clip.
+    """
+
+    low: float
+    high: float
+    foretold: float
+    given: Proportion
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fit, and its agreement on pairs that were held out, each by one network of the ensemble.
+
+    answered: with the answers left and right; true: with the clips' true progress, None where there is none; ties:
+    pairs left out of that, as their progress differs by less than `TIE`. teachers: answers' own agreement with true
+    progress. brier: mean square of answer minus probability.
+    """
+
+    fit: Fit
+    shape: RewardShape
+    answered: Proportion
+    true: Proportion | None
+    teachers: Proportion | None
+    ties: int
+    bins: tuple[Bin, ...]
+    brier: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the numbers for `fit.json`."""
+        bins = [{"low": b.low, "high": b.high, "foretold": b.foretold, **_counts(b.given)} for b in self.bins]
+        return {
+            "agreement_with_answers": _counts(self.answered),
+            "agreement_with_progress": None if self.true is None else _counts(self.true),
+            "answers_agreement_with_progress": None if self.teachers is None else _counts(self.teachers),
+            "ties": self.ties,
+            "brier": self.brier,
+            "calibration": bins,
+            "epochs": self.fit.epochs,
+        }
+
+
+def fit_answers(
+    clips: Clips, answers: Answers, shape: RewardShape, seed: int, on_epoch: Callable[[], None] = lambda: None
+) -> Fitted:
+    """Fit a reward and measure it on held-out pairs. Raises what `fit_reward` raises."""
+    rows = clips.rows[answers.pair]
+    compared = Compared(rows[:, 0], rows[:, 1], answers.better, answers.pair)
+    fit = fit_reward(clips.inputs, compared, shape, seed, on_epoch)
+    decided = answers.better != 0.5
+    right = (fit.logits > 0) == (answers.better > 0.5)
+    probability = probabilities(fit.logits)
+    difference = true_difference(clips)
+    true = teachers = None
+    ties = 0
+    if difference is not None:
+        pairs, first = np.unique(answers.pair, return_index=True)
+        told = np.abs(difference[pairs]) >= TIE
+        ties = int((~told).sum())
+        true = _proportion(((fit.logits[first] > 0) == (difference[pairs] > 0))[told])
+        clear = decided & (np.abs(difference[answers.pair]) >= TIE)
+        teachers = _proportion(((answers.better > 0.5) == (difference[answers.pair] > 0))[clear])
+    return Fitted(
+        fit=fit,
+        shape=shape,
+        answered=_proportion(right[decided]),
+        true=true,
+        teachers=teachers,
+        ties=ties,
+        bins=calibration(probability[decided], answers.better[decided]),
+        brier=float(np.mean((probability - answers.better) ** 2)),
+    )
+
+
+def probabilities(logits: F64) -> F64:
+    """Return P(left is better) of differences of returns (A,), (A,), as the model of the answers has it."""
+    return (1 - BY_CHANCE) / (1 + np.exp(-np.clip(logits, -50, 50))) + BY_CHANCE / 2
+
+
+def true_difference(clips: Clips) -> F64 | None:
+    """Return mean true progress of every pair's left clip minus that of its right one, (P,); None without progress."""
+    if clips.progress is None:
+        return None
+    means = clips.progress[clips.rows].mean(axis=-1)
+    return means[:, 0] - means[:, 1]
+
+
+def calibration(probability: F64, better: F64, edges: Sequence[float] = EDGES) -> tuple[Bin, ...]:
+    """Return how often the likelier clip was preferred, by its probability: of answers left and right, (A,) each."""
+    likelier = np.maximum(probability, 1 - probability)
+    given = np.where(probability >= 0.5, better, 1 - better)
+    place = np.clip(np.searchsorted(edges, likelier, side="right") - 1, 0, len(edges) - 2)
+    found: list[Bin] = []
+    for number, (low, high) in enumerate(itertools.pairwise(edges)):
+        inside = place == number
+        if inside.any():
+            found.append(Bin(low, high, float(likelier[inside].mean()), _proportion(given[inside] > 0.5)))
+    return tuple(found)
+
+
+def _proportion(right: NDArray[np.bool_]) -> Proportion:
+    return Proportion(int(right.sum()), max(len(right), 1))
+
+
+def _counts(one: Proportion) -> dict[str, Any]:
+    return {"rate": one.rate, "interval": list(one.interval), "right": one.successes, "of": one.n}

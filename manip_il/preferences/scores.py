@@ -1,0 +1,149 @@
+"""Scores of a dataset's frames and episodes by a reward, and the file that LeRobot's RA-BC weights samples by.
+
+What is scored is the reward itself, as progress: Bradley-Terry answers about clips of equal length leave a constant of
+the reward open, which its differences between two frames do not hold and its running sum does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from manip_il.data.atomic import writing
+from manip_il.data.lerobot_layout import EPISODE_INDEX
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import MismatchError
+from manip_il.preferences.frames import Frames
+
+F64, I64 = NDArray[np.float64], NDArray[np.int64]
+FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
+LAST = 1.0  # of an episode, over which its score is the mean [s]
+_METADATA = b"reward_model_path"  # as LeRobot's own scripts say it
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of a dataset. frames: of every frame, (N,), 0 to 1; reward: its name.
+
+    An episode's score is the mean of its last second's frames: how far it got, and stayed.
+    """
+
+    root: str
+    reward: str
+    spec: RobotTaskSpec
+    data: Frames
+    frames: F64
+
+    def __post_init__(self) -> None:
+        if self.frames.shape != (count := len(self.data.states),):
+            raise MismatchError("frames", "the dataset", count, "their scores", self.frames.shape)
+
+    @property
+    def episodes(self) -> F64:
+        """Score of every episode, (E,)."""
+        return episode_scores(self.frames, self.data)
+
+    @property
+    def succeeded(self) -> NDArray[np.bool_] | None:
+        """Whether every episode succeeded at some step, (E,); None where nothing says so."""
+        if self.data.success is None:
+            return None
+        return np.logical_or.reduceat(self.data.success, self.data.firsts)
+
+    @property
+    def auc(self) -> float | None:
+        """Area under the ROC curve of finding failed episodes by a low score; None without both kinds."""
+        return roc_auc(self.episodes, self.succeeded)
+
+    @property
+    def true_auc(self) -> float | None:
+        """The same by true progress: what a perfect reward would reach; None where there is none."""
+        if self.data.progress is None:
+            return None
+        return roc_auc(episode_scores(self.data.progress, self.data), self.succeeded)
+
+    @property
+    def correlation(self) -> float | None:
+        """Spearman's correlation of the frames' scores with true progress; None where there is none."""
+        if self.data.progress is None or np.ptp(self.data.progress) == 0 or np.ptp(self.frames) == 0:
+            return None
+        from scipy.stats import spearmanr
+
+        return float(spearmanr(self.frames, self.data.progress).statistic)
+
+    def worst(self, count: int) -> list[int]:
+        """Return the numbers of the episodes with the lowest scores, lowest first."""
+        return np.argsort(self.episodes, kind="stable")[:count].tolist()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything for `scores.json`; frames' scores are in the parquet file."""
+        true = episode_scores(self.data.progress, self.data) if self.data.progress is not None else None
+        succeeded = self.succeeded
+        numbers = self.data.episodes[self.data.firsts].tolist()
+        episodes: list[Mapping[str, Any]] = [
+            {
+                "episode": number,
+                "frames": int(self.data.lengths[place]),
+                "score": float(self.episodes[place]),
+                "progress": None if true is None else float(true[place]),
+                "success": None if succeeded is None else bool(succeeded[place]),
+            }
+            for place, number in enumerate(numbers)
+        ]
+        return {
+            "dataset": self.root,
+            "reward": self.reward,
+            "auc": self.auc,
+            "auc_of_progress": self.true_auc,
+            "correlation_with_progress": self.correlation,
+            "episodes": episodes,
+        }
+
+
+def episode_scores(values: F64, frames: Frames) -> F64:
+    """Return the mean over the last `LAST` seconds of every episode, (E,), of values of its frames (N,)."""
+    last = max(1, round(LAST * frames.spec.fps))
+    ends = frames.firsts + frames.lengths
+    begins = np.maximum(frames.firsts, ends - last)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return (sums[ends] - sums[begins]) / (ends - begins)
+
+
+def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
+    """Return P(a failed episode's score is below a successful one's), ties half (Mann and Whitney 1947).
+
+    scores, succeeded: of every episode, (E,). None where one kind is missing.
+    """
+    if succeeded is None or succeeded.all() or not succeeded.any():
+        return None
+    good, bad = scores[succeeded][:, None], scores[~succeeded][None]
+    return float(((good > bad) + 0.5 * (good == bad)).mean())
+
+
+def write_weights(path: Path, scores: Scores) -> None:
+    """Write what LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse` of every frame.
+
+    Raises `WriteError` where the disk is full or read-only.
+    """
+    data = scores.data
+    table = pa.table(
+        {
+            "index": np.arange(len(scores.frames), dtype=np.int64),
+            EPISODE_INDEX: data.episodes,
+            "frame_index": np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths),
+            "progress_sparse": scores.frames.astype(np.float32),
+        },
+        metadata={_METADATA: scores.reward.encode()},
+    )
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.partial")
+        pq.write_table(table, partial)
+        partial.replace(path)

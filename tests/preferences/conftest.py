@@ -1,0 +1,61 @@
+"""Datasets whose progress is known, without a simulator: an object is brought along one axis, well or badly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from manip_il.data import schema as s
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.learn.limits import threads
+from manip_il.mdp import Episode
+from manip_il.preferences.pairs import Clips
+
+from ..synthetic import MakeEpisode, make_episode, offline, spec
+from .made import brought, clips_of
+
+__all__ = ["make_episode", "offline", "spec"]
+LENGTHS = {"good": 30, "bad": 60}
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    with threads(1):
+        yield
+
+
+@pytest.fixture(scope="session")
+def datasets(tmp_path_factory: pytest.TempPathFactory, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+    """A folder with the datasets `good`, whose episodes get to the end, `bad`, whose episodes do not, and `other`."""
+    folder = tmp_path_factory.mktemp("supply")
+    spec = replace(spec, robot="arm")  # none that is known here, whose columns would be compared
+    for number, (name, length) in enumerate(LENGTHS.items()):
+        made = [brought(make_episode(100 * number + i, length, name == "good"), spec, name == "good") for i in range(8)]
+        write(folder / name, made, spec)
+    write(folder / "other", [make_episode(7, 30)], replace(spec, task="reach"))
+    return folder
+
+
+def write(root: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> None:
+    write_dataset(episodes, root, spec, repo_id="someone/lift", fingerprint={})
+
+
+@pytest.fixture(scope="session")
+def clips(datasets: Path) -> Clips:
+    """Sixty pairs of clips of ten steps of both datasets."""
+    return clips_of([datasets / "good", datasets / "bad"], 60)
+
+
+@pytest.fixture
+def error(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
+    """Returns the one line of error since the last output was read."""
+
+    def line() -> str:
+        err = capsys.readouterr().err
+        [found] = [line for line in err.splitlines() if line.startswith("manip-il: error:")]
+        return found
+
+    return line

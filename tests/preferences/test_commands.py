@@ -1,0 +1,86 @@
+"""The commands: from datasets to a reward, scores and a weighted clone; bad input is one line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.preferences.pairs import Pairs
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, datasets):
+    monkeypatch.chdir(tmp_path)
+    for name in ("good", "bad", "other"):
+        (tmp_path / name).symlink_to(datasets / name)
+    return tmp_path
+
+
+def run(line: str) -> int:
+    return main([*line.split(), "--quiet"])
+
+
+def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
+    assert run("preferences pairs good bad --clip=10 --count=40") == 0
+    assert run("preferences answer pairs.json --teacher=mistaken:0.1 --output=a.json") == 0
+    assert run("preferences answer pairs.json --teacher=perfect --output=b.json") == 0
+    assert run("preferences fit pairs.json a.json b.json --members=3 --output_dir=reward") == 0
+    out, err = capsys.readouterr()
+    assert "80 answers about 40 pairs" in out
+    assert "are answered left and right: both answers count" in err
+    found = json.loads((here / "reward" / "fit.json").read_text())
+    assert found["agreement_with_progress"]["of"] + found["ties"] == 40
+    assert run("score bad --reward=reward --output_dir=scores") == 0
+    assert "next: manip-il train --dataset.root=bad --weights=scores/rabc.parquet" in capsys.readouterr().out
+    words = "--dataset.root=bad --weights=scores/rabc.parquet --steps=2 --batch_size=8 --policy.width=8"
+    assert run(f"train {words} --output_dir=weighted") == 0
+    assert "of the frames weigh 0" in capsys.readouterr().out
+    assert (here / "weighted/checkpoints/last/pretrained_model/model.safetensors").is_file()
+    assert run("preferences pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
+    assert Pairs.read(here / "more.json").chosen == "where rewards disagree"
+
+
+def test_true_progress_scores_without_a_reward(here, capsys):
+    assert run("score good --reward=progress --output_dir=scores") == 0
+    assert len(json.loads((here / "scores/scores.json").read_text())["episodes"]) == 8
+    assert {path.name for path in (here / "scores").iterdir()} == {
+        *("config.yaml", "rabc.parquet", "report.html", "scores.json"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "says", "code"),
+    [
+        ("preferences pairs good other", "task differs: good has lift, other has reach", 1),
+        ("preferences pairs nowhere", "nowhere does not exist; expected a LeRobot dataset or a run", 2),
+        ("preferences pairs good --count=0", "--count is 0; expected at least 1", 2),
+        ("preferences pairs good --output=x.txt", "--output is x.txt; expected a file, NAME.json", 2),
+        ("preferences pairs good --clip=99", "the longest episode has 30", 1),
+        ("preferences ask nowhere.json", "nowhere.json does not exist; expected pairs.json", 2),
+        ("preferences answer good/meta/info.json", "format is None; expected 'manip_il pairs'", 1),
+        ("preferences answer good/meta/info.json --teacher=strict", "unknown teacher 'strict'", 2),
+        ("preferences fit good/meta/info.json nowhere.json", "nowhere.json does not exist", 2),
+        ("preferences fit good/meta/info.json good/meta/info.json --members=2", "--members is 2; expected 3 to 64", 2),
+        ("score good --reward=nowhere", "nowhere does not exist; expected a reward", 2),
+        ("score nowhere --reward=progress", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        ("train --dataset.root=good --weights=nowhere.parquet", "--weights is nowhere.parquet, which is no file", 2),
+        ("train --dataset.root=good,bad --weights=good/meta/info.json", "give one, and no --redraw", 2),
+    ],
+)
+def test_bad_input_is_one_line(line, says, code, here, error):
+    before = set(here.rglob("*"))
+    assert run(line) == code
+    assert says in error()
+    assert set(here.rglob("*")) == before
+
+
+def test_a_file_that_is_there_is_not_replaced_unasked(here, error):
+    (here / "pairs.json").write_text("mine")
+    assert run("preferences pairs good --clip=10 --count=5") == 2
+    assert "pairs.json exists already" in error()
+    assert run("preferences pairs good --clip=10 --count=5 --overwrite=true") == 0

@@ -1,0 +1,175 @@
+"""The Bradley-Terry reward: what it learns, that it is the same everywhere, and what a folder of it may hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from manip_il.errors import ManipError, MismatchError
+from manip_il.learn.preference.fitting import Compared, answer_losses, deal, fit_reward
+from manip_il.learn.preference.modeling_preference import write_reward
+from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
+from manip_il.learn.reward import LearnedReward
+from manip_il.preferences.answers import join_answers
+from manip_il.preferences.fit_report import fit_report
+from manip_il.preferences.fitting import calibration, fit_answers
+from manip_il.preferences.teachers import Teacher, answer_pairs
+
+SHAPE = RewardShape(members=3, width=16)
+
+
+@pytest.fixture(scope="module")
+def answers(clips):
+    return join_answers([answer_pairs(Teacher.parse("perfect"), clips, np.random.default_rng(0))])
+
+
+@pytest.fixture(scope="module")
+def fitted(clips, answers):
+    return fit_answers(clips, answers, SHAPE, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(fitted, clips, tmp_path_factory):
+    made = tmp_path_factory.mktemp("reward")
+    write_reward(made, fitted.fit.network, fitted.shape, clips.frames[0].spec, {"seed": 0}, {})
+    return made
+
+
+def test_a_reward_learns_what_its_answers_are_about(fitted, clips):
+    with torch.no_grad():
+        reward = fitted.fit.network(torch.from_numpy(clips.inputs)).numpy()
+    assert np.corrcoef(reward, clips.progress)[0, 1] > 0.75
+    assert fitted.true.rate > 0.85
+    assert fitted.teachers.rate == 1
+    assert np.quantile(reward, [0.01, 0.99]) == pytest.approx([0, 1], abs=0.02)
+
+
+def test_a_pair_is_held_out_whole_and_every_fold_is_in_turn():
+    pair = np.repeat(np.arange(30), 2)
+    folds = deal(pair, 5, 0)
+    assert (folds[::2] == folds[1::2]).all()
+    assert np.bincount(folds).tolist() == [12] * 5
+
+
+def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, answers):
+    """Answers of one fold turned round change the networks that learn from them or stop by them, not the held-out one.
+
+    The number of epochs is chosen by all answers, so both fits are of one epoch.
+    """
+    rows, folds = clips.rows[answers.pair], deal(answers.pair, 3, 0)
+    turned = np.where(folds == 1, 1 - answers.better, answers.better)
+    said = []
+    for better in (answers.better, turned):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("manip_il.learn.preference.fitting._EPOCHS", 1)
+            said.append(
+                fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], better, answers.pair), SHAPE, 0).logits
+            )
+    assert said[0][folds == 1] == pytest.approx(said[1][folds == 1], abs=1e-6)
+    assert not np.allclose(said[0][folds == 2], said[1][folds == 2], atol=1e-6)
+
+
+def test_the_same_seed_gives_the_same_weights(fitted, clips, answers):
+    again = fit_answers(clips, answers, SHAPE, 0).fit.network.state_dict()
+    assert all(torch.equal(value, again[name]) for name, value in fitted.fit.network.state_dict().items())
+
+
+def test_fewer_pairs_than_networks_are_refused(clips, answers):
+    few = answers.pair < 2
+    rows = clips.rows[answers.pair[few]]
+    with pytest.raises(ManipError, match="2 pairs are answered by left, right or equal; expected at least 3"):
+        fit_reward(clips.inputs, Compared(rows[:, 0], rows[:, 1], answers.better[few], answers.pair[few]), SHAPE, 0)
+
+
+def test_equal_is_likeliest_where_returns_are_alike():
+    losses = answer_losses(torch.tensor([[-1.0, 0.0, 1.0]]), torch.full((3,), 0.5))[0]
+    assert losses[1] < losses[0]
+    assert losses[0] == pytest.approx(losses[2])
+
+
+def test_a_wrong_answer_costs_no_more_than_chance_allows():
+    assert answer_losses(torch.tensor([[100.0]]), torch.tensor([0.0])).item() == pytest.approx(-np.log(0.05), abs=1e-4)
+
+
+def test_ways_are_the_triples_that_lead_from_one_thing_to_another(spec):
+    names = ("ee.x", "goal_from_object.x", "goal_from_object.y", "goal_from_object.z", "object_from_ee.x")
+    assert ways_of(replace(spec, environment_state_names=names)) == ((4, 5, 6),)
+
+
+def test_the_length_of_a_way_is_an_input():
+    network = RewardNetwork(4, RewardShape(ways=((1, 2, 3),)))
+    assert network.features(torch.tensor([[9.0, 2.0, 3.0, 6.0]])).tolist() == [[9, 2, 3, 6, 7]]
+
+
+def test_ours_and_lerobots_factory_give_the_same_rewards(folder, clips):
+    from lerobot.configs.rewards import RewardModelConfig
+    from lerobot.rewards import make_reward_model, make_reward_pre_post_processors
+
+    frames = clips.frames[0]
+    given = frames.states[:9], frames.environment_states[:9], frames.actions[:9]
+    ours = LearnedReward.load(folder)(*given)
+    config = RewardModelConfig.from_pretrained(str(folder))
+    config.pretrained_path = str(folder)
+    model, (preprocess, _) = make_reward_model(config), make_reward_pre_post_processors(config)
+    keys = ("observation.state", "observation.environment_state", "action")
+    batch = preprocess({key: torch.from_numpy(one) for key, one in zip(keys, given, strict=True)})
+    assert model.compute_reward(batch).numpy() == pytest.approx(ours, abs=1e-6)
+
+
+def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
+    from manip_il.data.lerobot_read import read_spec
+
+    reward = LearnedReward.load(folder)
+    reward.check_fits("here", clips.frames[0].spec)
+    with pytest.raises(MismatchError, match=r"task differs: the reward has lift, .*other has reach"):
+        reward.check_fits(str(datasets / "other"), read_spec(datasets / "other"))
+    with pytest.raises(MismatchError, match=r"shape of observation.state differs"):
+        reward(np.zeros((2, 9), np.float32), np.zeros((2, 15), np.float32), np.zeros((2, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"members": 10_000}, "members is 10000"),
+        ({"members": 64, "width": 1024, "depth": 8}, "much larger network than its weights"),
+        ({"ways": [[0, 1, 99]]}, "a way has column 99; there are"),
+        ({"ways": [[0, 1]]}, "expected columns of x, y and z"),
+        ({"width": 8}, "size mismatch"),
+        ({"type": "sarm"}, "is of type 'sarm'; expected a reward"),
+        ({"input_features": {}}, "observation.state is None"),
+    ],
+)
+def test_a_hostile_configuration_is_refused(change, says, folder, tmp_path):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | change))
+    with pytest.raises(ManipError) as refused:
+        LearnedReward.load(tmp_path)
+    assert says in str(refused.value)
+
+
+def test_weights_that_are_not_finite_are_refused_when_they_are_used(folder, tmp_path, clips):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    tensors = load_file(tmp_path / "model.safetensors")
+    tensors["model.low"].fill_(float("nan"))
+    save_file(tensors, tmp_path / "model.safetensors")
+    with pytest.raises(ManipError, match="the reward of row 0 is nan"):
+        LearnedReward.load(tmp_path).of_inputs(clips.inputs)
+
+
+def test_calibration_counts_every_answer_once_by_the_likelier_clip():
+    bins = calibration(np.array([0.95, 0.05, 0.55, 1.0]), np.array([1.0, 0.0, 0.0, 1.0]))
+    assert [(b.low, b.given.successes, b.given.n) for b in bins] == [(0.5, 0, 1), (0.9, 3, 3)]
+
+
+def test_the_page_says_what_was_held_out_and_by_whom_it_was_answered(fitted, clips, answers):
+    page = fit_report(fitted, clips, answers, ["Ada"], "manip-il preferences fit", {}, {}).render()
+    for words in ("Calibration", "by Ada", f"epoch {fitted.fit.epochs}", "agrees with true progress in"):
+        assert words in page

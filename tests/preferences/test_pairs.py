@@ -1,0 +1,122 @@
+"""Which clips are compared, and what a file of pairs may hold."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from manip_il.errors import ManipError, MismatchError, UsageError
+from manip_il.preferences.choose import choose_pairs, disagreement, open_supply
+from manip_il.preferences.frames import find_datasets
+from manip_il.preferences.pairs import Clips, Pairs, read_clips
+
+from .made import clips_of
+
+
+def test_every_source_is_in_as_many_pairs_as_any_other(clips):
+    counts = Counter(clip.source for pair in clips.pairs.pairs for clip in pair)
+    assert len(set(counts.values())) == 1
+
+
+def test_no_pair_is_there_twice_and_no_clip_is_compared_with_itself(clips):
+    every = [frozenset(pair) for pair in clips.pairs.pairs]
+    assert len(set(every)) == len(every)
+    assert all(len(pair) == 2 for pair in every)
+
+
+def test_clips_are_whole(clips):
+    episodes = np.concatenate([one.episodes + 1_000 * number for number, one in enumerate(clips.frames)])
+    assert (np.ptp(episodes[clips.rows], axis=-1) == 0).all()
+
+
+def test_episodes_shorter_than_a_clip_are_left_out(datasets):
+    roots = [datasets / "good", datasets / "bad"]
+    assert open_supply(roots, 31).too_short == 8
+    assert {clip.source for pair in clips_of(roots, 10, 31).pairs.pairs for clip in pair} == {1}
+    with pytest.raises(ManipError, match="--clip is 61 control steps; the longest episode has 60"):
+        open_supply(roots, 61)
+
+
+def test_the_same_seed_chooses_the_same_pairs(datasets):
+    roots = [datasets / "good", datasets / "bad"]
+    assert clips_of(roots, 20).pairs == clips_of(roots, 20).pairs
+    assert clips_of(roots, 20).pairs != clips_of(roots, 20, seed=1).pairs
+
+
+def test_more_pairs_than_there_are_clips_are_refused(datasets):
+    with pytest.raises(ManipError, match="--count is 50; "):
+        clips_of([datasets / "good"], 50, 30)
+
+
+def test_pairs_of_different_tasks_are_refused(datasets):
+    with pytest.raises(MismatchError, match=r"task differs: .*good has lift, .*other has reach"):
+        open_supply([datasets / "good", datasets / "other"], 10)
+
+
+def test_an_ensemble_chooses_the_pairs_that_it_disagrees_about(datasets):
+    supply = open_supply([datasets / "good", datasets / "bad"], 10)
+
+    def members(inputs):
+        return np.random.default_rng(1).normal(size=(3, inputs.shape[1])) @ inputs.T
+
+    chosen = choose_pairs(supply, 20, 0, np.random.default_rng(0), members)
+    evenly = choose_pairs(supply, 20, 0, np.random.default_rng(0))
+    doubts = [disagreement(Clips(one, supply.frames), members).mean() for one in (chosen, evenly)]
+    assert doubts[0] > 1.1 * doubts[1]
+
+
+def test_a_run_stands_for_the_datasets_of_its_rounds(tmp_path, datasets):
+    for number, name in enumerate(("good", "bad")):
+        (tmp_path / f"round_{number:03d}").mkdir()
+        (tmp_path / f"round_{number:03d}" / "dataset").symlink_to(datasets / name)
+    assert [path.parent.name for path in find_datasets([tmp_path])] == ["round_000", "round_001"]
+    with pytest.raises(UsageError, match="is given twice"):
+        find_datasets([datasets / "good", datasets / "good"])
+
+
+def test_pairs_are_the_same_from_their_file(clips, tmp_path):
+    path = tmp_path / "pairs.json"
+    path.write_text(json.dumps(clips.pairs.to_json()))
+    assert Pairs.read(path) == clips.pairs
+    assert (read_clips(Pairs.read(path)).rows == clips.rows).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"format": "else"}, "format is 'else'; expected 'manip_il pairs'"),
+        ({"version": 9}, "version is 9; this program reads 1"),
+        ({"pairs": [[[0, 0, 0], [0, 0, 0]]]}, "pair 0 is twice the clip"),
+        ({"pairs": [[[2, 0, 0], [0, 0, 0]]]}, "pair 0: source is 2; expected a whole number from 0 to 1"),
+        ({"pairs": [[[0, 99, 0], [0, 0, 0]]]}, "pair 0: episode is 99"),
+        ({"pairs": [[[0, 0, "0"], [0, 0, 0]]]}, "pair 0: first is '0'"),
+        ({"pairs": [[[0, 0, 0]]]}, "expected two of"),
+        ({"pairs": 3}, "pairs is 3; expected a list"),
+        ({"sources": []}, "sources are empty"),
+        ({"clip": 0}, "clip is 0"),
+        ({"task": "../x"}, "task is '../x'"),
+    ],
+)
+def test_a_file_that_holds_no_pairs_is_refused_in_one_line(change, says, clips, tmp_path):
+    path = tmp_path / "pairs.json"
+    path.write_text(json.dumps(clips.pairs.to_json() | change))
+    with pytest.raises(ManipError) as refused:
+        Pairs.read(path)
+    assert says in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
+def test_a_clip_beyond_the_end_of_its_episode_is_refused(clips):
+    tree = clips.pairs.to_json() | {"pairs": [[[0, 0, 25], [0, 0, 0]]]}
+    with pytest.raises(ManipError, match=r"pair 0: .*good has no 10 frames from frame 25 of episode 0"):
+        _ = Clips(Pairs.from_json(tree), clips.frames).rows
+
+
+def test_a_dataset_that_was_changed_since_is_refused(clips):
+    tree = clips.pairs.to_json()
+    tree["sources"][0]["sha256"] = "0" * 64
+    with pytest.raises(MismatchError, match=r"sha256 of .*good differs"):
+        read_clips(Pairs.from_json(tree))

@@ -1,0 +1,154 @@
+"""Scores of episodes, weights of frames, and that LeRobot takes them as its own."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from lerobot.rewards.sarm.rabc import RABCWeights
+
+from manip_il.errors import ManipError
+from manip_il.learn.lerobot_reward import score_by_lerobot
+from manip_il.learn.preference.modeling_preference import write_reward
+from manip_il.learn.preference.network import RewardNetwork, RewardShape
+from manip_il.learn.reward import LearnedReward
+from manip_il.learn.weights import rabc_weights, read_progress
+from manip_il.preferences.frames import Frames, read_frames
+from manip_il.preferences.score_report import score_report
+from manip_il.preferences.scores import Scores, episode_scores, roc_auc, write_weights
+
+
+@pytest.fixture(scope="module")
+def scored(datasets) -> Scores:
+    """Both datasets as one, scored by true progress with a little noise."""
+    good, bad = (read_frames(datasets / name) for name in ("good", "bad"))
+    data = Frames(
+        good.spec,
+        *(np.concatenate([getattr(one, name) for one in (good, bad)]) for name in ("states", "environment_states")),
+        np.concatenate([good.actions, bad.actions]),
+        np.concatenate([good.episodes, bad.episodes + 8]),
+        np.concatenate([good.progress, bad.progress]),
+        np.concatenate([good.success, bad.success]),
+    )
+    noise = np.random.default_rng(0).normal(size=len(data.states)) * 0.02
+    return Scores("both", "a test", data.spec, data, np.clip(data.progress + noise, 0, 1))
+
+
+def test_the_area_under_the_curve_is_the_share_of_pairs_in_order():
+    scores, succeeded = np.array([0.1, 0.4, 0.4, 0.9]), np.array([False, True, False, True])
+    assert roc_auc(scores, succeeded) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
+    assert roc_auc(scores, np.ones(4, bool)) is None
+    assert roc_auc(scores, None) is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), min_size=2, max_size=30))
+def test_the_area_does_not_change_with_the_scale_of_the_scores(rows):
+    scores, succeeded = np.array([a for a, _ in rows]), np.array([b for _, b in rows])
+    assert roc_auc(scores, succeeded) == roc_auc(scores / 10 - 1, succeeded)
+
+
+def test_an_episode_is_scored_by_its_last_second(scored):
+    data, fps = scored.data, scored.spec.fps
+    rows = data.rows(3)
+    assert episode_scores(scored.frames, data)[3] == pytest.approx(scored.frames[rows][-fps:].mean())
+
+
+def test_failed_episodes_are_found_and_listed_first(scored):
+    assert scored.auc == scored.true_auc == 1
+    assert not scored.succeeded[scored.worst(8)].any()
+    assert scored.correlation > 0.95
+    tree = scored.to_json()
+    assert [one["success"] for one in tree["episodes"]] == [True] * 8 + [False] * 8
+    assert json.loads(json.dumps(tree)) == tree
+
+
+def test_scores_need_neither_progress_nor_success(scored):
+    bare = replace(scored, data=replace(scored.data, progress=None, success=None))
+    assert (bare.auc, bare.true_auc, bare.correlation) == (None, None, None)
+    assert "number" in score_report(bare, "manip-il score", {}, {}).render()
+
+
+@pytest.mark.parametrize("ahead", [1, 7, 100])
+def test_weights_are_lerobots(ahead, scored, tmp_path):
+    path = tmp_path / "rabc.parquet"
+    write_weights(path, scored)
+    theirs = RABCWeights(path, chunk_size=ahead, device=torch.device("cpu"))
+    deltas = np.array([theirs._compute_delta(index) for index in range(len(scored.frames))], np.float32)
+    ours = rabc_weights(read_progress(path, scored.data.episodes), scored.data.episodes, ahead)
+    assert ours == pytest.approx(theirs._compute_weights(deltas), abs=1e-5)
+    assert {0.0, 1.0} < set(ours.tolist())
+
+
+def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
+    from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
+
+    write_weights(tmp_path / "rabc.parquet", scored)
+    config = SampleWeightingConfig(progress_path=str(tmp_path / "rabc.parquet"))
+    policy = type("Policy", (), {"config": type("Config", (), {"chunk_size": 10})()})()
+    weighter = make_sample_weighter(config, policy, torch.device("cpu"))
+    weights, stats = weighter.compute_batch_weights({"index": torch.tensor([0, 5, len(scored.frames) - 20])})
+    assert stats["num_zero_weight"] == 1
+    assert weights[2] == 0
+    assert weights[:2].tolist() == pytest.approx([1.5, 1.5], abs=1e-4)
+
+
+def test_a_frame_without_progress_weighs_one():
+    progress = np.array([0.0, np.nan, 0.5, 0.4])
+    assert rabc_weights(progress, np.zeros(4, int), 2)[1] == 1
+
+
+def test_what_gets_worse_weighs_nothing_and_an_end_little():
+    weights = rabc_weights(np.array([0.0, 0.5, 1.0, 0.9, 0.5, 0.1]), np.array([0, 0, 0, 1, 1, 1]), 1)
+    assert weights[[0, 1, 3, 4]].tolist() == [1, 1, 0, 0]
+    assert 0 < weights[2] < 1
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"index": [0, 0, 1]}, "frames differs"),
+        ({"index": [0, 1, 9]}, "frames differs"),
+        ({"episode_index": [0, 1, 1]}, "episodes differs"),
+        ({"index": ["a", "b", "c"]}, "is no file of weights"),
+        ({"progress_sparse": [0.0, 1.0, np.inf]}, "progress_sparse of frame 2 is infinite"),
+        ({"progress_sparse": None}, "unknown column"),
+    ],
+)
+def test_a_file_of_other_weights_is_refused(change, says, tmp_path):
+    columns = {"index": [0, 1, 2], "episode_index": [0, 0, 1], "progress_sparse": [0.0, 0.5, 1.0]} | change
+    path = tmp_path / "rabc.parquet"
+    pq.write_table(pa.table({key: value for key, value in columns.items() if value is not None}), path)
+    with pytest.raises(ManipError, match=says):
+        read_progress(path, np.array([0, 0, 1]))
+
+
+def test_a_reward_model_is_scored_through_lerobots_factory(datasets, tmp_path):
+    """A model of random weights: what LeRobot's factory makes of its folder scores every frame, as ours does.
+
+    LeRobot knows one action, the expert's label.
+    """
+    spec, shape = read_frames(datasets / "good").spec, RewardShape(3, 8)
+    frames = read_frames(datasets / "good")
+    network = RewardNetwork(frames.inputs.shape[1], shape)
+    network.initialise(torch.Generator().manual_seed(0))
+    write_reward(tmp_path, network, shape, spec, {}, {})
+    from manip_il.data.lerobot_read import read_table
+
+    labels = np.asarray(read_table(datasets / "good", ["action"])["action"])
+    ours = LearnedReward.load(tmp_path)(frames.states, frames.environment_states, labels)
+    assert score_by_lerobot(datasets / "good", tmp_path, trust=True) == pytest.approx(ours, abs=1e-5)
+    with pytest.raises(ManipError, match="if you trust its source, add --trust=true"):
+        score_by_lerobot(datasets / "good", tmp_path, trust=False)
+
+
+def test_a_reward_model_whose_parts_are_not_here_is_one_line(datasets, tmp_path):
+    (tmp_path / "config.json").write_text('{"type": "reward_classifier", "device": "cpu", "model_name": "nowhere/x"}')
+    with pytest.raises(ManipError, match="LeRobot cannot load the reward model in"):
+        score_by_lerobot(datasets / "good", tmp_path, trust=True)

@@ -1,0 +1,115 @@
+"""Simulated teachers, and answers joined."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.preferences.answers import Answer, Preferences, join_answers
+from manip_il.preferences.fitting import true_difference
+from manip_il.preferences.pairs import Clips
+from manip_il.preferences.teachers import TEACHERS, Teacher, answer_pairs
+
+from .made import clips_of
+
+
+@pytest.fixture(scope="module")
+def many(datasets):
+    return clips_of([datasets / "good", datasets / "bad"], 400, 5)
+
+
+def share_right(teacher: str, clips) -> float:
+    """Share of answers left or right that are the better clip by true progress."""
+    given = np.array(Teacher.parse(teacher).answers(clips, np.random.default_rng(3)))
+    told = np.isin(given, ("left", "right"))
+    return float(((given == "left") == (true_difference(clips) > 0))[told].mean())
+
+
+def test_the_perfect_teacher_prefers_the_clip_with_more_progress(many):
+    assert share_right("perfect", many) == 1
+
+
+@pytest.mark.parametrize("epsilon", [0.1, 0.4])
+def test_a_mistaken_teacher_is_wrong_in_its_share_of_the_answers(epsilon, many):
+    assert share_right(f"mistaken:{epsilon}", many) == pytest.approx(1 - epsilon, abs=0.05)
+
+
+def test_a_boltzmann_teacher_errs_the_more_the_higher_its_temperature(many):
+    shares = [share_right(f"boltzmann:{temperature}", many) for temperature in (0.01, 1, 100)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] > 0.97
+    assert shares[-1] == pytest.approx(0.5, abs=0.08)
+
+
+def test_a_myopic_teacher_prefers_what_ends_better(many):
+    ends = many.progress[many.rows][:, :, -1]
+    given = np.array(Teacher.parse("myopic:0").answers(many, np.random.default_rng(0)))
+    assert ((given == "left") == (ends[:, 0] > ends[:, 1])).all()
+
+
+def test_a_skipping_teacher_skips_pairs_in_which_nothing_is_done(many):
+    given = np.array(Teacher.parse("skipping:0.5").answers(many, np.random.default_rng(0)))
+    best = many.progress[many.rows].mean(-1).max(axis=1)
+    assert 0 < (given == "skip").sum() < len(given)
+    assert best[given == "skip"].max() < best[given != "skip"].min()
+
+
+def test_clips_that_are_alike_are_answered_equal(many):
+    alike = tuple(replace(one, progress=np.full(len(one.states), 0.5)) for one in many.frames)
+    assert set(Teacher.parse("perfect").answers(Clips(many.pairs, alike), np.random.default_rng(0))) == {"equal"}
+
+
+def test_the_same_seed_answers_the_same(many):
+    given = [answer_pairs(Teacher.parse("mistaken"), many, np.random.default_rng(5)).to_json() for _ in range(2)]
+    assert given[0] == given[1]
+
+
+@pytest.mark.parametrize("word", ["mistaken:x", "mistaken:2", "perfect:1", "boltzmann:0", "myopic:nan"])
+def test_a_number_that_a_teacher_does_not_take_is_refused(word):
+    with pytest.raises(UsageError, match=f"--teacher is '{word}'"):
+        Teacher.parse(word)
+
+
+def test_an_unknown_teacher_is_refused_with_the_nearest():
+    with pytest.raises(UnknownName, match="did you mean 'mistaken'"):
+        Teacher.parse("mistake")
+    assert set(TEACHERS) == {"perfect", "boltzmann", "mistaken", "myopic", "skipping"}
+
+
+def test_contradictions_and_skips_are_counted_and_all_answers_kept(clips):
+    one = Preferences("p", "a", (Answer(0, "left"), Answer(1, "right"), Answer(2, "skip"), Answer(3, "equal")))
+    other = Preferences("p", "b", (Answer(0, "right"), Answer(1, "right")))
+    found = join_answers([one, other])
+    assert (found.contradictory, found.skipped) == (1, 1)
+    assert found.pair.tolist() == [0, 1, 3, 0, 1]
+    assert found.better.tolist() == [1, 0, 0.5, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"answers": [{"pair": 60, "answer": "left"}]}, "has an answer about pair 60; there are pairs 0 to 59"),
+        ({"answers": [{"pair": -1, "answer": "left"}]}, "number of a pair is -1"),
+        ({"answers": [{"pair": 0, "answer": "lefft"}]}, "'lefft' (did you mean 'left'?)"),
+        ({"answers": [{"pair": 0, "answer": "left", "when": "noon"}]}, "when is 'noon'"),
+        ({"answers": [{"pair": 0}]}, "answer 0 has ['pair']; expected pair, answer, when"),
+        ({"answers": "left"}, "answers is 'left'; expected a list"),
+        ({"who": 3}, "who is 3; expected text"),
+        ({"pairs": "0" * 64}, "pairs (sha256) differs"),
+        ({"format": None}, "format is None; expected 'manip_il preferences'"),
+    ],
+)
+def test_answers_edited_into_nonsense_are_one_line(change, says, clips, tmp_path):
+    whole = {"format": "manip_il preferences", "version": 1, "pairs": clips.pairs.sha256, "who": "a", "answers": []}
+    path = tmp_path / "preferences.json"
+    path.write_text(json.dumps(whole | change))
+    with pytest.raises(ManipError) as refused:
+        Preferences.read(path, clips.pairs)
+    assert says in str(refused.value)
+    assert str(path) in str(refused.value)
+    path.write_text(json.dumps(whole))
+    assert Preferences.read(path, clips.pairs).who == "a"
