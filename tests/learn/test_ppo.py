@@ -1,4 +1,4 @@
-"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on bit-equal."""
+"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
 
 
 def test_a_reward_that_is_not_finite_is_refused():
-    one, env = learner()
+    one, _ = learner()
     one.collect()
     with pytest.raises(NotFiniteError, match="a reward is nan"):
         one.improve(np.full(STEPS * EPISODES, np.nan, np.float32))
@@ -121,10 +121,14 @@ def test_an_option_out_of_range_is_named(option, value):
 
 
 def test_the_global_generators_are_as_they_were_after_being_lent():
-    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()
+    def drawn() -> tuple[float, float]:
+        return torch.rand(1).item(), np.random.random()  # noqa: NPY002
+
+    torch_state, numpy_state = torch.random.get_rng_state(), np.random.get_state()  # noqa: NPY002
     with lent_generators(3):
-        first = torch.rand(1).item(), np.random.random()
+        first = drawn()
     with lent_generators(3):
-        assert (torch.rand(1).item(), np.random.random()) == first
-    assert torch.equal(torch.random.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])
+        assert drawn() == first
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
+    after = np.random.get_state()  # noqa: NPY002
+    assert np.array_equal(after[1], numpy_state[1])
