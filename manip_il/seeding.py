@@ -26,7 +26,6 @@ _STREAMS = {
     "redraw": 7,
     "theory": 8,
     "reinforcement": 9,
-    "preferences": 9,
 }
 _FIRST_ROUND = 10  # rounds take blocks 10, 11, ...
 _BLOCKS_PER_SEED = _FIRST_ROUND + MAX_ROUNDS

@@ -87,9 +87,10 @@ class AdversarialOptions:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
         env = self._environment()
         start = None if self.init is None else find_policy(self.init.expanduser())
-        made = {"env": env, "datasets": tuple(self.dataset.root), "start": start}
-        own = {one.name: getattr(self, one.name) for one in fields(LearningConfig) if hasattr(self, one.name)}
-        return LearningConfig(**{**own, **made})
+        own: dict[str, Any] = {
+            one.name: getattr(self, one.name) for one in fields(LearningConfig) if hasattr(self, one.name)
+        }
+        return LearningConfig(**own, env=env, datasets=tuple(self.dataset.root), start=start)
 
     def algorithm(self) -> Callable[[LearningRun, LearningConfig], Iterator[Iteration]]:
         """Return the loop."""

@@ -44,7 +44,7 @@ class PairsOptions:
         for name in ("clip", "count"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
-        stream_base("preferences", self.seed)
+        stream_base("training", self.seed)
         _require_new_file(self.output, ".json", self.overwrite)
 
     def run(self) -> None:
@@ -58,7 +58,7 @@ class PairsOptions:
         supply = open_supply(find_datasets(self.sources), self.clip)
         if reward is not None:
             reward.check_fits(str(supply.roots[0]), supply.frames[0].spec)
-        rng = rng_for(stream_base("preferences", self.seed), "pairs")
+        rng = rng_for(stream_base("training", self.seed), "pairs")
         members = reward.members if reward is not None else None
         pairs = choose_pairs(supply, self.count, self.seed, rng, members)
         write_json(self.output, pairs.to_json())
@@ -125,7 +125,7 @@ class AnswerOptions:
 
         _require_file(self.pairs, _PAIRS)
         Teacher.parse(self.teacher)
-        stream_base("preferences", self.seed)
+        stream_base("training", self.seed)
         _require_new_file(self.output, ".json", self.overwrite)
 
     def run(self) -> None:
@@ -136,7 +136,7 @@ class AnswerOptions:
         from manip_il.seeding import rng_for, stream_base
 
         clips = read_clips(Pairs.read(self.pairs))
-        rng = rng_for(stream_base("preferences", self.seed), "teacher")
+        rng = rng_for(stream_base("training", self.seed), "teacher")
         found = answer_pairs(Teacher.parse(self.teacher), clips, rng)
         write_json(self.output, found.to_json())
         given = [one.answer for one in found.answers]

@@ -135,6 +135,7 @@ class Lockstep(VecEnv):
         self.executed: list[F64] = []
         self.episodes[0].start(0)
         d = len(self.episodes[0].inputs())
+        self._width = d + 2
         super().__init__(len(episodes), spaces.Box(-np.inf, np.inf, (d + 2,), np.float32), actions.space)
 
     @property
@@ -173,7 +174,7 @@ class Lockstep(VecEnv):
         return self._observe(), np.zeros(self.num_envs, np.float32), done, infos
 
     def _observe(self) -> F32:
-        rows = np.zeros((self.num_envs, *self.observation_space.shape), np.float32)  # pyright: ignore[reportGeneralTypeIssues]
+        rows = np.zeros((self.num_envs, self._width), np.float32)
         for row, episode in zip(rows, self.episodes, strict=True):
             if episode.ended:
                 row[-2] = 1.0

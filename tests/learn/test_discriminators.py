@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -60,7 +62,7 @@ def test_every_form_of_the_reward_prefers_the_expert(form):
 
 
 def test_the_reward_of_airl_is_f_less_the_log_density():
-    d, _ = trained("airl")
+    d: Any = trained("airl")[0]
     steps = rows(0.0, seed=3)
     logs = log_density(steps, 0.0)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on bit-equal."""
+"""PPO over the mlp's network: the density is the network's, the absorbing state teaches nothing, runs go on."""
 
 from __future__ import annotations
 
@@ -33,13 +33,11 @@ def test_the_density_is_that_of_the_policy_network():
     actions = rng.uniform(-1, 1, (20, 2)).astype(np.float32)
     raw = torch.from_numpy(env.actions.raw(actions))
     with torch.no_grad():
-        log_std = one.policy.actor.head.raw_log_std  # of the number that never changes: it is left out
         theirs = one.network.log_prob(torch.from_numpy(states[:, :3]), raw)
         still = one.network.layers(one.network.encode(torch.from_numpy(states[:, :3])))[:, 1]
         spread = one.policy.log_std[0]
         constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
-    assert len(log_std) == 2
-    assert len(one.policy.log_std) == 1
+    assert len(one.policy.log_std) == 1, "the number that never changes is left out"
     ours = one.log_prob(Transitions(states, actions, states))
     np.testing.assert_allclose(ours, (theirs - constant).numpy(), rtol=1e-4, atol=1e-4)
 
@@ -69,8 +67,7 @@ def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_st
 def test_it_learns_what_the_reward_asks_for():
     one, env = learner(ends=False, epochs=10)
     first = np.abs(iterate(one, env, 0).next_states[:, 0]).mean()
-    for number in range(1, 40):
-        rows = iterate(one, env, number)
+    *_, rows = (iterate(one, env, number) for number in range(1, 40))
     assert np.abs(rows.next_states[:, 0]).mean() < 0.6 * first
 
 
@@ -105,7 +102,7 @@ def test_noise_of_exploration_is_as_wide_as_the_actors_and_within_the_range():
 
 
 def test_a_reward_that_is_not_finite_is_refused():
-    one, env = learner()
+    one, _ = learner()
     one.collect()
     with pytest.raises(NotFiniteError, match="a reward is nan"):
         one.improve(np.full(STEPS * EPISODES, np.nan, np.float32))
@@ -121,10 +118,14 @@ def test_an_option_out_of_range_is_named(option, value):
 
 
 def test_the_global_generators_are_as_they_were_after_being_lent():
-    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()
+    def drawn() -> tuple[float, float]:
+        return torch.rand(1).item(), np.random.random()  # noqa: NPY002
+
+    torch_state, numpy_state = torch.random.get_rng_state(), np.random.get_state()  # noqa: NPY002
     with lent_generators(3):
-        first = torch.rand(1).item(), np.random.random()
+        first = drawn()
     with lent_generators(3):
-        assert (torch.rand(1).item(), np.random.random()) == first
-    assert torch.equal(torch.random.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])
+        assert drawn() == first
+    assert torch.equal(torch.random.get_rng_state(), torch_state)
+    after = np.random.get_state()  # noqa: NPY002
+    assert np.array_equal(after[1], numpy_state[1])

@@ -1,0 +1,132 @@
+"""Runs of GAIL, AIRL and of a given reward, very small: what lies on disk, and that a stopped run goes on bit-equal."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manip_il.algorithms.airl import airl
+from manip_il.algorithms.fixed_reward import reinforcement
+from manip_il.algorithms.gail import gail
+from manip_il.algorithms.learning_config import LearningConfig
+from manip_il.algorithms.learning_run import LearningRun, best_validation, validations
+from manip_il.cli.main import main
+from manip_il.engine.engine import Engine
+from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
+from manip_il.learn.policy import LearnedPolicy
+from manip_il.sim.env import EnvConfig
+
+from ..engine.clones import clone
+from .trees import files
+
+pytestmark = pytest.mark.slow  # every test here waits for whole runs
+
+ENV = EnvConfig("fetch", "reach")
+LOOPS = {"gail": gail, "airl": airl}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory) -> LearningConfig:
+    """Options of a run on three demonstrations, of about three iterations."""
+    root = tmp_path_factory.mktemp("demos") / "reach"
+    words = ["--robot.type=fetch", "--task.type=reach", "--dataset.num_episodes=3", "--workers=1", "--quiet"]
+    assert main(["record", *words, f"--dataset.root={root}"]) == 0
+    return LearningConfig(
+        env=ENV,
+        datasets=(root,),
+        steps=300,
+        episodes=4,
+        ppo=PPOConfig(minibatches=2, epochs=2),
+        discriminator=DiscriminatorConfig(width=16, steps=3, batch_size=16),
+        validation_every=200,
+        validation_episodes=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def cloned(tmp_path_factory) -> Path:
+    return clone(ENV, 3, tmp_path_factory.mktemp("cloned"), steps=30, width=16)
+
+
+def run(config: LearningConfig, folder: Path, name: str = "gail", count: int | None = None):
+    """Run an algorithm, or go on with it, for at most so many iterations."""
+    one = LearningRun(config, folder, Engine())
+    return list(itertools.islice(LOOPS[name](one, config), count))
+
+
+@pytest.mark.parametrize("name", list(LOOPS))
+def test_a_stopped_run_goes_on_to_the_same_bytes(name, config, tmp_path):
+    whole = run(config, tmp_path / "whole", name)
+    assert len(whole) >= 2
+    first = run(config, tmp_path / "parts", name, 1)
+    rest = run(config, tmp_path / "parts", name)
+    assert [one.to_json() for one in whole] == [one.to_json() for one in (*first, *rest)]
+    for place in ("best", "checkpoints/last"):
+        assert files(tmp_path / "whole" / place) == files(tmp_path / "parts" / place)
+
+
+def test_a_run_leaves_policies_that_act_and_the_best_of_them(config, tmp_path):
+    results = run(config, tmp_path)
+    found = validations(tmp_path)
+    assert list(found) == [one.number for one in results if one.validation is not None]
+    assert results[-1].validation is not None
+    best = tmp_path / "best" / "pretrained_model"
+    assert (results[best_validation(found) - 1].number) == best_validation(found)
+    policy = LearnedPolicy.load(best)
+    assert policy.interface.space == "ee_delta"
+    k = policy.interface.numbers["observation.environment_state"]
+    assert policy.act(np.zeros((1, 8), np.float32), np.zeros((1, k), np.float32)).shape == (1, 8)
+    assert results[-1].steps >= config.steps
+    assert not list(tmp_path.rglob("*.p[kt]*"))
+
+
+def test_a_finished_run_has_nothing_left_to_do_and_may_take_more_steps(config, tmp_path):
+    results = run(config, tmp_path)
+    assert run(config, tmp_path) == []
+    [more] = run(replace(config, steps=results[-1].steps + 1), tmp_path)
+    assert more.number == results[-1].number + 1
+
+
+def test_until_the_warm_up_is_over_a_clone_acts_as_it_did(config, cloned, tmp_path):
+    config = replace(config, start=cloned, warmup=2, validation_every=10**6)
+    second, third = run(config, tmp_path / "warm", count=2)[-1], run(config, tmp_path / "moved", count=3)[-1]
+    assert second.policy != third.policy
+    rng = np.random.default_rng(0)
+    k = LearnedPolicy.load(cloned).interface.numbers["observation.environment_state"]
+    seen = rng.normal(size=(5, 8)).astype(np.float32), rng.normal(size=(5, k)).astype(np.float32)
+    before, warm, moved = (LearnedPolicy.load(one).act(*seen) for one in (cloned, second.policy, third.policy))
+    assert np.array_equal(before, warm)
+    assert not np.array_equal(before, moved)
+    assert list(validations(tmp_path / "warm")) == [0], "the clone itself"
+
+
+def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned, tmp_path):
+    seen = []
+
+    def reward(states, environment_states, actions, next_states, next_environment_states):
+        seen.append([len(states), states.shape[1], actions.shape[1]])
+        assert states.shape == next_states.shape
+        assert environment_states.shape == next_environment_states.shape
+        assert np.isfinite(actions).all()
+        return -np.abs(actions - states).sum(1).astype(np.float32)
+
+    config = replace(config, datasets=(), start=cloned, episode_steps=10, steps=60, warmup=0)
+    results = list(reinforcement(LearningRun(config, tmp_path, Engine(), absorbing=False), reward))
+    assert [one.steps for one in results] == [40, 80]
+    assert seen == [[40, 8, 8]] * 2
+
+
+def test_what_cannot_begin_is_refused(config, cloned, tmp_path):
+    with pytest.raises(UsageError, match=r"give --dataset\.root=DIR or --init=RUN"):
+        LearningRun(replace(config, datasets=()), tmp_path, Engine())
+    with pytest.raises(MismatchError, match=r"joint_delta, --action_space has ee_delta"):
+        LearningRun(replace(config, start=cloned, action_space="ee_delta"), tmp_path, Engine())
+    with pytest.raises(UsageError, match="episodes is 5; expected a multiple"):
+        replace(config, episodes=5)
+    with pytest.raises(UsageError, match="episode_steps is 10; expected at least"):
+        LearningRun(replace(config, episode_steps=10), tmp_path, Engine())

@@ -1,0 +1,75 @@
+"""`manip-il gail` and `airl`: bad input is one line, a run ends with a policy, metrics and a page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.engine.environments import env_spec
+from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.sim.env import EnvConfig
+
+from ..learn.tiny_policies import write_checkpoint
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+
+
+@pytest.mark.parametrize("name", ["gail", "airl"])
+@pytest.mark.parametrize(
+    ("words", "says", "code"),
+    [
+        ("", "--dataset.root names no dataset", 2),
+        ("--dataset.root=nowhere", "nowhere does not exist; expected the folder of a LeRobot dataset", 2),
+        (f"--dataset.root={SAMPLE} --init=nowhere", "no policy in nowhere", 2),
+        (f"--dataset.root={SAMPLE} --steps=0", "steps is 0; expected at least 1", 2),
+        (f"--dataset.root={SAMPLE} --ppo.gamma=2", "ppo.gamma is 2.0; expected 0 to 1", 2),
+        (f"--dataset.root={SAMPLE} --discriminator.regulariser=l2", "unknown discriminator.regulariser 'l2'", 2),
+        (f"--dataset.root={SAMPLE} --seed=-1", "seed is -1", 2),
+        (f"--dataset.root={SAMPLE} --resume=true", "nothing to resume", 2),
+    ],
+)
+def test_bad_input_is_one_line(name, words, says, code, here, error):
+    assert main([name, *words.split(), "--quiet"]) == code
+    assert says in error()
+    assert not any(here.glob("runs/*/checkpoints"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "robot", "says"),
+    [
+        ("act", "same", "is a policy of type 'act'; expected an mlp"),
+        ("mlp", "other", "robot differs: the policy has"),
+    ],
+)
+def test_a_policy_that_cannot_be_gone_on_from_is_refused(kind, robot, says, here, error):
+    from manip_il.data.lerobot_read import read_spec
+
+    own = read_spec(SAMPLE)
+    env = EnvConfig("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
+    spec = env_spec(env)
+    write_checkpoint(here / "policy", kind, spec, meta=CheckpointMeta.of(spec, {}))
+    assert main(["gail", f"--dataset.root={SAMPLE}", "--init=policy", "--quiet"]) != 0
+    assert says in error()
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_a_policy_metrics_and_a_page_and_goes_on(here, capsys):
+    small = "--steps=1 --episodes=2 --ppo.minibatches=1 --ppo.epochs=1 --discriminator.steps=1 --validation_episodes=1"
+    words = ["gail", f"--dataset.root={SAMPLE}", *small.split(), "--output_dir=run", "--quiet"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "validation success" in out
+    assert "next: manip-il eval --policy.path=run" in out
+    [line] = (here / "run" / "metrics.jsonl").read_text().splitlines()
+    record = json.loads(line)
+    assert {"steps", "success", "kl", "return", "discriminator_accuracy_expert", "log_std"} <= record.keys()
+    page = (here / "run" / "report.html").read_text()
+    assert "GAIL on" in page
+    assert "data:image/svg+xml;base64," in page
+    more = record["steps"] + 1
+    assert main([*words, f"--steps={more}", "--resume=true"]) == 0
+    assert [json.loads(one)["iteration"] for one in (here / "run" / "metrics.jsonl").read_text().splitlines()] == [1, 2]
