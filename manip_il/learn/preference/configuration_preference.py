@@ -33,7 +33,7 @@ class PreferenceConfig(RewardModelConfig):
 
     def network_shape(self) -> RewardShape:
         """Return the part that the network is built from."""
-        return RewardShape(self.members, self.width, self.depth, tuple((x, y, z) for x, y, z in self.ways))
+        return RewardShape(self.members, self.width, self.depth, tuple(map(tuple, self.ways)))
 
     @override
     def validate_features(self) -> None:

@@ -23,32 +23,36 @@ MOST_INPUTS, MOST_WAYS = 100_000, 1_000
 class RewardShape:
     """Sizes of the networks. members: of the ensemble; width: units a layer; depth: hidden layers.
 
-    ways: columns x, y and z of inputs that are the way from one thing to another [m]; its length is an input, too. How
-    far things are apart is most of what progress is, and a few hundred answers are few to learn a square root from.
+    ways: columns of inputs that are the way from one thing to another [m], x, y and z or x and y alone; its length is
+    an input, too. How far things are apart is most of what progress is, and a few hundred answers are few to learn a
+    square root from.
     """
 
     members: int = 8
     width: int = 32
     depth: int = 2
-    ways: tuple[tuple[int, int, int], ...] = ()
+    ways: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         checks.whole("members", self.members, LEAST_MEMBERS, MOST_MEMBERS)
         checks.whole("width", self.width, 1, MOST_UNITS)
         checks.whole("depth", self.depth, 1, MOST_LAYERS)
         for way in checks.array("ways", self.ways, MOST_WAYS):
-            if len(checks.array("a way", way, 3)) != 3:
-                raise ManipError(f"a way is {checks.shorten(way)}; expected columns of x, y and z")
+            if len(checks.array("a way", way, 3)) < 2:
+                raise ManipError(f"a way is {checks.shorten(way)}; expected columns of x, y and z, or of x and y")
             for column in way:
                 checks.whole("column of a way", column, 0, MOST_INPUTS - 1)
 
 
-def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, int, int], ...]:
-    """Return the columns of every way in a dataset's environment state, such as `goal_from_object`, after its state."""
+def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
+    """Return the columns of every way in a dataset's environment state, such as `goal_from_object`, after its state.
+
+    Each once in space and once over the table: hands approach from above.
+    """
     place = {name: len(spec.joint_names) + at for at, name in enumerate(spec.environment_state_names)}
     names = [name.removesuffix(".x") for name in place if "_from_" in name and name.endswith(".x")]
-    axes = [tuple(f"{name}.{axis}" for axis in "xyz") for name in names]
-    return tuple((place[x], place[y], place[z]) for x, y, z in axes if {x, y, z} <= place.keys())
+    axes = [[f"{name}.{axis}" for axis in plane] for name in names for plane in ("xyz", "xy")]
+    return tuple(tuple(place[one] for one in way) for way in axes if set(way) <= place.keys())
 
 
 class RewardNetwork(nn.Module):
@@ -64,8 +68,7 @@ class RewardNetwork(nn.Module):
         super().__init__()
         if any(column >= inputs for way in shape.ways for column in way):
             raise ManipError(f"a way has column {max(map(max, shape.ways))}; there are {inputs} inputs")
-        ways = torch.tensor(shape.ways, dtype=torch.int64).reshape(-1, 3)
-        self.register_buffer("ways", ways, persistent=False)
+        self.ways = [list(way) for way in shape.ways]
         inputs += len(shape.ways)
         sizes = [inputs, *[shape.width] * shape.depth, 1]
         layers = list(itertools.pairwise(sizes))
@@ -86,7 +89,7 @@ class RewardNetwork(nn.Module):
 
     def features(self, inputs: Tensor) -> Tensor:
         """Return inputs (B, d) with the lengths of their ways, (B, d + K)."""
-        return torch.cat([inputs, inputs[:, self.ways].norm(dim=-1)], dim=-1)
+        return torch.cat([inputs, *(inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways)], dim=-1)
 
     def members(self, inputs: Tensor) -> Tensor:
         """Return each network's reward, (M, B), of inputs (B, d), in the units in which preferences are log-odds."""
