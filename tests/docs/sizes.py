@@ -40,13 +40,10 @@ GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 3
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
     "robot check": {"episodes": 1},
-<<<<<<< HEAD
     "preferences pairs": {"count": 12},
     "preferences fit": {"members": 3},
-=======
     "gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
     "airl": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
->>>>>>> gail
     "redraw": {"frames": 30, "image.height": 96, "image.width": 96},  # diffusion cuts out 84 x 84 pixels
     "view": {"output": "seen.rrd"},  # a viewer that is served lives as long as its process, which runs all the lines
 }
