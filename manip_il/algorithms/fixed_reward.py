@@ -3,22 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Protocol
-
-from manip_il.mdp import F32, F64
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from manip_il.algorithms.learning_run import Iteration, LearningRun
-
-
-class Reward(Protocol):
-    """A reward of control steps, as a dataset has them."""
-
-    def __call__(
-        self, states: F32, environment_states: F32, actions: F64, next_states: F32, next_environment_states: F32
-    ) -> F32:
-        """Return rewards (B,) of joint states (B, n), environment states (B, k), absolute actions (B, n), and after."""
-        ...
+    from manip_il.learn.reward import Reward
 
 
 def reinforcement(run: LearningRun, reward: Reward) -> Iterator[Iteration]:

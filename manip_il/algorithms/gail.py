@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def gail(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:
     """Yield every iteration: roll out the learner, tell it from the expert, improve it where it is taken for him."""
-    d = run.keep(lambda actor: GailDiscriminator(c.discriminator, actor, c.reward))
+    d = run.keep(lambda actor: GailDiscriminator(c.discriminator, actor, c.reward_form))
     for i in run.iterations():
         learner = run.rollouts(i)
         run.discriminate(d, learner)

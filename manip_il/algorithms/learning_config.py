@@ -28,7 +28,8 @@ class LearningConfig:
     steps: int = option(200_000, "simulated control steps in all")
     episodes: int = option(32, "of an iteration, side by side")
     episode_steps: int = option(
-        0, "control steps of an episode while learning; 0: half as many again as the longest demonstration has"
+        0,
+        "control steps of an episode while learning; 0: 1.5 times the longest demonstration's, or the horizon",
     )
     action_space: str | None = option(
         None, "what the policy's actions are: ee_delta, joint_delta or joint_target; by default ee_delta, or --init's"
@@ -40,7 +41,7 @@ class LearningConfig:
     warmup: int | None = option(
         None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init"
     )
-    reward: str = option("logit", ", ".join(REWARDS))
+    reward_form: str = option("logit", ", ".join(REWARDS))
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     validation_every: int = option(20_000, "steps from one validation to the next")

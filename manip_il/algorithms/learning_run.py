@@ -47,7 +47,7 @@ from manip_il.learn.ppo import Learner, lent_generators
 from manip_il.learn.start import start_conversion, start_policy
 from manip_il.learn.train import save_policy
 from manip_il.learn.transitions import Demonstrations, Transitions, read_demonstrations
-from manip_il.mdp import F32, F64
+from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
 VALIDATION = "validation"
@@ -152,15 +152,11 @@ class LearningRun:
         self._metrics["absorbing"] = float(self._rows.absorbing.mean())
         return self._rows
 
-    def executed(self) -> tuple[F32, F32, F64, F32, F32]:
-        """Return the last rollouts as datasets have them.
-
-        That is joint states (N, n), environment states (N, k), actions (N, n), and both states after these.
-        """
+    def executed(self) -> tuple[F32, F32, F32]:
+        """Return joint states (N, n), environment states (N, k) and absolute actions (N, n) of the last rollouts."""
         n = len(self._spec.joint_names)
-        before, after = self._rows.states[:, :-1], self._rows.next_states[:, :-1]
-        actions = np.concatenate(self._envs.executed)
-        return before[:, :n], before[:, n:], actions, after[:, :n], after[:, n:]
+        states = self._rows.states[:, :-1]
+        return states[:, :n], states[:, n:], np.concatenate(self._envs.executed).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
         """Return the log-density of rows' actions for the learner [nats], (N,)."""

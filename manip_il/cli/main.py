@@ -60,6 +60,7 @@ COMMANDS = {
         "manip_il.cli.adversarial:GailOptions", "imitate by GAIL: reinforcement learning from demonstrations"
     ),
     "airl": Command("manip_il.cli.adversarial:AirlOptions", "imitate by AIRL, which learns a reward, too"),
+    "ppo": Command("manip_il.cli.ppo:PpoOptions", "improve a cloned policy on a reward learnt from preferences"),
     "preferences pairs": Command("manip_il.cli.preferences:PairsOptions", "choose pairs of clips to compare"),
     "preferences ask": Command("manip_il.cli.preferences:AskOptions", "make a page that asks which clip is better"),
     "preferences answer": Command(
