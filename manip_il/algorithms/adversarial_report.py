@@ -1,4 +1,4 @@
-"""The page of `manip-il gail` and `manip-il airl`."""
+"""The page of `manip-il gail`, `airl` and `ppo`."""
 
 from __future__ import annotations
 
@@ -65,14 +65,15 @@ def _validation_figure(found: Mapping[int, EvalResult], steps: Mapping[int, int]
 
 
 def _learning_figure(records: Records) -> Figure:
-    with drawing(3, 2, size=(2.6, 2.0)) as (drawn, axes):
-        for axis, (title, lines) in zip(axes.ravel(), _PANELS, strict=False):
+    panels = [(title, lines) for title, lines in _PANELS if any(key in record for record in records for key in lines)]
+    with drawing(-(-len(panels) // 2), 2, size=(2.6, 2.0)) as (drawn, axes):
+        for axis, (title, lines) in zip(axes.ravel(), panels, strict=False):
             for colour, (key, label) in zip(ARMS, lines.items(), strict=False):
                 points = [(record["steps"], record[key]) for record in records if record.get(key) is not None]
                 axis.plot(*zip(*points, strict=True), color=colour, lw=1.2, label=label) if points else None
             axis.set(title=title)
             if len(lines) > 1:
                 axis.legend()
-        for axis in axes.ravel()[len(_PANELS) :]:
+        for axis in axes.ravel()[len(panels) :]:
             axis.remove()
-        return to_figure(drawn, "Success, discriminator, return, distance and spread over simulated steps")
+        return to_figure(drawn, "How the learner changed over simulated steps")

@@ -1,0 +1,73 @@
+"""`manip-il ppo`: a clone goes on from a reward learnt from preferences, of the same robot and task."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from manip_il.cli.main import main
+from manip_il.engine.environments import env_spec
+from manip_il.learn.preference.modeling_preference import write_reward
+from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
+from manip_il.sim.env import EnvConfig
+
+from ..engine.clones import clone
+
+ENV = EnvConfig("fetch", "reach")
+
+
+def reward(folder: Path, env: EnvConfig = ENV) -> Path:
+    """A reward for an environment, whose weights nobody has learnt."""
+    spec = env_spec(env)
+    shape = RewardShape(members=3, width=4, ways=ways_of(spec))
+    torch.manual_seed(0)
+    width = 2 * len(spec.joint_names) + len(spec.environment_state_names)
+    folder.mkdir(parents=True)
+    write_reward(folder, RewardNetwork(width, shape), shape, spec, {}, {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cloned(tmp_path_factory) -> Path:
+    return clone(ENV, 2, tmp_path_factory.mktemp("cloned"), steps=5, width=16)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("", "--init is missing; expected the run of a cloned mlp"),
+        ("--init=runs/cloned", "--reward is missing; expected a folder of manip-il preferences fit"),
+        ("--init=nowhere --reward=nowhere", "no policy in nowhere"),
+    ],
+)
+def test_bad_input_is_one_line(words, says, here, error):
+    assert main(["ppo", *words.split(), "--quiet"]) == 2
+    assert says in error()
+
+
+@pytest.mark.slow
+def test_a_reward_that_is_not_the_policys_is_refused(here, cloned, error):
+    assert main(["ppo", f"--init={cloned}", "--reward=nowhere", "--quiet"]) == 2
+    assert "nowhere does not exist; expected a reward of manip-il preferences fit" in error()
+    assert main(["ppo", f"--init={cloned}", f"--reward={cloned}", "--quiet"]) == 1
+    assert "is of type 'mlp'; expected a reward" in error()
+    reward(here / "lift", replace(ENV, task="lift", horizon=0))
+    assert main(["ppo", f"--init={cloned}", "--reward=lift", "--quiet"]) == 1
+    assert "task differs" in error()
+
+
+@pytest.mark.slow
+def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
+    reward(here / "reward")
+    small = "--steps=1 --episodes=2 --episode_steps=4 --warmup=0 --ppo.minibatches=1 --ppo.epochs=1"
+    words = ["ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
+    assert main([*words, "--output_dir=run", "--quiet"]) == 0
+    assert "next: manip-il eval --policy.path=run" in capsys.readouterr().out
+    [record] = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())
+    assert record["steps"] == 8, "episodes go on after success"
+    assert (here / "run" / "best" / "pretrained_model" / "model.safetensors").is_file()
+    assert "PPO on" in (here / "run" / "report.html").read_text()
