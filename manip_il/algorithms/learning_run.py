@@ -181,9 +181,10 @@ class LearningRun:
     def improve(self, rewards: F32) -> None:
         """Let PPO learn from the rewards (N,) of the last rollouts."""
         self._metrics["return"] = float(rewards.sum() / self.config.episodes)
+        remaining = max(0.0, 1.0 - self._simulated / self.config.steps)
         moves = self._number > self.config.warmup_iterations
         with threads(1), lent_generators(self._stream(self._number, "updates")):
-            self._metrics |= self._learner.improve(rewards, actor=moves)
+            self._metrics |= self._learner.improve(rewards, actor=moves, remaining=remaining)
 
     def finish(self) -> Iteration:
         """Write the iteration, which ends it; validate its policy where that is due."""

@@ -34,7 +34,7 @@ class LearningOptions:
     title: ClassVar[str]
     name: ClassVar[str]
     init: Path | None = option(None, "a cloned mlp, or its run, to begin with; by default a new policy")
-    steps: int = option_of(LearningConfig, "steps", help_text="simulated control steps; a resumed run may have more")
+    steps: int = option_of(LearningConfig, "steps")
     episodes: int = option_of(LearningConfig, "episodes")
     episode_steps: int = option_of(LearningConfig, "episode_steps")
     action_space: Literal["ee_delta", "joint_delta", "joint_target"] | None = option_of(LearningConfig, "action_space")
@@ -66,7 +66,7 @@ class LearningOptions:
         from manip_il.engine.engine import Engine
 
         config = self.config()
-        with open_output(self, FREE, may_grow="steps") as folder:
+        with open_output(self, FREE) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, Engine(self.workers) as engine:
                 self._learn(config, folder, engine, stages)

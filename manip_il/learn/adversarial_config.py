@@ -16,9 +16,9 @@ REWARDS = ("logit", "log_d", "minus_log_one_minus_d")
 class PPOConfig:
     """Options of PPO, by its paper's names. Raises `UsageError` for a value out of range."""
 
-    lr: float = option(1e-3, "learning rate of actor and critic")
-    epochs: int = option(6, "passes over an iteration's steps")
-    minibatches: int = option(8, "gradient steps in one pass")
+    lr: float = option(5e-4, "first learning rate of actor and critic; it falls linearly to a twentieth over the run")
+    epochs: int = option(10, "passes over an iteration's steps")
+    minibatches: int = option(4, "gradient steps in one pass")
     gamma: float = option(0.9, "discount of a control step")
     gae_lambda: float = option(0.95, "of generalised advantage estimation")
     clip_range: float = option(0.2, "of the ratio of densities")

@@ -29,6 +29,7 @@ from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.transitions import F32, Transitions
 
+LAST_LR = 0.05  # share of the first learning rate that is left at the end
 _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/explained_variance": "explained_variance"}
 
 
@@ -49,7 +50,7 @@ class Learner:
         self.ppo = PPO(
             ActorCritic,
             env,
-            learning_rate=config.lr,
+            learning_rate=lambda remaining: config.lr * max(LAST_LR, remaining),
             n_steps=horizon,
             batch_size=env.num_envs * horizon // config.minibatches,
             n_epochs=config.epochs,
@@ -85,10 +86,10 @@ class Learner:
         actions = np.clip(buffer.actions, *self._bounds).reshape(len(states), -1) * (1.0 - states[:, -1:])
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
 
-    def improve(self, rewards: F32, *, actor: bool = True) -> dict[str, float]:
+    def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
 
-        actor: whether it moves, beside the critic. Raises `NotFiniteError` for a reward that is not finite.
+        actor: whether it moves, beside the critic. remaining: share of the run, which the learning rate falls with. Raises `NotFiniteError` for a reward that is not finite.
         """
         if not np.isfinite(rewards).all():
             raise NotFiniteError(f"a reward is {rewards[~np.isfinite(rewards)][0]}; expected finite numbers")
@@ -97,6 +98,7 @@ class Learner:
         ends = np.ones(buffer.n_envs, dtype=bool)
         buffer.compute_returns_and_advantage(torch.zeros(buffer.n_envs), ends)
         self.network.requires_grad_(actor)
+        self.ppo._current_progress_remaining = remaining
         self.ppo.train()
         values = self.ppo.logger.name_to_value
         found = {ours: float(values[theirs]) for theirs, ours in _METRICS.items()}

@@ -70,6 +70,5 @@ def test_a_run_ends_with_a_policy_metrics_and_a_page_and_goes_on(here, capsys):
     page = (here / "run" / "report.html").read_text()
     assert "GAIL on" in page
     assert "data:image/svg+xml;base64," in page
-    more = record["steps"] + 1
-    assert main([*words, f"--steps={more}", "--resume=true"]) == 0
-    assert [json.loads(one)["iteration"] for one in (here / "run" / "metrics.jsonl").read_text().splitlines()] == [1, 2]
+    assert main([*words, "--resume=true"]) == 0
+    assert (here / "run" / "metrics.jsonl").read_text().splitlines() == [line]
