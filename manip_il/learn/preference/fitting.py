@@ -25,7 +25,7 @@ from manip_il.learn.preference.network import RewardNetwork, RewardShape
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 BY_CHANCE = 0.1  # E
-_LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 32
+_LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 16
 _EPOCHS, _PATIENCE = 200, 15
 _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
 
