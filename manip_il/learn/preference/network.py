@@ -63,6 +63,10 @@ class RewardNetwork(nn.Module):
     """
 
     CLAMP = 5.0
+    mean: Tensor
+    std: Tensor
+    low: Tensor
+    high: Tensor
 
     def __init__(self, inputs: int, shape: RewardShape) -> None:
         super().__init__()
