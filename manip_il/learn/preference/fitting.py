@@ -60,9 +60,9 @@ def fit_reward(
 ) -> Fit:
     """Fit the networks to answers; inputs: of every frame, (N, d).
 
-    The pairs are dealt into as many folds as there are networks: network m leaves fold m out and learns from the others.
-    All stop at the epoch at which the loss on what they leave out is lowest. The same arguments give the same bits. Raises `ManipError` for fewer pairs than
-    networks.
+    The pairs are dealt into as many folds as there are networks: network m leaves fold m out and learns from the
+    others. All stop at the epoch at which the loss on what they leave out is lowest. The same arguments give the same
+    bits. Raises `ManipError` for fewer pairs than networks.
     """
     folds = deal(compared.pair, shape.members, seed)
     with threads(1):
