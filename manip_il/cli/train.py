@@ -109,11 +109,11 @@ class TrainOptions:
         with contextlib.ExitStack() as held:
             root = self._redrawn(held) if self.redraw else None
             spec, fingerprint, sources = self._read_sources(lerobot, (root,) if root else tuple(self.dataset.root))
+            weights = self._frame_weights(lerobot, sources.roots[0])
             if root is None:
                 self._prepare(held)
-            weights = self._frame_weights(lerobot, sources.roots[0])
             fit = self._fit_mlp if config.is_mlp else self._fit_policy
-            path = fit(config, spec, fingerprint, sources, weights)
+            path = fit(config, {"spec": spec, "fingerprint": fingerprint, "sources": sources, "weights": weights})
         if _is_first_process():
             say(f"checkpoint: {path}")
             robot = common.own_robot(spec.robot, suffix=".yaml")
@@ -202,58 +202,40 @@ class TrainOptions:
         steps = config.steps_per_checkpoint
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
-    def _fit_mlp(
-        self,
-        config: FitConfig,
-        spec: Any,
-        fingerprint: Mapping[str, Any],
-        sources: Sources,
-        weights: NDArray[np.float64] | None,
-    ) -> Path:
+    def _fit_mlp(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
         from manip_il.data.lerobot_read import read_tables
         from manip_il.learn.columns import LEARNING_COLUMNS
         from manip_il.learn.train import fit
 
         with self._begin(config) as stages:
-            table = read_tables(sources.roots, (*LEARNING_COLUMNS, "frame_index"))
+            roots = data["sources"].roots
+            table = read_tables(roots, (*LEARNING_COLUMNS, "frame_index"))
             stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
             return fit(
                 table,
                 config,
                 self.output_dir,
-                spec=spec,
-                fingerprint=fingerprint,
                 on_log=stages.log,
                 resume=self.resume,
-                weights=weights,
-                sources=sources,
-                repo_id=f"local/{'_'.join(root.name for root in sources.roots)}",
+                repo_id=f"local/{'_'.join(root.name for root in roots)}",
+                **data,
             )
 
-    def _fit_policy(
-        self,
-        config: FitConfig,
-        spec: Any,
-        fingerprint: Mapping[str, Any],
-        sources: Sources,
-        weights: NDArray[np.float64] | None,
-    ) -> Path:
+    def _fit_policy(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
         from manip_il.learn.fit_policy import begin_fit
 
+        roots = data["sources"].roots
         with contextlib.ExitStack() as stack:
             with self._decoding() as on_frames:
                 trainer = stack.enter_context(
                     begin_fit(
-                        sources.roots,
+                        roots,
                         config,
                         self.output_dir,
-                        spec=spec,
-                        fingerprint=fingerprint,
-                        look=_look(sources.roots),
+                        look=_look(roots),
                         resume=self.resume,
-                        weights=weights,
-                        sources=sources,
                         on_frames=on_frames,
+                        **data,
                     )
                 )
             stages = stack.enter_context(self._begin(config))

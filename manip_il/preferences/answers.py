@@ -26,7 +26,7 @@ _LONGEST_WHO = 200  # characters
 
 @dataclass(frozen=True)
 class Answer:
-    """What was answered about a pair, by its number. when: ISO 8601; None of a simulated teacher."""
+    """An answer about a pair, by its number. when: ISO 8601; None of a simulated teacher."""
 
     pair: int
     answer: str

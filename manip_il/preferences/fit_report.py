@@ -87,9 +87,9 @@ def fit_report(
                 tables=(agreement_table(found),),
                 notes=(
                     f"{found.shape.members} networks of {found.shape.depth} x {found.shape.width}; the pairs are dealt "
-                    f"into as many folds. Each network leaves one fold out, from which its numbers above are, and "
-                    f"another chose where to stop: epoch {found.fit.epochs}. The reward is their mean, which has seen "
-                    "every pair.",
+                    "into as many folds. Each network leaves one fold out, from which its numbers above are; all "
+                    f"stopped at epoch {found.fit.epochs}, where the loss on these was lowest. The reward is their "
+                    "mean, which has seen every pair.",
                 ),
             ),
             Section(

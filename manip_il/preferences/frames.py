@@ -52,7 +52,7 @@ class Frames:
 
     @cached_property
     def inputs(self) -> F32:
-        """What a reward is a function of, (N, n + k + n): state, environment state and action."""
+        """Inputs of a reward, (N, n + k + n): state, environment state and action."""
         return np.concatenate([self.states, self.environment_states, self.actions], axis=1)
 
     def rows(self, episode: int) -> slice:

@@ -46,7 +46,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Clip:
-    """Where a clip begins: number of the source, of its episode, and of the episode's frame."""
+    """The beginning of a clip: number of the source, of its episode, and of the episode's frame."""
 
     source: int
     episode: int
@@ -158,7 +158,7 @@ class Clips:
 
     @cached_property
     def inputs(self) -> NDArray[np.float32]:
-        """What a reward is a function of, of all frames, (N, d)."""
+        """Inputs of a reward, of all frames, (N, d)."""
         return np.concatenate([one.inputs for one in self.frames])
 
     @cached_property

@@ -76,7 +76,7 @@ class Scores:
             return None
         from scipy.stats import spearmanr
 
-        return float(spearmanr(self.frames, self.data.progress).statistic)
+        return float(spearmanr(self.frames, self.data.progress)[0])
 
     def worst(self, count: int) -> list[int]:
         """Return the numbers of the episodes with the lowest scores, lowest first."""

@@ -57,7 +57,7 @@ def test_a_pair_is_held_out_whole_and_every_fold_is_in_turn():
 
 
 def test_what_is_said_of_a_held_out_pair_does_not_depend_on_its_answer(clips, answers):
-    """Answers of one fold turned round change the networks that learn from them or stop by them, not the held-out one.
+    """Answers of one fold turned round change the networks that learn from them, not the one that leaves them out.
 
     The number of epochs is chosen by all answers, so both fits are of one epoch.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,16 +30,11 @@ from manip_il.preferences.scores import Scores, episode_scores, roc_auc, write_w
 def scored(datasets) -> Scores:
     """Both datasets as one, scored by true progress with a little noise."""
     good, bad = (read_frames(datasets / name) for name in ("good", "bad"))
-    data = Frames(
-        good.spec,
-        *(np.concatenate([getattr(one, name) for one in (good, bad)]) for name in ("states", "environment_states")),
-        np.concatenate([good.actions, bad.actions]),
-        np.concatenate([good.episodes, bad.episodes + 8]),
-        np.concatenate([good.progress, bad.progress]),
-        np.concatenate([good.success, bad.success]),
-    )
+    columns = ("states", "environment_states", "actions", "progress", "success")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in (good, bad)]) for name in columns}
+    data = Frames(good.spec, episodes=np.concatenate([good.episodes, bad.episodes + 8]), **joined)
     noise = np.random.default_rng(0).normal(size=len(data.states)) * 0.02
-    return Scores("both", "a test", data.spec, data, np.clip(data.progress + noise, 0, 1))
+    return Scores("both", "a test", data.spec, data, np.clip(joined["progress"] + noise, 0, 1))
 
 
 def test_the_area_under_the_curve_is_the_share_of_pairs_in_order():

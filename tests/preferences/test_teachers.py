@@ -25,8 +25,9 @@ def many(datasets):
 def share_right(teacher: str, clips) -> float:
     """Share of answers left or right that are the better clip by true progress."""
     given = np.array(Teacher.parse(teacher).answers(clips, np.random.default_rng(3)))
-    told = np.isin(given, ("left", "right"))
-    return float(((given == "left") == (true_difference(clips) > 0))[told].mean())
+    told, difference = np.isin(given, ("left", "right")), true_difference(clips)
+    assert difference is not None
+    return float(((given == "left") == (difference > 0))[told].mean())
 
 
 def test_the_perfect_teacher_prefers_the_clip_with_more_progress(many):

@@ -25,7 +25,7 @@ from manip_il.learn.preference.network import RewardNetwork, RewardShape
 
 F32, F64, I64 = NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]
 BY_CHANCE = 0.1  # E
-_LR, _WEIGHT_DECAY, _BATCH = 5e-4, 1.0, 16
+_LR, _WEIGHT_DECAY, _BATCH = 1e-4, 1.0, 16
 _EPOCHS, _PATIENCE = 200, 15
 _RANGE = (0.01, 0.99)  # quantiles of the frames' rewards that become 0 and 1
 
@@ -45,7 +45,7 @@ class Compared:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Networks, and what those say of a pair that neither learnt from it nor stopped by it.
+    """Networks, and what the one that did not learn from a pair says of it.
 
     logits: R(left) - R(right) of every answer, (A,). epochs: that the networks were trained for.
     """
@@ -60,9 +60,9 @@ def fit_reward(
 ) -> Fit:
     """Fit the networks to answers; inputs: of every frame, (N, d).
 
-    The pairs are dealt into as many folds as there are networks: network m leaves fold m out, stops by fold m + 1, and
-    learns from the others. The same arguments give the same bits. Raises `ManipError` for fewer pairs than
-    networks.
+    The pairs are dealt into as many folds as there are networks: network m leaves fold m out and learns from the
+    others. All stop at the epoch at which the loss on what they leave out is lowest. The same arguments give the same
+    bits. Raises `ManipError` for fewer pairs than networks.
     """
     folds = deal(compared.pair, shape.members, seed)
     with threads(1):
@@ -97,12 +97,12 @@ def _train(
 ) -> int:
     """Train all networks at once, each on its own folds; return the epoch with the lowest loss, and go back to it.
 
-    One epoch for all: the loss by which it is chosen is that of every network on its own fold, so of every answer once.
-    A single fold of some 25 answers would choose by chance.
+    The loss by which it is chosen is that of every network on the fold that it leaves out, so of every answer once: one
+    number for all networks, as a single fold of some 25 answers would choose by chance.
     """
     member = np.arange(len(network.weights[0]))[:, None]
-    stops = torch.from_numpy(folds == (member + 1) % len(member))
-    learns = (torch.from_numpy(folds != member) & ~stops).float()
+    left_out = torch.from_numpy(folds == member)
+    learns = (~left_out).float()
     better = torch.from_numpy(compared.better).float()
     optimizer = torch.optim.AdamW(network.parameters(), lr=_LR, weight_decay=_WEIGHT_DECAY)
     lowest, best = math.inf, 0
@@ -117,7 +117,7 @@ def _train(
         with torch.no_grad():
             losses = answer_losses(_logits(network, inputs, compared, slice(None)), better)
         on_epoch()
-        if (loss := losses[stops].mean().item()) < lowest:
+        if (loss := losses[left_out].mean().item()) < lowest:
             lowest, best = loss, epoch
             kept = copy.deepcopy(network.state_dict())
         elif epoch - best >= _PATIENCE:

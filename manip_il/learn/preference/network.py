@@ -14,7 +14,7 @@ from manip_il import checks
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError
 
-LEAST_MEMBERS, MOST_MEMBERS = 3, 64  # each learns from some folds of pairs, stops by one and leaves one out
+LEAST_MEMBERS, MOST_MEMBERS = 3, 64  # each leaves one fold of the pairs out
 MOST_UNITS, MOST_LAYERS = 1_024, 8
 MOST_INPUTS, MOST_WAYS = 100_000, 1_000
 
@@ -63,6 +63,10 @@ class RewardNetwork(nn.Module):
     """
 
     CLAMP = 5.0
+    mean: Tensor
+    std: Tensor
+    low: Tensor
+    high: Tensor
 
     def __init__(self, inputs: int, shape: RewardShape) -> None:
         super().__init__()
