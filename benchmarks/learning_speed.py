@@ -27,6 +27,7 @@ from manip_il.engine.engine import Engine
 from manip_il.engine.vector_env import RobotEpisode
 from manip_il.learn.discriminators import GailDiscriminator
 from manip_il.sim.config import EnvConfig
+from manip_il.sim.env import ManipEnv
 
 SCENES = (("panda", "reach"), ("panda", "pick_place"), ("fetch", "pick_place"))
 NEVER = 10**9
@@ -34,6 +35,8 @@ NEVER = 10**9
 
 class Recorded(RobotEpisode):
     """Keeps where the episode began and its controls."""
+
+    _env: ManipEnv
 
     def start(self, seed: int) -> None:
         super().start(seed)
@@ -74,7 +77,8 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     env = EnvConfig(robot, task)
     config = LearningConfig(env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
-    run.envs.episodes = [Recorded(env, run.conversion, None) for _ in range(config.episodes)]
+    recorded = [Recorded(env, run.conversion, None) for _ in range(config.episodes)]
+    run.envs.episodes = list(recorded)
     d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
     found = []
     for number, _ in zip(run.iterations(), range(iterations), strict=False):
@@ -85,7 +89,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
         run.improve(d.reward(learner, run.log_prob(learner)))
         run.finish()
         times.append(time.process_time())
-        for episode in run.envs.episodes:
+        for episode in recorded:
             episode.replay()
         times.append(time.process_time())
         acting, learning, raw = np.diff(times)

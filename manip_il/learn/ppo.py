@@ -78,7 +78,7 @@ class Learner:
         """Run one episode in every environment; return all steps, those of a time together."""
         env, buffer = self.ppo.env, self.ppo.rollout_buffer
         assert env is not None
-        self.ppo._last_obs = env.reset()
+        self.ppo._last_obs = np.asarray(env.reset())
         self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
         after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
