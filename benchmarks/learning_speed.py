@@ -78,7 +78,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     config = LearningConfig(env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
     recorded = [Recorded(env, run.conversion, None) for _ in range(config.episodes)]
-    run.envs.episodes = list(recorded)
+    run.envs.episodes = recorded
     d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
     found = []
     for number, _ in zip(run.iterations(), range(iterations), strict=False):
