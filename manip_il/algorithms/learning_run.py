@@ -92,25 +92,19 @@ class LearningRun:
         self._validated_at = 0
         spec = read_spec(config.datasets[0]) if config.datasets else env_spec(config.env)
         self._spec = spec
-        self._conversion = start_conversion(config.start, config.action_space, spec)
-        demonstrations = read_demonstrations(config.datasets, self._conversion.encode) if config.datasets else None
+        self.conversion = start_conversion(config.start, config.action_space, spec)
+        demonstrations = read_demonstrations(config.datasets, self.conversion.encode) if config.datasets else None
+        rows = demonstrations.stacked if demonstrations else None
+        self.horizon = _episode_steps(config, demonstrations)
+        hold = demonstrations.hold if demonstrations and absorbing else None
         with threads(1), lent_generators(self._stream(0, "weights")):
-            self._policy = start_policy(
-                config.start, self._conversion.space, spec, stream_base("training", config.seed),
-                demonstrations.stacked if demonstrations else None,
-            )  # fmt: skip
-            network = self._policy.model
-            names = ("target_mean", "target_scale", "target_low", "target_high")
-            self._actions = ActionRange(*(getattr(network, name).numpy().copy() for name in names))
-            self.horizon = _episode_steps(config, demonstrations)
-            hold = demonstrations.hold if demonstrations and absorbing else None
-            self._envs = Lockstep(
-                [RobotEpisode(config.env, self._conversion, hold) for _ in range(config.episodes)],
-                self._actions, self.horizon,
-            )  # fmt: skip
-            self._learner = Learner(network, config.ppo, self._envs, self.horizon, config.first_log_std)
+            seed = stream_base("training", config.seed)
+            self._policy = start_policy(config.start, self.conversion.space, spec, seed, rows)
+            self._actions = _action_range(self._policy.model)
+            episodes = [RobotEpisode(config.env, self.conversion, hold) for _ in range(config.episodes)]
+            self.envs = Lockstep(episodes, self._actions, self.horizon)
+            self._learner = Learner(self._policy.model, config.ppo, self.envs, self.horizon, config.first_log_std)
         self._expert = demonstrations.padded(self.horizon, self._actions.normalised) if demonstrations else None
-        self.frames = len(demonstrations.stacked[0]) if demonstrations else 0
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:
         """Return a discriminator that belongs to the run and is saved with it. make: of the actor's network."""
@@ -144,11 +138,11 @@ class LearningRun:
         """Run the learner's episodes of an iteration; return all steps, those of absorbing states too."""
         self._number = number
         seeds = stream_seeds("reinforcement", number * self.config.episodes, self.config.seed)
-        self._envs.seeds = seeds[-self.config.episodes :]
+        self.envs.seeds = seeds[-self.config.episodes :]
         with threads(1), lent_generators(self._stream(number, "rollouts")):
             self._rows = self._learner.collect()
-        self._simulated += self._envs.simulated
-        self._metrics["success"] = float(self._envs.solved.mean())
+        self._simulated += self.envs.simulated
+        self._metrics["success"] = float(self.envs.solved.mean())
         self._metrics["absorbing"] = float(self._rows.absorbing.mean())
         return self._rows
 
@@ -156,7 +150,7 @@ class LearningRun:
         """Return joint states (N, n), environment states (N, k) and absolute actions (N, n) of the last rollouts."""
         n = len(self._spec.joint_names)
         states = self._rows.states[:, :-1]
-        return states[:, :n], states[:, n:], np.concatenate(self._envs.executed).astype(np.float32)
+        return states[:, :n], states[:, n:], np.concatenate(self.envs.executed).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
         """Return the log-density of rows' actions for the learner [nats], (N,)."""
@@ -189,11 +183,11 @@ class LearningRun:
     def finish(self) -> Iteration:
         """Write the iteration, which ends it; validate its policy where that is due."""
         meta = CheckpointMeta.of(
-            self._spec, env_fingerprint(self.config.env), self._options(), action_space=self._conversion.space
+            self._spec, env_fingerprint(self.config.env), self._options(), action_space=self.conversion.space
         )
         step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
         with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
-            save_policy(self._policy, self._conversion, new / PRETRAINED_MODEL)
+            save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
             write_own_files(new, meta, step | {"validated_at": self._validated_at})
@@ -273,3 +267,9 @@ def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None
     if config.episode_steps or demonstrations is None:
         return config.episode_steps or config.env.horizon
     return min(config.env.horizon, math.ceil(LONGER * demonstrations.longest))
+
+
+def _action_range(network: MLPNetwork) -> ActionRange:
+    """Units and range of the network's targets."""
+    names = ("target_mean", "target_scale", "target_low", "target_high")
+    return ActionRange(*(getattr(network, name).numpy().copy() for name in names))

@@ -129,7 +129,8 @@ class Lockstep(VecEnv):
     """
 
     def __init__(self, episodes: Sequence[Simulated], actions: ActionRange, horizon: int):
-        self.episodes, self.actions, self.horizon = list(episodes), actions, horizon
+        self.episodes: Sequence[Simulated] = list(episodes)
+        self.actions, self.horizon = actions, horizon
         self.seeds: Sequence[int] = range(len(episodes))
         self.simulated, self._step, self._given = 0, 0, np.empty((0, 0), np.float32)
         self.executed: list[F64] = []

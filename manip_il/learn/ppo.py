@@ -78,7 +78,7 @@ class Learner:
         """Run one episode in every environment; return all steps, those of a time together."""
         env, buffer = self.ppo.env, self.ppo.rollout_buffer
         assert env is not None
-        self.ppo._last_obs = env.reset()
+        self.ppo._last_obs = np.asarray(env.reset())
         self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
         after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
@@ -89,7 +89,8 @@ class Learner:
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
 
-        actor: whether it moves, beside the critic. remaining: share of the run, which the learning rate falls with. Raises `NotFiniteError` for a reward that is not finite.
+        actor: whether it moves, beside the critic. remaining: share of the run, with which the learning rate falls.
+        Raises `NotFiniteError` for a reward that is not finite.
         """
         if not np.isfinite(rewards).all():
             raise NotFiniteError(f"a reward is {rewards[~np.isfinite(rewards)][0]}; expected finite numbers")

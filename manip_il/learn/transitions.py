@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from manip_il.data.lerobot_read import read_table, read_tables
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
-from manip_il.learn.columns import EPISODE_INDEX
+from manip_il.learn.columns import EPISODE_INDEX, Table, require_finite
 from manip_il.mdp import Actor
 
 F32 = NDArray[np.float32]
+_TELLING = (LABEL_VALID, ACTOR, SUCCESS)  # columns that say whether an episode is a demonstration
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +65,14 @@ class Transitions:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, and whether it succeeded.
+    """Whole episodes of the expert: raw inputs (T, d) and targets (T, n) of each, these in a policy's action space.
 
-    Targets are in the space of a conversion, raw. hold: steps from success to the end. names: of the datasets.
+    hold: steps from success to the end; None where no column says when an episode succeeds.
     """
 
     inputs: tuple[F32, ...]
     targets: tuple[F32, ...]
-    succeeded: tuple[bool, ...]
-    hold: int
+    hold: int | None
 
     @property
     def longest(self) -> int:
@@ -87,14 +87,14 @@ class Demonstrations:
     def padded(self, steps: int, encode: Callable[[F32], F32]) -> Transitions:
         """Return all episodes as `steps` transitions each. encode: raw targets (T, n) to normalised ones.
 
-        An episode that did not succeed is not padded: how it would have gone on is not known.
+        Without a `hold` nothing is padded: how the episodes would have gone on is not known.
         Raises `UsageError` where one is longer.
         """
         if self.longest > steps:
             raise UsageError(f"episode_steps is {steps}; expected at least {self.longest}, the longest demonstration")
         made = [
-            padded_episode(inputs, encode(targets), steps if ended else 0)
-            for inputs, targets, ended in zip(self.inputs, self.targets, self.succeeded, strict=True)
+            padded_episode(inputs, encode(targets), 0 if self.hold is None else steps)
+            for inputs, targets in zip(self.inputs, self.targets, strict=True)
         ]
         return Transitions(*(np.concatenate(parts) for parts in zip(*made, strict=True)))
 
@@ -124,34 +124,38 @@ def read_demonstrations(
     raises.
     """
     table = read_tables(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
-    sound = np.ones(len(table[ACTION]), dtype=bool)
-    if LABEL_VALID in table:
-        sound &= table[LABEL_VALID].reshape(-1) != 0
-    if ACTOR in table:
-        sound &= table[ACTOR].reshape(-1) == Actor.EXPERT
-    for name in (STATE, ENVIRONMENT_STATE, ACTION):
-        sound_rows = np.isfinite(table[name]).all(axis=1)
-        if not sound_rows.all():
-            raise NotFiniteError(f"column {name}, row {int(np.argmin(sound_rows))} is not finite")
-    index = table[EPISODE_INDEX].reshape(-1)
-    bounds = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
-    pieces = [slice(*pair) for pair in itertools.pairwise(bounds)]
-    solved = table[SUCCESS].reshape(-1) != 0 if SUCCESS in table else np.ones(len(index), dtype=bool)
-    pieces = [piece for piece in pieces if sound[piece].all() and solved[piece].any()]
-    if not pieces:
+    require_finite(table, (STATE, ENVIRONMENT_STATE, ACTION))
+    pieces = _episodes(table)
+    kept = [piece for piece in pieces if _is_demonstration(table, piece)]
+    if not kept:
         raise NothingToLearnError(
-            f"none of the {len(bounds) - 1} episodes in {', '.join(map(str, roots))} is the expert's from beginning to "
+            f"none of the {len(pieces)} episodes in {', '.join(map(str, roots))} is the expert's from beginning to "
             "success; record demonstrations with manip-il record"
         )
-    kept = {key: table[key] for key in (STATE, ENVIRONMENT_STATE, ACTION)}
-    inputs = np.concatenate([kept[STATE], kept[ENVIRONMENT_STATE]], axis=1).astype(np.float32)
-    targets = [encode(kept[ACTION][piece], kept[STATE][piece]).astype(np.float32) for piece in pieces]
-    held = [len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in pieces] if SUCCESS in table else [0]
-    ended = (SUCCESS in table,) * len(pieces)
-    return Demonstrations(tuple(inputs[piece] for piece in pieces), tuple(targets), ended, min(held))
+    inputs = np.concatenate([table[STATE], table[ENVIRONMENT_STATE]], axis=1).astype(np.float32)
+    targets = [encode(table[ACTION][piece], table[STATE][piece]).astype(np.float32) for piece in kept]
+    hold = None
+    if SUCCESS in table:
+        solved = table[SUCCESS].reshape(-1) != 0
+        hold = min(len(solved[piece]) - 1 - int(np.argmax(solved[piece])) for piece in kept)
+    return Demonstrations(tuple(inputs[piece] for piece in kept), tuple(targets), hold)
+
+
+def _episodes(table: Table) -> list[slice]:
+    """The rows of every episode."""
+    bounds = np.flatnonzero(np.diff(np.asarray(table[EPISODE_INDEX]).reshape(-1), prepend=-1, append=-1))
+    return [slice(*pair) for pair in itertools.pairwise(bounds)]
+
+
+def _is_demonstration(table: Table, piece: slice) -> bool:
+    """Whether an episode is the expert's, valid and successful, as far as there are columns that say so."""
+    rows = {name: np.asarray(table[name][piece]).reshape(-1) for name in _TELLING if name in table}
+    valid = LABEL_VALID not in rows or bool((rows[LABEL_VALID] != 0).all())
+    driven = ACTOR not in rows or bool((rows[ACTOR] == Actor.EXPERT).all())
+    return valid and driven and (SUCCESS not in rows or bool((rows[SUCCESS] != 0).any()))
 
 
 def _optional(roots: Sequence[Path]) -> list[str]:
     """The columns beside those of learning that every dataset has."""
     known = [set(read_table(root, episodes=[0])) for root in roots]
-    return [name for name in (LABEL_VALID, ACTOR, SUCCESS) if all(name in names for names in known)]
+    return [name for name in _TELLING if all(name in names for names in known)]

@@ -1,0 +1,102 @@
+"""Simulated control steps a second of reinforcement learning, the whole loop, as a share of what raw physics allows.
+
+python benchmarks/learning_speed.py [--quick]
+
+Ours is GAIL's iteration with 16 environments: act, inverse kinematics, step, observe, discriminator, PPO, checkpoint.
+The limit is `mj_step` replaying the same controls from the same starts and nothing else. Iteration by iteration by
+turns in the same run, in seconds of the processor; the median ratio counts. Beside it the share without PPO's and the
+discriminator's gradient steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from _machine import describe_machine
+
+from manip_il.algorithms.learning_config import LearningConfig
+from manip_il.algorithms.learning_run import LearningRun
+from manip_il.cli.main import main as command
+from manip_il.engine.engine import Engine
+from manip_il.engine.vector_env import RobotEpisode
+from manip_il.learn.discriminators import GailDiscriminator
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.env import ManipEnv
+
+SCENES = (("panda", "reach"), ("panda", "pick_place"), ("fetch", "pick_place"))
+NEVER = 10**9
+
+
+class Recorded(RobotEpisode):
+    """Keeps where the episode began and its controls."""
+
+    _env: ManipEnv
+
+    def start(self, seed: int) -> None:
+        super().start(seed)
+        self.began, self.controls = mujoco.MjData(self._env.world.model), []
+        mujoco.mj_copyData(self.began, self._env.world.model, self._env.data)
+
+    def advance(self, target: np.ndarray) -> np.ndarray:
+        action = super().advance(target)
+        self.controls.append(self._env.data.ctrl.copy())
+        return action
+
+    def replay(self) -> None:
+        for control in self.controls:
+            self.began.ctrl[:] = control
+            mujoco.mj_step(self._env.world.model, self.began, self._env.config.physics_steps)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few iterations: shows that it runs, measures little")
+    iterations = 2 if parser.parse_args().quick else 8
+    print(describe_machine())
+    print("robot task        steps/s  raw physics, steps/s  share of raw  without gradient steps")
+    for robot, task in SCENES:
+        with tempfile.TemporaryDirectory() as folder:
+            measured = measure(robot, task, Path(folder), iterations)
+        whole, acting, raw = np.median(measured, axis=0)
+        print(f"{robot:5s} {task:10s} {whole:8,.0f}  {raw:20,.0f}  {whole / raw:12.2f}  {acting / raw:22.2f}")
+    return 0
+
+
+def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[float, float, float]]:
+    """Steps a second of every iteration: the whole loop, rollouts alone, physics alone."""
+    demos = folder / "demos"
+    words = [f"--robot.type={robot}", f"--task.type={task}", "--dataset.num_episodes=5", f"--dataset.root={demos}"]
+    if command(["record", *words, "--workers=1", "--quiet"]):
+        raise SystemExit("recording failed")
+    env = EnvConfig(robot, task)
+    config = LearningConfig(env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
+    run = LearningRun(config, folder, Engine())
+    recorded = [Recorded(env, run.conversion, None) for _ in range(config.episodes)]
+    run.envs.episodes = recorded
+    d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
+    found = []
+    for number, _ in zip(run.iterations(), range(iterations), strict=False):
+        times = [time.process_time()]
+        learner = run.rollouts(number)
+        times.append(time.process_time())
+        run.discriminate(d, learner)
+        run.improve(d.reward(learner, run.log_prob(learner)))
+        run.finish()
+        times.append(time.process_time())
+        for episode in recorded:
+            episode.replay()
+        times.append(time.process_time())
+        acting, learning, raw = np.diff(times)
+        steps = run.envs.simulated
+        found.append((steps / (acting + learning), steps / acting, steps / raw))
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())
