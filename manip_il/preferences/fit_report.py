@@ -23,7 +23,7 @@ def agreement_table(found: Fitted) -> Table:
     """Return with what the reward agrees on held-out pairs, and how far the answers do themselves."""
     rows = [("answers", found.answered, "left or right was answered, and the reward says so")]
     if found.true is not None:
-        rows.append(("true progress", found.true, f"without {found.ties} pairs that differ by less than {TIE:g}"))
+        rows.append(("true progress", found.true, f"ties left out, by less than {TIE:g}: {found.ties}"))
     if found.teachers is not None:
         rows.append(("the answers themselves with true progress", found.teachers, ""))
     cells = tuple((name, str(p), f"{p.n:,}", note) for name, p, note in rows)
@@ -38,7 +38,7 @@ def calibration_table(bins: Sequence[Bin]) -> Table:
 
 def calibration_figure(bins: Sequence[Bin]) -> Figure:
     """Draw how often the likelier clip was preferred over how likely it was foretold to be."""
-    with drawing(1, size=(3.6, 3.2)) as (drawn, axes):
+    with drawing(1, size=(6.8, 2.8)) as (drawn, axes):
         axis = axes[0, 0]
         axis.plot([0.5, 1], [0.5, 1], "--", color=RULE, lw=1.5)
         x, y = [b.foretold for b in bins], [b.given.rate for b in bins]

@@ -74,9 +74,9 @@ class Scores:
         """Spearman's correlation of the frames' scores with true progress; None where there is none."""
         if self.data.progress is None or np.ptp(self.data.progress) == 0 or np.ptp(self.frames) == 0:
             return None
-        from scipy.stats import spearmanr
+        from scipy.stats import rankdata
 
-        return float(spearmanr(self.frames, self.data.progress)[0])
+        return float(np.corrcoef(rankdata(self.frames), rankdata(self.data.progress))[0, 1])
 
     def worst(self, count: int) -> list[int]:
         """Return the numbers of the episodes with the lowest scores, lowest first."""

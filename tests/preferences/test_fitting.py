@@ -117,7 +117,7 @@ def test_ours_and_lerobots_factory_give_the_same_rewards(folder, clips):
     config.pretrained_path = str(folder)
     model, (preprocess, _) = make_reward_model(config), make_reward_pre_post_processors(config)
     keys = ("observation.state", "observation.environment_state", "action")
-    batch = preprocess({key: torch.from_numpy(one) for key, one in zip(keys, given, strict=True)})
+    batch = preprocess({key: torch.tensor(one) for key, one in zip(keys, given, strict=True)})
     assert model.compute_reward(batch).numpy() == pytest.approx(ours, abs=1e-6)
 
 
