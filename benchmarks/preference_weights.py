@@ -78,7 +78,7 @@ def measure(folder: Path, task: str, *, quick: bool) -> int:
         run(f"train --dataset.root={half} {weights} --steps={steps}", folder / name)
         run(f"eval --policy.path={folder / name} --eval.n_episodes={seeds}", folder / f"eval_{name}")
         results.append(EvalResult.read(folder / f"eval_{name}" / "eval.json"))
-    compared = compare_results(*reversed(results))
+    compared = compare_results(results[1], results[0])
     print(f"agreement with true progress on pairs that nobody answered: {agreement}")
     print(f"area under the ROC curve, failed episodes: {scores['auc']}; by true progress {scores['auc_of_progress']}")
     print(f"weighted {results[0].success}, as it is {results[1].success}; {compared.verdict}")
