@@ -33,6 +33,7 @@ RECIPES = {  # folder -> the command that makes it, relative to the same place
     "out/1": f"{_EXPERT} --eval.first=2 --output_dir=out/1",
     "out/2": f"{_EXPERT} --eval.first=4 --output_dir=out/2",
 }
+READ_BY = {"pairs.json": "runs/dagger"}  # what a file names, and a command that is given the file reads
 ARM = Path("my_arm.yaml")
 SAMPLE = "datasets/sample"  # comes with the repository
 _OUTPUTS = ("output", "output_dir", "output-dir", "video", "new_root")
@@ -47,7 +48,8 @@ class Stock:
 
     def bring(self, words: tuple[str, ...], target: Path) -> None:
         """Put what a line reads, and nobody has made there yet, into `target`."""
-        for path in inputs(words):
+        given = inputs(words)
+        for path in (*given, *(READ_BY[one] for one in given if one in READ_BY)):
             if path == ARM.name and not (target / path).exists():
                 write(target, name=ARM.stem)
             if path.endswith(".xml") and not (target / path).exists():
