@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from matplotlib.ticker import EngFormatter
+
 from manip_il.algorithms.learning_run import best_validation
 from manip_il.evaluation.figures import ARMS, DAGGER, Figure, Section, SectionsReport, drawing, to_figure
 from manip_il.evaluation.report_data import PolicyRow
@@ -41,7 +43,7 @@ def adversarial_report(
         sections.append(Section("How it learnt", figures=figures, notes=("Over simulated control steps.",)))
     return SectionsReport(
         title=title,
-        verdict=f"{names[best]}: validation success {found[best].success}.",
+        verdict=f"Best {names[best]}: validation success {found[best].success}.",
         command=command,
         config=config,
         fingerprint=found[best].fingerprint,
@@ -50,17 +52,18 @@ def adversarial_report(
 
 
 def _name(number: int, steps: Mapping[int, int]) -> str:
-    return f"after {steps[number]:,} steps" if steps.get(number) else "the policy given" if not number else "the last"
+    return f"after {steps[number]:,} steps" if steps.get(number) else "policy given" if not number else "last"
 
 
 def _validation_figure(found: Mapping[int, EvalResult], steps: Mapping[int, int]) -> Figure:
-    with drawing(1, size=(4.5, 2.6)) as (drawn, axes):
+    with drawing(1, size=(6.5, 2.4)) as (drawn, axes):
         axis = axes[0, 0]
         x = [steps.get(number, 0) for number in found]
         rates = [one.success for one in found.values()]
         low, high = ([abs(rate.rate - rate.interval[side]) for rate in rates] for side in (0, 1))
         axis.errorbar(x, [rate.rate for rate in rates], yerr=(low, high), color=DAGGER, marker="o", ms=4, lw=1.4)
         axis.set(title="validation success", ylim=(-0.02, 1.02), xlabel="steps")
+        axis.xaxis.set_major_formatter(EngFormatter())
         return to_figure(drawn, "Validation success over simulated steps, with intervals")
 
 
@@ -72,6 +75,7 @@ def _learning_figure(records: Records) -> Figure:
                 points = [(record["steps"], record[key]) for record in records if record.get(key) is not None]
                 axis.plot(*zip(*points, strict=True), color=colour, lw=1.2, label=label) if points else None
             axis.set(title=title)
+            axis.xaxis.set_major_formatter(EngFormatter())
             if len(lines) > 1:
                 axis.legend()
         for axis in axes.ravel()[len(panels) :]:
