@@ -45,7 +45,7 @@ class LearningConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
     validation_every: int = option(20_000, "steps from one validation to the next")
-    validation_episodes: int = option(100, "episodes of a validation, by which the best policy is chosen")
+    validation_episodes: int = option(200, "episodes of a validation, by which the best policy is chosen")
     seed: int = 0
 
     def __post_init__(self) -> None:
