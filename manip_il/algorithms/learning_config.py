@@ -8,7 +8,6 @@ from pathlib import Path
 from manip_il.errors import UsageError
 from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig, PPOConfig
 from manip_il.option import option
-from manip_il.seeding import stream_base
 from manip_il.sim.config import EnvConfig
 
 _AT_LEAST_1 = ("steps", "episodes", "validation_every", "validation_episodes")
@@ -49,6 +48,8 @@ class LearningConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        from manip_il.seeding import stream_base  # here, as help needs no numpy
+
         for name in _AT_LEAST_1:
             if getattr(self, name) < 1:
                 raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")

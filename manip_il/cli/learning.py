@@ -65,7 +65,7 @@ class LearningOptions:
         """Run, or go on with, all iterations, and write the report."""
         from manip_il.engine.engine import Engine
 
-        config = self.config()
+        config = self.learning_config()
         with open_output(self, FREE) as folder:
             kept = f"every finished iteration, in {folder}"
             with Stages(kept) as stages, Engine(self.workers) as engine:
@@ -76,7 +76,7 @@ class LearningOptions:
         robot = common.own_robot(config.env.robot)
         say(f"next: manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test")
 
-    def config(self) -> LearningConfig:
+    def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""
         env = self.environment()
         start = None if self.init is None else find_policy(self.init.expanduser())

@@ -36,13 +36,13 @@ class PpoOptions(LearningOptions):
 
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
+        super().check()
         for name, value, what in (
             ("init", self.init, "the run of a cloned mlp"),
             ("reward", self.reward, "a folder of manip-il preferences fit"),
         ):
             if value is None:
                 raise UsageError(f"--{name} is missing; expected {what}")
-        super().check()
 
     def environment(self) -> EnvConfig:
         """Return the environment of the reward, which must be the policy's; raises `MismatchError` where it is not."""

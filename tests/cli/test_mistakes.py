@@ -126,7 +126,8 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
 def test_resume_with_nothing_to_resume_is_refused_before_anything_heavy_is_imported(tmp_path):
     nothing = "--resume=true: nothing to resume in new"
     commands = ["train --dataset.root=SAMPLE", "dagger", "eval --policy.type=expert", f"compare {ROOT} {SAMPLE}"]
-    commands += [f"study {ROOT / 'pyproject.toml'}", "quickstart"]
+    commands += [f"study {ROOT / 'pyproject.toml'}", "quickstart", "ppo"]
+    commands += ["gail --dataset.root=SAMPLE", "airl --dataset.root=SAMPLE"]
     cases = {f"{command} --resume=true --output_dir=new": nothing for command in commands}
     journals = f"{nothing}.journals"
     cases |= {"record --resume=true --dataset.root=new": journals, "redraw SAMPLE new --resume=true": journals}

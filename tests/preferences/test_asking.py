@@ -96,11 +96,14 @@ def test_taps_on_a_phone_answer(browser, page):
 
 def test_a_reload_keeps_the_answers_and_the_name(browser, page):
     with opened(browser, page, 1280) as window:
+        second = "document.getElementById('count').innerText === 'Pair 2 of 4'"
         window.page.keyboard.press("ArrowLeft")
+        window.page.wait_for_function(second, timeout=60_000)
         window.page.fill("#who", "Ada")
         window.page.keyboard.press("ArrowLeft")  # in the name, it is no answer
+        window.page.wait_for_timeout(500)  # the browser writes what is kept to disk by and by
         window.page.reload()
-        assert count(window) == "Pair 2 of 4"
+        window.page.wait_for_function(second, timeout=60_000)
         assert window.page.input_value("#who") == "Ada"
 
 
