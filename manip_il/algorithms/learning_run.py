@@ -153,15 +153,16 @@ class LearningRun:
         return states[:, :n], states[:, n:], np.concatenate(self.envs.executed).astype(np.float32)
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return the log-density of rows' actions for the learner [nats], (N,)."""
+        """Return rows' log-densities for the learner above their mean [nats], (N,); see `Learner.log_prob`."""
         with threads(1):
             return self._learner.log_prob(rows)
 
     def discriminate(self, d: Discriminator, learner: Transitions) -> None:
         """Fit a discriminator to the demonstrations and the learner's steps.
 
-        The demonstrated actions get noise as wide as the learner's spread: it is then known by where it aims. Without
-        it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
+        The demonstrated actions get noise as wide as the learner's first spread: it is then known by where it aims.
+        Without it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
+        With noise as wide as the spread of now, nothing holds that spread: under AIRL it grows without end.
         """
         if self._expert is None:
             raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")

@@ -151,7 +151,11 @@ class GailDiscriminator(Discriminator):
 
 
 class AirlDiscriminator(Discriminator):
-    """f(s, a, s') against the learner's log-density, as above; the reward is log D - log(1 - D) = f - log pi."""
+    """f(s, a, s') against the learner's log-density, as above; the reward is log D - log(1 - D) = f - log pi.
+
+    pi is taken relative to exp(-H), H its entropy: else -log pi, which is H on average, rewards every step of living
+    on, but none in the absorbing state, where nothing is drawn, and f has to follow H while the spread changes.
+    """
 
     def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float) -> None:
         self._gamma = gamma

@@ -62,6 +62,7 @@ class Learner:
             policy_kwargs={"network": network},
             device="cpu",
         )
+        self._first_spread = self.policy.spread.numpy().copy()
         self.ppo.set_logger(configure(None, []))
         self.ppo.ep_info_buffer, self.ppo.ep_success_buffer = deque(maxlen=1), deque(maxlen=1)
         self._callback = CallbackList([])
@@ -106,15 +107,19 @@ class Learner:
         return {**found, "log_std": self.policy.log_std.mean().item()}
 
     def log_prob(self, rows: Transitions) -> F32:
-        """Return the log-density of every row's action for the actor [nats], (N,); 0 in the absorbing state."""
+        """Return the log-density of every row's action for the actor, above its mean over actions [nats], (N,).
+
+        That is log pi + H with the entropy H; 0 in the absorbing state, where nothing is drawn.
+        """
         obs = torch.from_numpy(np.pad(rows.states, ((0, 0), (0, EXTRA - 1))))
         with torch.no_grad():
-            _, log_prob, _ = self.policy.evaluate_actions(obs, torch.from_numpy(rows.actions))
-        return log_prob.numpy()
+            _, log_prob, entropy = self.policy.evaluate_actions(obs, torch.from_numpy(rows.actions))
+        assert entropy is not None
+        return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
-        """Return the same rows, N, with noise of the actor's spread on their actions, within the actions' range."""
-        noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self.policy.spread.numpy()
+        """Return the same rows, N, with noise of the actor's first spread on their actions, within their range."""
+        noise = rng.standard_normal(rows.actions.shape, dtype=np.float32) * self._first_spread
         actions = np.clip(rows.actions + noise, *self._bounds) * (1.0 - rows.states[:, -1:])
         return Transitions(rows.states, actions.astype(np.float32), rows.next_states)
 

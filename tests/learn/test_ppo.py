@@ -26,7 +26,7 @@ def iterate(one, env, number: int, actor: bool = True) -> Transitions:
     return rows
 
 
-def test_the_density_is_that_of_the_policy_network():
+def test_the_density_is_that_of_the_policy_network_above_its_mean():
     one, env = learner()
     rng = np.random.default_rng(1)
     states = np.pad(rng.normal(size=(20, 3)).astype(np.float32), ((0, 0), (0, 1)))
@@ -39,7 +39,17 @@ def test_the_density_is_that_of_the_policy_network():
         constant = -0.5 * (still / spread.exp()) ** 2 - spread - 0.5 * np.log(2 * np.pi)
     assert len(one.policy.log_std) == 1, "the number that never changes is left out"
     ours = one.log_prob(Transitions(states, actions, states))
-    np.testing.assert_allclose(ours, (theirs - constant).numpy(), rtol=1e-4, atol=1e-4)
+    entropy = float(spread) + 0.5 + 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(ours, (theirs - constant).numpy() + entropy, rtol=1e-4, atol=1e-4)
+
+
+def test_of_the_actors_own_actions_the_density_is_at_its_mean():
+    one, env = learner()
+    env.seeds = range(EPISODES)
+    with lent_generators(0):
+        rows = one.collect()
+    live = one.log_prob(rows)[~rows.absorbing]
+    assert abs(live.mean()) < 4 * live.std() / np.sqrt(len(live)) + 0.05
 
 
 def test_in_the_absorbing_state_every_action_is_as_likely():
