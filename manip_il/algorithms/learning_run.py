@@ -162,7 +162,6 @@ class LearningRun:
 
         The demonstrated actions get noise as wide as the learner's first spread: it is then known by where it aims.
         Without it, it is known by its exploration, which tells it nothing and makes the densities of AIRL meaningless.
-        With noise as wide as the spread of now, nothing holds that spread: under AIRL it grows without end.
         """
         if self._expert is None:
             raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")

@@ -51,11 +51,12 @@ class PpoOptions(LearningOptions):
         from manip_il.sim.config import EnvConfig
 
         assert self.reward is not None
-        meta = load_reward(self.reward).meta
+        reward = load_reward(self.reward)
+        meta = reward.meta
         if not is_known(meta.robot, meta.task):
             raise UsageError(f"{self.reward} is for {meta.robot} {meta.task}, which cannot be simulated here")
         env = EnvConfig(meta.robot, meta.task, meta.fps, object=meta.object)
-        load_reward(self.reward).check_fits("the environment", env_spec(env))
+        reward.check_fits("the environment", env_spec(env))
         return env
 
     def iterations(self, config: LearningConfig, folder: Path, engine: Engine, watch: Watch) -> Iterator[Iteration]:

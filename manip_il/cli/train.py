@@ -146,7 +146,7 @@ class TrainOptions:
             raise UsageError("--weights is for the frames of one dataset, as it is; give one, and no --redraw")
 
     def _frame_weights(self, lerobot: LeRobotFit, root: Path) -> NDArray[np.float64] | None:
-        """How often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
+        """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
         if self.weights is None:
             return None
         from manip_il.data.lerobot_read import dataset_info, read_table

@@ -1,4 +1,4 @@
-"""What a reward sees of a dataset, and which datasets a folder stands for."""
+"""Read the columns of a dataset that a reward takes, and find the datasets that a folder stands for."""
 
 from __future__ import annotations
 
