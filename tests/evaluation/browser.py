@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,6 +27,13 @@ class Opened:
     def evaluate(self, script: str, argument: object = None) -> Any:
         """The value of an expression, or of a function of `argument`, in the page."""
         return self.page.evaluate(script, argument)
+
+    def wait_until(self, script: str, argument: object = None, seconds: float = 60.0) -> None:
+        """Wait until that is true. Playwright's `wait_for_function` evaluates in the page, which a page may forbid."""
+        end = time.monotonic() + seconds
+        while not self.evaluate(script, argument):
+            assert time.monotonic() < end, f"not within {seconds:g} s: {script}"
+            self.page.wait_for_timeout(50)
 
 
 @contextmanager

@@ -142,7 +142,7 @@ def test_films_start_by_themselves_in_a_loop_and_have_posters(browser: Browser, 
     with opened(browser, file, 1280) as window:
         for film in window.page.query_selector_all("video"):
             film.scroll_into_view_if_needed()  # browsers wait with those that are out of sight
-            assert window.page.wait_for_function(STARTED, arg=film, timeout=60_000)
+            window.wait_until(STARTED, film)
             assert film.evaluate(POSTER) == [64, 48]
         assert (window.console, window.requests) == ([], [])
 

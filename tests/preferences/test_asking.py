@@ -98,19 +98,19 @@ def test_a_reload_keeps_the_answers_and_the_name(browser, page):
     with opened(browser, page, 1280) as window:
         second = "document.getElementById('count').innerText === 'Pair 2 of 4'"
         window.page.keyboard.press("ArrowLeft")
-        window.page.wait_for_function(second, timeout=60_000)
+        window.wait_until(second)
         window.page.fill("#who", "Ada")
         window.page.keyboard.press("ArrowLeft")  # in the name, it is no answer
         window.page.wait_for_timeout(500)  # the browser writes what is kept to disk by and by
         window.page.reload()
-        window.page.wait_for_function(second, timeout=60_000)
+        window.wait_until(second)
         assert window.page.input_value("#who") == "Ada"
 
 
 def test_both_films_play_the_clips_of_their_pair(browser, page):
     with opened(browser, page, 1280) as window:
         for side in ("left", "right"):
-            window.page.wait_for_function(f"document.getElementById('{side}').currentTime > 0", timeout=60_000)
+            window.wait_until(f"document.getElementById('{side}').currentTime > 0")
         before = window.evaluate("document.getElementById('left').src")
         window.page.keyboard.press("ArrowLeft")
         assert window.evaluate("document.getElementById('left').src") != before
