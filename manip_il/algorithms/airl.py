@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from manip_il.learn.discriminators import AirlDiscriminator
 
 if TYPE_CHECKING:
+    from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_config import LearningConfig
-    from manip_il.algorithms.learning_run import Iteration, LearningRun
+    from manip_il.algorithms.learning_run import LearningRun
 
 
 def airl(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:

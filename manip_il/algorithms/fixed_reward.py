@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.learning_run import Iteration, LearningRun
+    from manip_il.algorithms.iterations import Iteration
+    from manip_il.algorithms.learning_run import LearningRun
     from manip_il.learn.reward import Reward
 
 

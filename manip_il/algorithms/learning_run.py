@@ -1,7 +1,7 @@
 """One run of reinforcement learning on disk: environments, learner, and what is kept of every iteration.
 
 checkpoints/last/    the last finished iteration: its policy, and all that the next one needs
-validation/          every validation's eval.json, by iteration
+validation/          by iteration, every validated policy and its eval.json
 best/                the policy with the highest validation success, the later of equals
 
 An iteration is whole episodes from seeds of its own, and draws from random streams of its own: a run that was killed
@@ -12,13 +12,16 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from manip_il.algorithms.iterations import STAGES, Iteration, Stage, best_validation, validated, validations
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
 from manip_il.algorithms.run import BEST, Watch
 from manip_il.data.atomic import new_folder
@@ -27,7 +30,7 @@ from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.vector_env import ActionRange, Lockstep, RobotEpisode
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.learn.checkpoint import (
@@ -50,24 +53,7 @@ from manip_il.learn.transitions import Demonstrations, Transitions, read_demonst
 from manip_il.mdp import F32
 from manip_il.seeding import rng_for, stream_base, stream_seeds
 
-VALIDATION = "validation"
 Kept = TypeVar("Kept", bound=Discriminator)
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """Outcome of an iteration. steps: simulated so far. validation: of its policy, None where none was due."""
-
-    number: int
-    steps: int
-    metrics: dict[str, float]
-    policy: Path
-    validation: EvalResult | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the line of `metrics.jsonl`."""
-        success = None if self.validation is None else self.validation.success.rate
-        return {"iteration": self.number, "steps": self.steps, **self.metrics, "validation_success": success}
 
 
 class LearningRun:
@@ -90,6 +76,7 @@ class LearningRun:
         self._modules: dict[str, Discriminator] = {}
         self._number, self._simulated, self._metrics = 0, 0, dict[str, float]()
         self._validated_at = 0
+        self._seconds = dict.fromkeys(STAGES, 0.0)
         spec = read_spec(config.datasets[0]) if config.datasets else env_spec(config.env)
         self._spec = spec
         self.conversion = start_conversion(config.start, config.action_space, spec)
@@ -119,16 +106,20 @@ class LearningRun:
         if checkpoint is None:
             return None
         step = read_step(checkpoint)
-        number = int(step["step"])
-        return Iteration(
-            number, int(step["simulated"]), step["metrics"], checkpoint / PRETRAINED_MODEL, self._validation(number)
-        )
+        number, policy = int(step["step"]), checkpoint / PRETRAINED_MODEL
+        return self._iteration(number, int(step["simulated"]), step["metrics"], policy, self._validation(number))
+
+    def begin(self) -> Iteration | None:
+        """Return what the run goes on from: its last finished iteration, or the policy that it begins with, if any."""
+        if (last := self.last) is not None or self.config.start is None:
+            return last
+        return self._iteration(0, 0, {}, self.config.start, self._validate(0, self.config.start))
 
     def iterations(self) -> Iterator[int]:
         """Yield the numbers, from 1 or from the last finished iteration's on, until all steps are simulated."""
         self._resume()
-        if self._number == 0 and self.config.start is not None:
-            self._validate(0, self.config.start)
+        if self._number == 0:
+            self.begin()
         while self._simulated < self.config.steps:
             self._number += 1
             self._metrics = {}
@@ -139,7 +130,7 @@ class LearningRun:
         self._number = number
         seeds = stream_seeds("reinforcement", number * self.config.episodes, self.config.seed)
         self.envs.seeds = seeds[-self.config.episodes :]
-        with threads(1), lent_generators(self._stream(number, "rollouts")):
+        with self._timed("collect"), threads(1), lent_generators(self._stream(number, "rollouts")):
             self._rows = self._learner.collect()
         self._simulated += self.envs.simulated
         self._metrics["success"] = float(self.envs.solved.mean())
@@ -166,7 +157,7 @@ class LearningRun:
         if self._expert is None:
             raise UsageError("no demonstrations to tell the learner from; give --dataset.root=DIR")
         rng = rng_for(self._stream(self._number, "discriminator"), "batches")
-        with threads(1):
+        with self._timed("fit"), threads(1):
             expert = self._learner.explored(self._expert, rng)
             log_probs = self._learner.log_prob(expert), self._learner.log_prob(learner)
             found = d.fit(expert, learner, log_probs, rng)
@@ -177,7 +168,7 @@ class LearningRun:
         self._metrics["return"] = float(rewards.sum() / self.config.episodes)
         remaining = max(0.0, 1.0 - self._simulated / self.config.steps)
         moves = self._number > self.config.warmup_iterations
-        with threads(1), lent_generators(self._stream(self._number, "updates")):
+        with self._timed("fit"), threads(1), lent_generators(self._stream(self._number, "updates")):
             self._metrics |= self._learner.improve(rewards, actor=moves, remaining=remaining)
 
     def finish(self) -> Iteration:
@@ -196,7 +187,15 @@ class LearningRun:
                 shutil.rmtree(other, ignore_errors=True)
         self._watch.on_step()
         policy = self.folder / "checkpoints" / "last" / PRETRAINED_MODEL
-        return Iteration(self._number, self._simulated, self._metrics, policy, self._validate_if_due(policy))
+        validation = self._validate_if_due(policy)
+        return self._iteration(self._number, self._simulated, self._metrics, policy, validation)
+
+    def _iteration(
+        self, number: int, steps: int, metrics: dict[str, float], policy: Path, validation: EvalResult | None
+    ) -> Iteration:
+        seconds, self._seconds = self._seconds, dict.fromkeys(STAGES, 0.0)
+        seconds = {stage: round(took, 3) for stage, took in seconds.items()}
+        return Iteration(number, steps, number * self.config.episodes, metrics, policy, validation, seconds)
 
     def _validate_if_due(self, policy: Path) -> EvalResult | None:
         every = self.config.validation_every
@@ -210,8 +209,11 @@ class LearningRun:
         if (found := self._validation(number)) is None:
             job = RolloutJob(self.config.env, "policy", policy=policy, label="last", hold=HOLD)
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
-            found = evaluate(self._engine, job, seeds, f"iteration {number}", self._watch.on_episode)
-            found.write(self._eval_file(number))
+            with self._timed("validate"):
+                found = evaluate(self._engine, job, seeds, f"iteration {number}", self._watch.on_episode)
+            with new_folder(self._eval_file(number).parent) as new:
+                shutil.copytree(policy, new / PRETRAINED_MODEL)
+                found.write(new / FILE_NAME)
         if number == best_validation(validations(self.folder)):
             with new_folder(self.folder / BEST, replace=True) as new:
                 shutil.copytree(policy, new / PRETRAINED_MODEL)
@@ -222,7 +224,7 @@ class LearningRun:
         return EvalResult.read(path) if path.is_file() else None
 
     def _eval_file(self, number: int) -> Path:
-        return self.folder / VALIDATION / f"{number:06d}" / FILE_NAME
+        return validated(self.folder, number) / FILE_NAME
 
     def _resume(self) -> None:
         """Go on from the last finished iteration, whose validation is made up for where it is missing."""
@@ -236,6 +238,13 @@ class LearningRun:
             self._validated_at = int(step["validated_at"])
         self._validate_if_due(checkpoint / PRETRAINED_MODEL)
 
+    @contextmanager
+    def _timed(self, stage: Stage) -> Generator[None]:
+        """Add what a stage takes to the iteration's seconds."""
+        started = time.monotonic()
+        yield
+        self._seconds[stage] += time.monotonic() - started
+
     def _options(self) -> dict[str, Any]:
         """The options that a checkpoint names."""
         config = self.config
@@ -248,18 +257,6 @@ class LearningRun:
         """A seed for one purpose of an iteration."""
         base = stream_base("reinforcement", self.config.seed)
         return int(rng_for(base + number, purpose).integers(2**63))
-
-
-def validations(folder: Path) -> dict[int, EvalResult]:
-    """Return a run's validations by iteration, in order; raises `ManipError` for one that cannot be read."""
-    return {int(path.parent.name): EvalResult.read(path) for path in sorted(folder.glob(f"{VALIDATION}/*/{FILE_NAME}"))}
-
-
-def best_validation(found: dict[int, EvalResult]) -> int:
-    """Return the iteration with the highest validation success, the later of equals."""
-    if not found:
-        raise ManipError("the run has no validation; expected one at its end")
-    return max(found, key=lambda number: (found[number].success.rate, number))
 
 
 def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None) -> int:

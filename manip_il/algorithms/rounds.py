@@ -44,7 +44,8 @@ def mixture(policy: Fitted, beta: float) -> Drive:
 class Rollouts:
     """One round's episodes. dataset: None where the expert gave no label. beta: the expert's share of the steps.
 
-    labels: sound ones. queries: states in which the expert was queried. episodes, successes: of the rollouts.
+    labels: sound ones. queries: states in which the expert was queried. episodes, successes: of the rollouts. steps:
+    control steps simulated.
     """
 
     round: int
@@ -54,6 +55,7 @@ class Rollouts:
     queries: int
     episodes: int
     successes: int
+    steps: int
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,8 @@ class RoundResult:
     """One finished round. policy: its checkpoint. Times in [s].
 
     labels: sound labels learnt from so far. queries: states in which the expert was queried so far, which is more where
-    it must answer to decide (`safety`, `dart`'s held-out episodes). episodes: rollouts so far. rollout_success: of this
-    round's rollouts.
+    it must answer to decide (`safety`, `dart`'s held-out episodes). episodes: rollouts so far. steps: control steps
+    simulated so far. rollout_success: of this round's rollouts.
     """
 
     round: int
@@ -83,6 +85,7 @@ class RoundResult:
     labels: int
     queries: int
     episodes: int
+    steps: int
     rollout_success: float
     policy: Path
     validation: EvalResult
@@ -91,7 +94,7 @@ class RoundResult:
     def to_json(self) -> dict[str, Any]:
         """Return one line of `metrics.jsonl`."""
         success = self.validation.success
-        first = ("round", "beta", "labels", "queries", "episodes", "rollout_success")
+        first = ("round", "beta", "labels", "queries", "episodes", "steps", "rollout_success")
         return {name: getattr(self, name) for name in first} | {
             "validation_success": success.rate,
             "validation_interval": list(success.interval),

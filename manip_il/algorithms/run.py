@@ -78,7 +78,7 @@ class Run:
         self.config, self.folder = config, folder
         self._engine, self._watch = engine, watch or Watch()
         self._made: dict[int, Rollouts] = {}
-        self._held_out_queries = 0
+        self._held_out_steps = 0
         self._fitted: Fitted | None = None
         self._seconds: dict[str, float] = {}
 
@@ -105,7 +105,7 @@ class Run:
                 job = replace(self._job(0), cameras=None)
                 episodes = collect(self._engine, job, stream_seeds("held_out", count, self.config.seed), journals)
                 record(episodes, journals, root, job, Recording("local/held_out", provenance=provenance(job)))
-            self._held_out_queries = sum(read_header(path).frames for path in list_episodes(journals))
+            self._held_out_steps = sum(read_header(path).frames for path in list_episodes(journals))
         return root
 
     def rollouts(self, round_: int, drive: Drive, query: QueryRule | None = None, disturbed: float = 0.0) -> Rollouts:
@@ -183,8 +183,9 @@ class Run:
             round=round_,
             beta=here.beta,
             labels=sum(one.labels for one in so_far),
-            queries=sum(one.queries for one in so_far) + self._held_out_queries,
+            queries=sum(one.queries for one in so_far) + self._held_out_steps,
             episodes=sum(one.episodes for one in so_far),
+            steps=sum(one.steps for one in so_far) + self._held_out_steps,
             rollout_success=here.successes / max(1, here.episodes),
             policy=policy.path,
             validation=validation,
@@ -254,7 +255,7 @@ class Run:
         root, datasets = self._folder(0) / DATASET, self.config.datasets
         if not datasets:
             self._seconds["collect"] = 0.0
-            self._made[0] = Rollouts(0, None, 1.0, labels=0, queries=0, episodes=0, successes=0)
+            self._made[0] = Rollouts(0, None, 1.0, labels=0, queries=0, episodes=0, successes=0, steps=0)
             return self._made[0]
         found = {str(one): dataset_sha256(one) for one in datasets}
         with self._timed("collect"):
@@ -265,7 +266,7 @@ class Run:
                 raise MismatchError("content of a dataset", one, ours, f"the run in {self.folder}", theirs)
         info = dataset_info(root)
         labels = int(read_table(root, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum())
-        self._made[0] = Rollouts(0, root, 1.0, labels, labels, info.episodes, info.success or 0)
+        self._made[0] = Rollouts(0, root, 1.0, labels, labels, info.episodes, info.success or 0, info.frames)
         return self._made[0]
 
     def _take(self, policy: Path, round_: int) -> Path:
@@ -282,9 +283,10 @@ class Run:
         headers = [read_header(path) for path in list_episodes(here / JOURNALS)]
         dataset = here / DATASET if self._is_recorded(round_) else None
         labels = int(read_table(dataset, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum()) if dataset else 0
-        queries = sum(header.frames for header in headers) if queried_everywhere else labels
+        steps = sum(header.frames for header in headers)
+        queries = steps if queried_everywhere else labels
         successes = sum(header.success for header in headers)
-        self._made[round_] = Rollouts(round_, dataset, beta, labels, queries, len(headers), successes)
+        self._made[round_] = Rollouts(round_, dataset, beta, labels, queries, len(headers), successes, steps)
         return self._made[round_]
 
     def _evaluate(self, policy: Fitted, path: Path) -> EvalResult:

@@ -55,7 +55,7 @@ class Source:
         if self.policy is not None:
             return self.policy, None
         round_ = select_round(rule, self.history, limit, self.name)
-        return round_policy(self.path, round_.round), round_
+        return round_policy(self.path, round_), round_
 
     def measure(
         self, rule: Rule, limit: float | None, trial: Trial | None, folder: Path, engine: Engine, stages: Stages
@@ -162,19 +162,24 @@ def require_same_env(left: str, env: EnvConfig, right: str, other: EnvConfig) ->
 
 
 def run_history(folder: Path) -> History:
-    """Return the rounds of a DAgger run so far."""
+    """Return the rounds of a run so far."""
     return history(read_jsonl(folder / METRICS_FILE), str(folder))
 
 
-def round_policy(folder: Path, round_: int) -> Path:
-    """Return the `pretrained_model` folder of a run's round."""
+def round_policy(folder: Path, round_: Round) -> Path:
+    """Return the `pretrained_model` folder of a run's round, or of an iteration that was validated."""
+    if round_.unit == "iteration":
+        from manip_il.algorithms.iterations import validated
+        from manip_il.learn.checkpoint import PRETRAINED_MODEL
+
+        return find_policy(validated(folder, round_.round) / PRETRAINED_MODEL)
     from manip_il.algorithms.run import round_folder
 
-    return find_policy(round_folder(folder, round_) / "policy")
+    return find_policy(round_folder(folder, round_.round) / "policy")
 
 
 def run_finished(folder: Path) -> bool:
-    """Return whether all rounds of a run are done: the best policy is put beside them last."""
+    """Return whether a run has a best policy, which a DAgger run gets at its end."""
     return (folder / "best" / "pretrained_model" / "config.json").is_file()
 
 
@@ -215,7 +220,7 @@ def _policy_env(
     """Return the environment of a policy, whose checkpoint holds robot, task and rate, but no tolerance or horizon."""
     from manip_il.learn.checkpoint import read_meta
 
-    meta = read_meta(source.policy or round_policy(source.path, 0))
+    meta = read_meta(source.policy or round_policy(source.path, source.history[0]))
     if run is not None:
         own = {} if meta is None else {"robot": meta.robot, "task": meta.task, "object": meta.object}
         return run if meta is None else replace(run, control_hz=meta.fps, **own)

@@ -23,8 +23,8 @@ from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
 AT_HELP = (
-    "which rounds of a run count: end (all), labels, episodes or seconds (up to what every run reached; seconds of "
-    "collecting and fitting), or an amount, as in labels:5000"
+    "which rounds of a run count: end (all), labels, episodes, steps or seconds (up to what every run reached; seconds "
+    "of collecting and fitting), or an amount, as in labels:5000"
 )
 
 

@@ -257,7 +257,7 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
 
 
 def learning_curve(folder: Path, name: str = "DAgger") -> LearningCurve:
-    """Return validation success over labels, episodes and wall-clock, one point a round. name: of the algorithm."""
+    """Return validation success over costs, one point a round. name: of the algorithm."""
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.evaluation.rounds import curve_points, history
 

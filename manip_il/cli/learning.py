@@ -18,7 +18,8 @@ from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.algorithms.learning_run import Iteration, LearningRun
+    from manip_il.algorithms.iterations import Iteration
+    from manip_il.algorithms.learning_run import LearningRun
     from manip_il.algorithms.run import Watch
     from manip_il.engine.engine import Engine
     from manip_il.sim.config import EnvConfig
@@ -109,7 +110,7 @@ class LearningOptions:
 
     def _report(self, config: LearningConfig, folder: Path) -> None:
         from manip_il.algorithms.adversarial_report import adversarial_report
-        from manip_il.algorithms.learning_run import validations
+        from manip_il.algorithms.iterations import validations
 
         title = f"{self.title} on {config.env.robot} {config.env.task}"
         records, command = read_jsonl(folder / METRICS_FILE), command_line(self.name, self)
@@ -118,6 +119,6 @@ class LearningOptions:
 
 
 def resumed(run: LearningRun, iterations: Iterator[Iteration]) -> Iterator[Iteration]:
-    """Return a run's iterations after its last finished one, which may have ended before its line was written."""
-    last = run.last
-    return itertools.chain([last] if last else [], iterations)
+    """Return a run's iterations after that which it goes on from, which may have ended before its line was written."""
+    first = run.begin()
+    return itertools.chain([first] if first else [], iterations)

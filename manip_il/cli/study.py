@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
+from manip_il.cli.arms import ROUND_0, ArmOptions, begun, charged
 from manip_il.cli.candidates import Source, limit_of, run_finished, run_history
 from manip_il.cli.compare import rule_json
 from manip_il.cli.dagger import FREE, METRICS_FILE, DaggerOptions
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from manip_il.evaluation.results import EvalResult
     from manip_il.sim.config import EnvConfig
 
-ROUND_0 = "round_000"
 # Options on which round 0 (demonstrations and the first fit) does not depend
 _AFTER_ROUND_0 = (
     *("method", "rounds", "episodes_per_round", "disturbed_share", "beta", "label", "query", "branch_steps"),
@@ -85,6 +85,8 @@ class StudyOptions:
             self._report(plan, study)
         print_table(study.results_table())
         print_table(study.target_table())
+        if study.within:
+            print_table(study.within_table())
         for sentence in (study.verdict, *study.facts):
             say(sentence)
         say(f"table: {folder / TABLE_FILE}")
@@ -101,12 +103,16 @@ class StudyOptions:
                 continue
             say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
             options = self._options(plan, name, seed)
-            share_start(options, [self._options(plan, other, seed) for other in plan.arms if other != name])
+            if isinstance(options, DaggerOptions):
+                others = [self._options(plan, other, seed) for other in plan.arms if other != name]
+                share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
             options.run()
 
-    def _options(self, plan: Plan, name: str, seed: int) -> DaggerOptions:
-        own = replace(plan.arms[name], seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
-        return replace(own, engine=self.engine, workers=self.workers)
+    def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
+        own = begun(plan.arms[name], lambda arm: self._folder(arm, seed))
+        own = replace(own, seed=seed, output_dir=self._folder(name, seed), resume=True, overwrite=False)
+        own = replace(own, workers=self.workers)
+        return replace(own, engine=self.engine) if isinstance(own, DaggerOptions) else own
 
     def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
         from manip_il.engine.engine import Engine
@@ -123,7 +129,7 @@ class StudyOptions:
                 last = (plan.rule, limit, trials[name], self.output_dir, engine, stages)
                 arms.append(Arm(name, tuple(source.measure(*last) for source in arm)))
             solved = {name: self._test_expert(name, tests, engine, stages) for name, tests in experts.items()}
-        return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved)
+        return Study(tuple(arms), plan.baseline, plan.file.target, plan.rule, limit, solved, plan.within)
 
     def _test_expert(
         self, arm: str, trials: Mapping[str, Trial], engine: Engine, stages: Stages
@@ -143,7 +149,11 @@ class StudyOptions:
 
     def _sources(self, plan: Plan, name: str) -> list[Source]:
         folders = {seed: self._folder(name, seed) for seed in range(plan.file.training_seeds)}
-        return [Source(folder, seed, history=run_history(folder)) for seed, folder in folders.items()]
+        options, start = plan.arms[name], plan.starts[name] or name
+        histories = {
+            seed: charged(options, run_history(folder), self._folder(start, seed)) for seed, folder in folders.items()
+        }
+        return [Source(folder, seed, history=histories[seed]) for seed, folder in folders.items()]
 
     def _folder(self, name: str, seed: int) -> Path:
         return self.output_dir / name / f"seed_{seed}"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il import checks
+from manip_il.cli.arms import ArmOptions, first_arm, learning_env, read_arm
 from manip_il.cli.candidates import require_same_env
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.options import Open, to_plain
@@ -47,9 +48,10 @@ class ExpertTest:
 class StudyFile:
     """Content of a study's YAML file.
 
-    common: options of `manip-il dagger` that all arms share. arms: name -> options in which an arm differs. Where that
-    is the task, nothing is compared, and expert (name -> `ExpertTest`) adds what the expert solves of each. suite: as
-    `manip-il eval --suite=`, for the test.
+    common: options of `manip-il dagger` that all its arms share. arms: name -> options in which an arm differs; with
+    `algorithm: gail`, `airl` or `ppo` those of that command, where `dataset.root` and `init` name another arm. Where
+    the task differs, nothing is compared, and expert (name -> `ExpertTest`) adds what the expert solves of each. suite:
+    as `manip-il eval --suite=`, for the test. within: amounts as of `at`, such as steps:20000.
     """
 
     common: Open = field(default_factory=dict[str, Any])
@@ -62,18 +64,22 @@ class StudyFile:
     at: str = "end"
     baseline: str | None = option(None, "the arm that others are compared with; by default the first")
     target: float = option(0.95, "validation success whose cost is reported")
+    within: list[str] = option(list, "costs up to which the best validation success is reported")
 
 
 @dataclass(frozen=True)
 class Plan:
     """A checked file: the options of every arm are valid.
 
-    envs: arm -> its environment, the same for all where there is a baseline. experts: name -> test.
+    starts: arm -> the arm whose round 0 it begins with, None for its own. envs: arm -> its environment, the same for
+    all where there is a baseline. experts: name -> test.
     """
 
     file: StudyFile
-    arms: Mapping[str, DaggerOptions]
+    arms: Mapping[str, ArmOptions]
+    starts: Mapping[str, str | None]
     rule: Rule
+    within: tuple[Rule, ...]
     baseline: str | None
     envs: Mapping[str, EnvConfig]
     experts: Mapping[str, ExpertTest]
@@ -88,13 +94,29 @@ def read_plan(path: Path, training_seeds: int | None, trust: bool = False) -> Pl
     if training_seeds is not None:
         file = replace(file, training_seeds=training_seeds)
     _check_numbers(path, file)
-    arms = {name: replace(_arm(path, file, name), trust=trust) for name in file.arms}
+    arms: dict[str, ArmOptions] = {}
+    starts: dict[str, str | None] = {}
     envs: dict[str, EnvConfig] = {}
-    for name, options in arms.items():
+    for name in file.arms:
+        options = _arm(path, file, name)
         with _named(path, name):
-            envs[name] = options.config().env
+            start = starts[name] = first_arm(options, arms)
+            if isinstance(options, DaggerOptions):
+                options = replace(options, trust=trust)
+                envs[name] = options.config().env
+            elif start is not None:
+                envs[name] = learning_env(start, envs[start])
+        arms[name] = options
     experts = {name: _expert_test(path, name, file.expert[name]) for name in file.expert}
-    return Plan(file, arms, Rule.parse(file.checkpoint, file.at), _baseline(file, envs), envs, experts)
+    rule, within = Rule.parse(file.checkpoint, file.at), tuple(_amount(one) for one in file.within)
+    return Plan(file, arms, starts, rule, within, _baseline(file, envs), envs, experts)
+
+
+def _amount(text: str) -> Rule:
+    rule = Rule.parse("best", text)
+    if rule.amount is None:
+        raise UsageError(f"within has {text!r}; expected a cost with an amount, such as steps:20000")
+    return rule
 
 
 def _baseline(file: StudyFile, envs: Mapping[str, EnvConfig]) -> str | None:
@@ -146,7 +168,7 @@ def _check_numbers(path: Path, file: StudyFile) -> None:
             )
 
 
-def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
+def _arm(path: Path, file: StudyFile, name: str) -> ArmOptions:
     differences = file.arms[name]
     if not isinstance(differences, dict | None):
         raise UsageError(
@@ -157,7 +179,7 @@ def _arm(path: Path, file: StudyFile, name: str) -> DaggerOptions:
         if own := next((own for own in OWN if own in tree), None):
             raise UsageError(f"{origin}: {own} is set by the study itself, for every run; take it out")
     with _named(path, name):
-        return from_layers(DaggerOptions, layers)
+        return read_arm(*layers)
 
 
 def _expert_test(path: Path, name: str, tree: Any) -> ExpertTest:

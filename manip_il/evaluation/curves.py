@@ -1,4 +1,4 @@
-"""Charts of validation success over labels, episodes and wall-clock: axes, marks and lines in percent of the chart.
+"""Charts of validation success over costs: axes, marks and lines in percent of the chart.
 
 Lines stretch with the page while text and marks keep their size: readable at any width, without scripts.
 """
@@ -19,7 +19,12 @@ LOG_SPAN = 20  # amounts that differ by this factor or more are shown on a logar
 DODGE = 5  # px that DAgger and cloning are moved apart where they share a number of labels
 SHAPES = 4  # that marks have, told apart without colour
 _UNITS = ((3 * 3600.0, 3600.0, "h"), (300.0, 60.0, "min"), (0.0, 1.0, "s"))  # from so many seconds on; in seconds
-_COST_NAMES: dict[Cost, str] = {"labels": "expert labels", "episodes": "episodes", "seconds": "wall-clock"}
+_COST_NAMES: dict[Cost, str] = {
+    "labels": "expert labels",
+    "episodes": "episodes",
+    "steps": "simulated steps",
+    "seconds": "wall-clock",
+}
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from manip_il.evaluation.results import EvalResult
 from manip_il.mdp import F64, require_finite
 
 Kind = Literal["expert", "dagger", "cloning", "baseline"]
-Cost = Literal["labels", "episodes", "seconds"]
-COSTS: tuple[Cost, ...] = ("labels", "episodes", "seconds")
+Cost = Literal["labels", "episodes", "steps", "seconds"]
+COSTS: tuple[Cost, ...] = ("labels", "episodes", "steps", "seconds")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
 
@@ -54,7 +54,7 @@ class PolicyRow:
 class CurvePoint:
     """Validation success of one policy that learnt from `labels` expert labels; `name` such as `round 3`.
 
-    episodes, seconds: its other costs, where known; seconds of collecting and fitting.
+    episodes, steps, seconds: its other costs, where known; simulated control steps, seconds of collecting and fitting.
     """
 
     labels: int
@@ -62,6 +62,7 @@ class CurvePoint:
     name: str = ""
     episodes: int | None = None
     seconds: float | None = None
+    steps: int | None = None
 
     def __post_init__(self) -> None:
         for cost in COSTS:
@@ -70,7 +71,7 @@ class CurvePoint:
                 raise ManipError(f"a learning curve's point has {amount} {cost}; expected 0 or more")
 
     def amount(self, cost: Cost) -> float | None:
-        """Return labels, episodes or seconds; None where not known."""
+        """Return labels, episodes, steps or seconds; None where not known."""
         return getattr(self, cost)
 
 
@@ -169,7 +170,7 @@ def format_seconds(seconds: float) -> str:
 
 
 def format_amount(cost: Cost, amount: float) -> str:
-    """Return `8,012 labels`, `150 episodes` or `3 min 20 s`."""
+    """Return `8,012 labels`, `150 episodes`, `8,012 steps` or `3 min 20 s`."""
     return format_seconds(amount) if cost == "seconds" else f"{amount:,.0f} {cost}"
 
 

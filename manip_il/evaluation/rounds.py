@@ -1,10 +1,10 @@
-"""The rounds of a DAgger run, read from `metrics.jsonl`, and the choice of one for a comparison."""
+"""The rounds of a run, read from `metrics.jsonl`, and the choice of one for a comparison."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from manip_il import checks
@@ -20,7 +20,7 @@ _MOST = 10**12  # labels, episodes
 
 @dataclass(frozen=True)
 class Round:
-    """One round, and the costs of the run up to its end.
+    """One round of DAgger, or one validated iteration of reinforcement learning, and the run's costs up to its end.
 
     seconds: of collecting and fitting; validating is counted apart, as it is no part of the method.
     """
@@ -29,13 +29,25 @@ class Round:
     labels: int
     queries: int
     episodes: int
+    steps: int
     seconds: float
     validating: float  # [s]
     validation: Proportion
+    unit: Literal["round", "iteration"] = "round"
+
+    @property
+    def name(self) -> str:
+        """Return `round 3` or `iteration 120`."""
+        return f"{self.unit} {self.round}"
 
     def amount(self, axis: Cost) -> float:
-        """Return the labels, episodes or seconds that the run had used."""
+        """Return the labels, episodes, simulated control steps or seconds that the run had used."""
         return getattr(self, axis)
+
+    def after(self, start: Round, *, fitted: float) -> Round:
+        """Return the round as of a run that began with what another's round 0 made. fitted: that took besides [s]."""
+        sums = {name: getattr(self, name) + getattr(start, name) for name in ("labels", "queries", "episodes", "steps")}
+        return replace(self, **sums, seconds=self.seconds + fitted)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -44,6 +56,7 @@ class Round:
             "labels": self.labels,
             "queries": self.queries,
             "episodes": self.episodes,
+            "steps": self.steps,
             "seconds": round(self.seconds, 2),
             "validating_seconds": round(self.validating, 2),
             "validation_success": self.validation.rate,
@@ -55,48 +68,76 @@ History = tuple[Round, ...]
 
 
 def history(records: Sequence[Mapping[str, Any]], name: str) -> History:
-    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are not a run's."""
+    """Return a run's rounds in order from the lines of its `metrics.jsonl`; `ManipError` where they are not a run's.
+
+    Of `manip-il gail`, `airl` and `ppo` those iterations are rounds that were validated.
+    """
     if not records:
-        raise ManipError(f"{name} has no finished round yet; continue with manip-il dagger --resume=true")
+        raise ManipError(f"{name} has no finished round yet; continue it with --resume=true")
+    unit = "iteration" if "iteration" in records[0] else "round"
+    records = sorted(records, key=lambda record: _number(record, unit))
+    first = min(1, max(0, _number(records[0], unit))) if unit == "iteration" else 0
     rounds: list[Round] = []
     seconds = validating = 0.0
-    for number, record in enumerate(sorted(records, key=_number)):
-        if _number(record) != number:
-            raise ManipError(f"{name}: metrics.jsonl has no round {number}; expected one line a round")
+    for number, record in enumerate(records, start=first):
+        if _number(record, unit) != number:
+            raise ManipError(f"{name}: metrics.jsonl has no {unit} {number}; expected one line {_a(unit)}")
         try:
             times = checks.mapping("seconds", record["seconds"])
             seconds += sum(checks.number(part, times[part], 0) for part in ("collect", "fit"))
             validating += checks.number("validate", times["validate"], 0)
-            count = checks.whole("validation_episodes", record["validation_episodes"], 1, _MOST)
-            success = checks.number("validation_success", record["validation_success"], 0, 1)
-            rounds.append(
-                Round(
-                    round=number,
-                    labels=checks.whole("labels", record["labels"], 0, _MOST),
-                    queries=checks.whole("queries", record.get("queries", record["labels"]), 0, _MOST),
-                    episodes=checks.whole("episodes", record["episodes"], 0, _MOST),
-                    seconds=seconds,
-                    validating=validating,
-                    validation=Proportion(round(success * count), count),
-                )
-            )
+            if unit == "round" or record["validation_success"] is not None:
+                rounds.append(_round(record, number, seconds, validating, unit))
         except (KeyError, ManipError) as error:
-            why = f"no {error}, round {number}" if isinstance(error, KeyError) else f"round {number}: {error}"
-            raise ManipError(f"{name}: metrics.jsonl was not written by manip-il dagger ({why})") from error
+            why = f"no {error}, {unit} {number}" if isinstance(error, KeyError) else f"{unit} {number}: {error}"
+            raise ManipError(f"{name}: metrics.jsonl was not written by a run of manip-il ({why})") from error
+    if not rounds:
+        raise ManipError(f"{name} has no validated iteration yet; continue it with --resume=true")
     return tuple(rounds)
 
 
-def _number(record: Mapping[str, Any]) -> int:
+def _round(
+    record: Mapping[str, Any], number: int, seconds: float, validating: float, unit: Literal["round", "iteration"]
+) -> Round:
+    count = checks.whole("validation_episodes", record["validation_episodes"], 1, _MOST)
+    success = checks.number("validation_success", record["validation_success"], 0, 1)
+    labels = checks.whole("labels", record["labels"], 0, _MOST) if unit == "round" else 0  # which asks for none
+    queries = checks.whole("queries", record.get("queries", labels), 0, _MOST)
+    return Round(
+        round=number,
+        labels=labels,
+        queries=queries,
+        episodes=checks.whole("episodes", record["episodes"], 0, _MOST),
+        steps=checks.whole("steps", record.get("steps", queries), 0, _MOST),
+        seconds=seconds,
+        validating=validating,
+        validation=Proportion(round(success * count), count),
+        unit=unit,
+    )
+
+
+def _number(record: Mapping[str, Any], unit: str) -> int:
     """Number of a line's round; -1 where it has none."""
-    number = record.get("round")
+    number = record.get(unit)
     return number if isinstance(number, int) else -1
 
 
+def _a(unit: str) -> str:
+    return f"{'an' if unit == 'iteration' else 'a'} {unit}"
+
+
 def curve_points(rounds: History) -> tuple[CurvePoint, ...]:
-    """Return a run's learning curve, with all costs."""
+    """Return a run's learning curve, with all costs; without steps where the expert was queried in each of them."""
+    steps = [one.steps if unasked(rounds) else None for one in rounds]
     return tuple(
-        CurvePoint(one.labels, one.validation, f"round {one.round}", one.episodes, one.seconds) for one in rounds
+        CurvePoint(one.labels, one.validation, one.name, one.episodes, one.seconds, count)
+        for one, count in zip(rounds, steps, strict=True)
     )
+
+
+def unasked(rounds: History) -> bool:
+    """Return whether steps were simulated in which the expert was not queried, so that they are a cost of their own."""
+    return any(one.steps != one.queries for one in rounds)
 
 
 @dataclass(frozen=True)
@@ -113,11 +154,11 @@ class Rule:
 
     @classmethod
     def parse(cls, checkpoint: Literal["best", "last"], at: str) -> Rule:
-        """Parse `--at=`: `end`, `labels`, `episodes`, `seconds`, or such a name with an amount, `labels:5000`."""
+        """Parse `--at=`: `end`, `labels`, `episodes`, `steps` or `seconds`, these with an amount too, `labels:5000`."""
         axis, colon, text = at.partition(":")
         known = (END, *COSTS)
         if axis not in known:
-            raise UnknownName("way to compare: --at", axis, known)
+            raise UnknownName("way to compare", axis, known)
         if not colon:
             return cls(checkpoint, axis)
         try:
@@ -125,11 +166,16 @@ class Rule:
         except ValueError:
             amount = math.nan
         if axis == END or not 0 < amount < math.inf:
-            raise UsageError(f"--at is {at!r}; expected end, labels, episodes, seconds, or an amount as in labels:5000")
+            raise UsageError(f"--at is {at!r}; expected {', '.join(known)}, or an amount as in labels:5000")
         return cls(checkpoint, axis, amount)
 
     def __str__(self) -> str:
         return self.axis if self.amount is None else f"{self.axis}:{self.amount:g}"
+
+    @property
+    def words(self) -> str:
+        """Return the cost and its amount, `20,000 steps`."""
+        return self.axis if self.axis == END or self.amount is None else format_amount(self.axis, self.amount)
 
 
 def budget(rule: Rule, histories: Sequence[History]) -> float | None:
@@ -148,12 +194,16 @@ def budget(rule: Rule, histories: Sequence[History]) -> float | None:
     return reached if rule.amount is None else rule.amount
 
 
+def rounds_within(rule: Rule, rounds: History, limit: float | None) -> History:
+    """Return the rounds that ended within `limit` of the rule's cost; all without a limit."""
+    axis = rule.axis
+    return rounds if axis == END or limit is None else tuple(one for one in rounds if one.amount(axis) <= limit)
+
+
 def select_round(rule: Rule, rounds: History, limit: float | None, name: str) -> Round:
     """Return the round of one run that `rule` chooses; `UsageError` where none ended within `limit`."""
-    axis = rule.axis
-    if axis == END or limit is None:
-        within = rounds
-    elif not (within := tuple(one for one in rounds if one.amount(axis) <= limit)):
+    within, axis = rounds_within(rule, rounds, limit), rule.axis
+    if not within and axis != END and limit is not None:
         raise UsageError(
             f"--at={rule}: {name} has no round within {format_amount(axis, limit)}; "
             f"its first took {format_amount(axis, rounds[0].amount(axis))}"

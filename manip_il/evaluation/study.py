@@ -13,7 +13,7 @@ from manip_il.evaluation.comparison import Arm, Comparison, Member, seeds_facts
 from manip_il.evaluation.intervals import format_percent
 from manip_il.evaluation.report_data import COSTS, Cost, format_amount
 from manip_il.evaluation.results import EvalResult
-from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip, rule_facts
+from manip_il.evaluation.rounds import Round, Rule, first_reaching, largest_dip, rounds_within, rule_facts, unasked
 from manip_il.evaluation.tables import Table
 
 FILE_NAME, TABLE_FILE = "study.json", "table.md"
@@ -25,6 +25,7 @@ class Study:
 
     rule, limit: by which a run's round was chosen. Every member is of a run, and has its history. Arms of different
     tasks have no baseline (None). experts: tests of the expert in an arm's task, arm -> name of the test -> result.
+    within: costs up to which validation is told.
     """
 
     arms: tuple[Arm, ...]
@@ -33,6 +34,7 @@ class Study:
     rule: Rule
     limit: float | None = None
     experts: Mapping[str, Mapping[str, EvalResult]] = field(default_factory=dict)
+    within: tuple[Rule, ...] = ()
 
     def __post_init__(self) -> None:
         names = [arm.name for arm in self.arms]
@@ -89,15 +91,23 @@ class Study:
 
     def results_table(self) -> Table:
         """Return an arm a row: the expert's success, costs, success, difference from the baseline, largest dip."""
-        columns = ("arm", *self._tests, *("wall-clock" if cost == "seconds" else cost for cost in COSTS))
+        columns = ("arm", *self._tests, *("wall-clock" if cost == "seconds" else cost for cost in self._costs))
         columns += ("validation", "test", f"test, against {self.baseline}")
         return Table((*columns, "largest dip [points]"), tuple(self._row(arm) for arm in self.arms))
 
     def target_table(self) -> Table:
-        """Return an arm a row: labels, episodes and wall-clock when validation first reached the target."""
-        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {100 * self.target:g} %" for cost in COSTS]
-        rows = [(arm.name, *(self._to_target(arm, cost) for cost in COSTS), self._fewer(arm)) for arm in self.arms]
+        """Return an arm a row: labels, episodes, steps and wall-clock when validation first reached the target."""
+        columns = [f"{'wall-clock' if cost == 'seconds' else cost} to {100 * self.target:g} %" for cost in self._costs]
+        rows = [
+            (arm.name, *(self._to_target(arm, cost) for cost in self._costs), self._fewer(arm)) for arm in self.arms
+        ]
         return Table(("arm, validation", *columns, f"labels of {self.baseline} / of this arm"), tuple(rows))
+
+    def within_table(self) -> Table:
+        """Return an arm a row: the best validation success up to each of the costs `within`, empty before the first."""
+        columns = [f"within {rule.words}" for rule in self.within]
+        rows = [(arm.name, *(_within(arm, rule) for rule in self.within)) for arm in self.arms]
+        return Table(("arm, validation", *columns), tuple(rows))
 
     def to_json(self) -> dict[str, Any]:
         """Return the contract of `study.json`."""
@@ -127,6 +137,12 @@ class Study:
         }
 
     @property
+    def _costs(self) -> list[Cost]:
+        """Costs in the tables."""
+        steps = any(unasked(member.history) for arm in self.arms for member in arm.members)
+        return [cost for cost in COSTS if cost != "steps" or steps]
+
+    @property
     def _tests(self) -> list[str]:
         """Names of the expert's tests, in the order of the first arm that has them."""
         return list(dict.fromkeys(test for tests in self.experts.values() for test in tests))
@@ -137,7 +153,7 @@ class Study:
 
     def _row(self, arm: Arm) -> tuple[str, ...]:
         chosen = [_chosen(member) for member in arm.members]
-        costs = [_plain(cost, fmean(one.amount(cost) for one in chosen)) for cost in COSTS]
+        costs = [_plain(cost, fmean(one.amount(cost) for one in chosen)) for cost in self._costs]
         validation = _rates([one.validation.rate for one in chosen])
         test = _rates([member.result.success.rate for member in arm.members])
         comparison = self.comparisons.get(arm.name)
@@ -176,19 +192,25 @@ class Study:
 
 def table_markdown(study: Study) -> str:
     """Return both tables, for the documentation."""
-    results, target = study.results_table().filled(), study.target_table().filled()
+    tables = [study.results_table(), study.target_table(), *([study.within_table()] if study.within else [])]
     count = study.arms[0].members[0].result.success.n
     tests = {test: len(one.episodes) for tests in study.experts.values() for test, one in tests.items()}
     experts = "".join(f"- {test}: {count:,} test episodes.\n" for test, count in tests.items())
     seeds = ", ".join(map(str, study.training_seeds))
     episodes = f"{count:,} test episodes; training seeds {seeds}, in brackets where each is told."
     facts = "".join(f"- {fact}\n" for fact in [episodes, *study.facts])
-    return f"{results.markdown()}\n{target.markdown()}\n{facts}{experts}"
+    return "".join(f"{table.filled().markdown()}\n" for table in tables) + facts + experts
 
 
 def _expert_json(result: EvalResult) -> dict[str, Any]:
     success = result.success
     return {"success_rate": success.rate, "interval": list(success.interval), "n_episodes": success.n}
+
+
+def _within(arm: Arm, rule: Rule) -> str:
+    """The best validation success of every training seed up to a cost."""
+    rounds = [rounds_within(rule, member.history, rule.amount) for member in arm.members]
+    return _rates([max(one.validation.rate for one in own) for own in rounds]) if all(rounds) else ""
 
 
 def _chosen(member: Member) -> Round:

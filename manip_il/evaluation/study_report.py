@@ -1,4 +1,4 @@
-"""`report.html` of a study: which arm is better, and success over labels, episodes and wall-clock."""
+"""`report.html` of a study: which arm is better, and success over labels, episodes, steps and wall-clock."""
 
 from __future__ import annotations
 
@@ -59,6 +59,11 @@ class StudyReport(Report):
     def to_target(self) -> Table:
         """Costs of each arm to the target."""
         return self._coloured(self.study.target_table())
+
+    @property
+    def within(self) -> Table | None:
+        """Success of each arm within costs that were asked for."""
+        return self._coloured(self.study.within_table()) if self.study.within else None
 
     @property
     def bars(self) -> list[Bar]:

@@ -53,8 +53,8 @@ def test_the_order_of_the_lines_does_not_matter():
         ([], "no finished round"),
         (records()[1:], "no round 0"),
         ([records()[0], records()[0]], "no round 1"),
-        ([{"step": 100, "loss": 0.1, "round": 0}], "not written by manip-il dagger"),
-        ([records()[0] | {"seconds": None}], "not written by manip-il dagger"),
+        ([{"step": 100, "loss": 0.1, "round": 0}], "not written by a run of manip-il"),
+        ([records()[0] | {"seconds": None}], "not written by a run of manip-il"),
     ],
 )
 def test_lines_that_are_no_runs_are_refused_by_name(lines, words):

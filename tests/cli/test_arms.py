@@ -1,0 +1,148 @@
+"""Arms that learn by reinforcement begin with another's demonstrations and policy, and are charged for them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.adversarial import GailOptions
+from manip_il.cli.arms import begun, charged
+from manip_il.cli.main import main
+from manip_il.cli.outputs import read_jsonl
+from manip_il.cli.ppo import PpoOptions
+from manip_il.cli.study_file import read_plan
+from manip_il.evaluation.rounds import history
+
+from .made_runs import make_run
+
+FILE = """
+common: {task.type: reach, rounds: 1, env: {horizon: 100}}
+arms:
+  cloning: {rounds: 0}
+  dagger: {}
+  gail: {algorithm: gail, dataset.root: cloning, init: cloning, steps: 300}
+  scratch: {algorithm: airl, dataset.root: cloning}
+  ppo: {algorithm: ppo, init: cloning, reward: somewhere}
+within: ["steps:20000", "seconds:60"]
+"""
+TINY = """
+common: {task.type: reach, demonstrations: 2, steps: 30, validation_episodes: 2, policy: {width: 16}}
+arms:
+  cloning: {rounds: 0}
+  gail:
+    {algorithm: gail, dataset.root: cloning, init: cloning, steps: 150, episodes: 2, ppo.minibatches: 1, warmup: 0,
+    validation_every: 100, validation_episodes: 2}
+training_seeds: 1
+eval: {n_episodes: 2}
+within: ["steps:200"]
+"""
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.yaml").write_text(FILE)
+    return tmp_path / "x.yaml"
+
+
+def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
+    plan = read_plan(file, None)
+    assert plan.starts == {"cloning": None, "dagger": None, "gail": "cloning", "scratch": "cloning", "ppo": "cloning"}
+    gail, scratch, ppo = (begun(plan.arms[name], Path("s/seed_3").joinpath) for name in ("gail", "scratch", "ppo"))
+    start = Path("s/seed_3/cloning/round_000")
+    assert isinstance(gail, GailOptions)
+    assert (gail.dataset.root, gail.init, gail.steps) == ([start / "dataset"], start / "policy", 300)
+    assert (list(scratch.roots), scratch.init) == ([start / "dataset"], None)
+    assert isinstance(ppo, PpoOptions)
+    assert (ppo.init, ppo.reward) == (start / "policy", Path("somewhere"))
+    assert len({*plan.envs.values()}) == 1
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("algorithm: gail", "algorithm: gale", "arm 'gail': unknown algorithm 'gale'"),
+        (
+            "init: cloning, steps",
+            "init: clone, steps",
+            "arm 'gail': dataset.root and init are cloning, clone; expected",
+        ),
+        (
+            "init: cloning, steps",
+            "init: dagger, steps",
+            "arm 'gail': dataset.root and init are cloning, dagger; expected",
+        ),
+        (
+            "dataset.root: cloning}",
+            "dataset.root: gail}",
+            "arm 'scratch': dataset.root and init are gail; expected the",
+        ),
+        (", dataset.root: cloning}", "}", "arm 'scratch': dataset.root and init are not given; expected the name"),
+        ("steps: 300", "rounds: 3", "arms.gail: 'rounds'"),
+        ("horizon: 100", "horizon: 99", "arm 'gail': environment differs: arm 'cloning' has"),
+        ("steps:20000", "steps", "within has 'steps'; expected a cost with an amount"),
+        ("steps:20000", "stairs:3", "unknown way to compare 'stairs'"),
+    ],
+)
+def test_an_arm_that_cannot_begin_is_one_line(before, after, words, file, error):
+    assert before in FILE
+    file.write_text(FILE.replace(before, after, 1))
+    assert main(["study", str(file.name), "--output_dir=s"]) in (1, 2)
+    assert words in error()
+    assert not Path("s").exists()
+
+
+def lines(*validated: float | None) -> list[dict[str, object]]:
+    """Iterations of a run from a clone, a hundred steps each."""
+    seconds = {"collect": 1.0, "fit": 2.0, "validate": 4.0}
+    return [
+        {"iteration": i, "steps": 100 * i, "episodes": 2 * i, "validation_success": rate, "validation_episodes": 10}
+        | {"seconds": seconds}
+        for i, rate in enumerate(validated)
+    ]
+
+
+def test_iterations_that_were_validated_are_rounds_and_cost_what_all_before_them_took():
+    found = history(lines(0.2, None, 0.5, None, 0.4), "x")
+    assert [(one.name, one.steps, one.labels, one.seconds) for one in found] == [
+        ("iteration 0", 0, 0, 3.0),
+        ("iteration 2", 200, 0, 9.0),
+        ("iteration 4", 400, 0, 15.0),
+    ]
+
+
+def test_a_run_is_charged_for_the_demonstrations_it_begins_with_and_for_the_fit_with_init(file, policy, tmp_path):
+    run = make_run(tmp_path / "cloning", policy, 0, (0.2,))
+    start = history(read_jsonl(run / "metrics.jsonl"), "x")[0]
+    own, plan = history(lines(0.2, 0.5), "x"), read_plan(file, None)
+    gail, scratch, dagger = (charged(plan.arms[name], own, run) for name in ("gail", "scratch", "dagger"))
+    assert dagger == own
+    for found, seconds in ((gail, start.seconds), (scratch, 1.0)):
+        last = found[-1]
+        assert (last.labels, last.episodes, last.steps) == (100, 2 + 2, 100 + 100)
+        assert last.seconds == own[-1].seconds + seconds
+
+
+@pytest.mark.slow
+def test_a_study_of_cloning_and_gail_tests_both_and_goes_on(file, tmp_path, capsys):
+    file.write_text(TINY)
+    words = ["study", file.name, "--output_dir=s", "--workers=1"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "within 200 steps" in out
+    data = json.loads(Path("s/study.json").read_text())
+    [gail] = data["arms"]["gail"]["training_seeds"]
+    rounds = gail["rounds"]
+    assert (
+        rounds[0]["validation_success"]
+        == data["arms"]["cloning"]["training_seeds"][0]["rounds"][0]["validation_success"]
+    )
+    assert rounds[0]["steps"] == rounds[0]["labels"] < rounds[-1]["steps"]
+    assert rounds[-1]["labels"] == rounds[0]["labels"]
+    assert {one["n_episodes"] for one in (gail, *data["arms"]["cloning"]["training_seeds"])} == {2}
+    done = Path("s/gail/seed_0/metrics.jsonl").read_bytes()
+    assert main([*words, "--resume=true"]) == 0
+    assert Path("s/gail/seed_0/metrics.jsonl").read_bytes() == done
+    assert "simulated steps" in Path("s/report.html").read_text()
