@@ -21,16 +21,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from manip_il import checks
 from manip_il.algorithms.iterations import STAGES, Iteration, Stage, best_validation, validated, validations
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
 from manip_il.algorithms.run import BEST, Watch
 from manip_il.data.atomic import new_folder
+from manip_il.data.build import dataset_sha256
 from manip_il.data.lerobot_read import read_spec
 from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.vector_env import ActionRange, Lockstep, RobotEpisode
-from manip_il.errors import UsageError
+from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
 from manip_il.learn.checkpoint import (
@@ -59,7 +61,8 @@ Kept = TypeVar("Kept", bound=Discriminator)
 class LearningRun:
     """The steps of one run in `folder`. absorbing: episodes end after success, as the demonstrations do.
 
-    Raises what `start_conversion` and `read_demonstrations` raise, `UsageError` for options that do not fit those.
+    reward: the folder of the reward that it learns from, if one was given. Raises what `start_conversion` and
+    `read_demonstrations` raise, `UsageError` for options that do not fit those.
     """
 
     def __init__(
@@ -70,6 +73,7 @@ class LearningRun:
         watch: Watch | None = None,
         *,
         absorbing: bool = True,
+        reward: Path | None = None,
     ):
         self.config, self.folder = config, folder
         self._engine, self._watch = engine, watch or Watch()
@@ -77,6 +81,7 @@ class LearningRun:
         self._number, self._simulated, self._metrics = 0, 0, dict[str, float]()
         self._validated_at = 0
         self._seconds = dict.fromkeys(STAGES, 0.0)
+        self._given = _hashes(config, reward)
         spec = read_spec(config.datasets[0]) if config.datasets else env_spec(config.env)
         self._spec = spec
         self.conversion = start_conversion(config.start, config.action_space, spec)
@@ -106,8 +111,9 @@ class LearningRun:
         if checkpoint is None:
             return None
         step = read_step(checkpoint)
-        number, policy = int(step["step"]), checkpoint / PRETRAINED_MODEL
-        return self._iteration(number, int(step["simulated"]), step["metrics"], policy, self._validation(number))
+        with readable_state(checkpoint):
+            number, steps, metrics = int(step["step"]), int(step["simulated"]), dict(step["metrics"])
+        return self._iteration(number, steps, metrics, checkpoint / PRETRAINED_MODEL, self._validation(number))
 
     def begin(self) -> Iteration | None:
         """Return what the run goes on from: its last finished iteration, or the policy that it begins with, if any."""
@@ -181,7 +187,7 @@ class LearningRun:
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
-            write_own_files(new, meta, step | {"validated_at": self._validated_at})
+            write_own_files(new, meta, step | {"validated_at": self._validated_at, "given": self._given})
         for other in (self.folder / "checkpoints").iterdir():
             if not other.is_symlink() and other.name != f"{self._number:06d}":
                 shutil.rmtree(other, ignore_errors=True)
@@ -232,6 +238,10 @@ class LearningRun:
         if checkpoint is None:
             return
         step = read_step(checkpoint)
+        given = checks.mapping(f"{checkpoint}: given", step.get("given"))
+        for name, ours in self._given.items():
+            if ours != given.get(name):
+                raise MismatchError("content", name, ours, f"the run in {self.folder}", given.get(name))
         with readable_state(checkpoint), threads(1):
             self._learner.load(checkpoint / TRAINING_STATE, self._modules)
             self._number, self._simulated = int(step["step"]), int(step["simulated"])
@@ -257,6 +267,14 @@ class LearningRun:
         """A seed for one purpose of an iteration."""
         base = stream_base("reinforcement", self.config.seed)
         return int(rng_for(base + number, purpose).integers(2**63))
+
+
+def _hashes(config: LearningConfig, reward: Path | None) -> dict[str, str]:
+    """SHA-256 of everything that a run is given, by its place."""
+    folders = [folder for folder in (config.start, reward) if folder is not None]
+    return {str(root): dataset_sha256(root) for root in config.datasets} | {
+        str(folder): policy_sha256(folder) for folder in folders
+    }
 
 
 def _episode_steps(config: LearningConfig, demonstrations: Demonstrations | None) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.learning import LearningOptions, resumed
-from manip_il.cli.preferences import load_reward
+from manip_il.cli.preferences import load_reward, reward_folder
 from manip_il.errors import UsageError
 from manip_il.option import option
 
@@ -65,5 +65,6 @@ class PpoOptions(LearningOptions):
         from manip_il.algorithms.learning_run import LearningRun
 
         assert self.reward is not None
-        run = LearningRun(config, folder, engine, watch, absorbing=False)
+        reward = reward_folder(self.reward)
+        run = LearningRun(config, folder, engine, watch, absorbing=False, reward=reward)
         return resumed(run, reinforcement(run, load_reward(self.reward)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,21 @@ def test_a_reward_that_is_given_sees_steps_as_datasets_have_them(config, cloned,
     results = list(reinforcement(LearningRun(config, tmp_path, Engine(), absorbing=False), reward))
     assert [one.steps for one in results] == [40, 80]
     assert seen == [[40, 8, 8]] * 2
+
+
+def test_a_run_does_not_go_on_with_other_demonstrations_or_another_start(config, cloned, tmp_path):
+    demos, start = tmp_path / "demos", tmp_path / "start"
+    shutil.copytree(config.datasets[0], demos)
+    shutil.copytree(cloned, start)
+    config = replace(config, datasets=(demos,), start=start, validation_every=10**6)
+    run(config, tmp_path / "run", count=1)
+    for changed in (demos / "meta" / "stats.json", start / "config.json"):
+        before = changed.read_text()
+        changed.write_text(before + " ")
+        with pytest.raises(MismatchError, match="content differs"):
+            run(config, tmp_path / "run", count=1)
+        changed.write_text(before)
+    assert [one.number for one in run(config, tmp_path / "run", count=1)] == [2]
 
 
 def test_what_cannot_begin_is_refused(config, cloned, tmp_path):

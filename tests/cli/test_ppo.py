@@ -68,7 +68,8 @@ def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
     words = ["ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
     assert main([*words, "--output_dir=run", "--quiet"]) == 0
     assert "next: manip-il eval --policy.path=run" in capsys.readouterr().out
-    [record] = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())
+    start, record = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())
+    assert (start["iteration"], start["steps"], start["validation_episodes"]) == (0, 0, 1), "the clone itself"
     assert record["steps"] == 8, "episodes go on after success"
     assert (here / "run" / "best" / "pretrained_model" / "model.safetensors").is_file()
     assert "PPO on" in (here / "run" / "report.html").read_text()

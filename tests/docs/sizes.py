@@ -132,12 +132,18 @@ def shrink_study(path: Path) -> None:
     """Give every arm of a study small sizes, in place."""
     study = yaml.safe_load(path.read_text(encoding="utf-8"))
     of_dagger = {option.name for option in options_of(load("dagger"))}
-    for arm in (study["common"], *study["arms"].values()):
+    learning = [arm for arm in study["arms"].values() if "algorithm" in arm]
+    for arm in learning:
+        of_command = {option.name for option in options_of(load(arm["algorithm"]))}
+        arm |= {name: size for name, size in SMALL.items() if name in of_command and name != "workers"}
+        arm |= OF_COMMAND[arm["algorithm"]]
+    for arm in (study["common"], *(one for one in study["arms"].values() if "algorithm" not in one)):
         for option, size in (SMALL | GIVEN).items():
             if option in of_dagger and option in arm:
                 arm[option] = size
     common = study["common"]
-    common |= {option: size for option, size in SMALL.items() if option in of_dagger and option != "workers"}
+    kept = ("workers", "env.horizon") if learning else ("workers",)  # learning arms take the task's own horizon
+    common |= {option: size for option, size in SMALL.items() if option in of_dagger and option not in kept}
     policy = common.setdefault("policy", {})
     policy |= OF_POLICY.get(policy.get("type", "mlp"), {})
     if "image" in common:
