@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def airl(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:
     """Yield every iteration: roll out the learner, fit f by D = exp f / (exp f + pi), improve it by f - log pi."""
-    d = run.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.ppo.gamma))
+    d = run.keep(lambda actor: AirlDiscriminator(c.discriminator, actor, c.discount))
     for i in run.iterations():
         learner = run.rollouts(i)
         run.discriminate(d, learner)

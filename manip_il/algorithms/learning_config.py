@@ -35,7 +35,7 @@ class LearningConfig:
     )
     log_std: float | None = option(
         None,
-        "log of the first spread of actions, in deviations of the demonstrations'; by default -0.5, or -2 of a clone",
+        "log of the first spread of actions, in deviations of the demonstrations'; by default -0.5, or -1 of a clone",
     )
     warmup: int | None = option(
         None, "iterations in which critic and discriminator learn alone; by default 0, or 10 with --init"
@@ -64,11 +64,16 @@ class LearningConfig:
         stream_base("reinforcement", self.seed)
 
     @property
+    def discount(self) -> float:
+        """Discount of a control step."""
+        return self.ppo.discount(clone=self.start is not None)
+
+    @property
     def first_log_std(self) -> float:
         """Log of the first spread of actions; of a clone small, so that it explores close to what it does."""
         if self.log_std is not None:
             return self.log_std
-        return -0.5 if self.start is None else -2.0
+        return -0.5 if self.start is None else -1.0
 
     @property
     def warmup_iterations(self) -> int:

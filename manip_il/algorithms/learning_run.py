@@ -95,7 +95,8 @@ class LearningRun:
             self._actions = _action_range(self._policy.model)
             episodes = [RobotEpisode(config.env, self.conversion, hold) for _ in range(config.episodes)]
             self.envs = Lockstep(episodes, self._actions, self.horizon)
-            self._learner = Learner(self._policy.model, config.ppo, self.envs, self.horizon, config.first_log_std)
+            clone, log_std = config.start is not None, config.first_log_std
+            self._learner = Learner(self._policy.model, config.ppo, self.envs, self.horizon, log_std, clone=clone)
         self._expert = demonstrations.padded(self.horizon, self._actions.normalised) if demonstrations else None
 
     def keep(self, make: Callable[[MLPNetwork], Kept]) -> Kept:

@@ -16,10 +16,14 @@ REWARDS = ("logit", "log_d", "minus_log_one_minus_d")
 class PPOConfig:
     """Options of PPO, by its paper's names. Raises `UsageError` for a value out of range."""
 
-    lr: float = option(5e-4, "first learning rate of actor and critic; it falls linearly to a twentieth over the run")
+    lr: float | None = option(
+        None,
+        "first learning rate of actor and critic, falls linearly to a twentieth over the run; by default 5e-4, or 2e-4 "
+        "of a clone",
+    )
     epochs: int = option(10, "passes over an iteration's steps")
     minibatches: int = option(4, "gradient steps in one pass")
-    gamma: float = option(0.9, "discount of a control step")
+    gamma: float | None = option(None, "discount of a control step; by default 0.9, or 0.97 of a clone")
     gae_lambda: float = option(0.95, "of generalised advantage estimation")
     clip_range: float = option(0.2, "of the ratio of densities")
     entropy: float = option(0.0, "weight of the entropy")
@@ -27,14 +31,22 @@ class PPOConfig:
 
     def __post_init__(self) -> None:
         for name, low, high in (("lr", 0.0, 1.0), ("clip_range", 0.0, 1.0), ("target_kl", 0.0, math.inf)):
-            if not low < getattr(self, name) < high:
-                raise UsageError(f"ppo.{name} is {getattr(self, name)}; expected more than {low:g}, less than {high:g}")
+            if (value := getattr(self, name)) is not None and not low < value < high:
+                raise UsageError(f"ppo.{name} is {value}; expected more than {low:g}, less than {high:g}")
         for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"ppo.{name} is {getattr(self, name)}; expected 0 to 1")
+            if (value := getattr(self, name)) is not None and not 0 <= value <= 1:
+                raise UsageError(f"ppo.{name} is {value}; expected 0 to 1")
         for name, least in (("epochs", 1), ("minibatches", 1), ("entropy", 0)):
             if not getattr(self, name) >= least:
                 raise UsageError(f"ppo.{name} is {getattr(self, name)}; expected at least {least}")
+
+    def first_lr(self, *, clone: bool) -> float:
+        """Return the first learning rate. clone: whether the actor is one."""
+        return self.lr if self.lr is not None else 2e-4 if clone else 5e-4
+
+    def discount(self, *, clone: bool) -> float:
+        """Return gamma, by default longer for a clone, which lives to see what comes of its actions."""
+        return self.gamma if self.gamma is not None else 0.97 if clone else 0.9
 
 
 @dataclass(frozen=True)

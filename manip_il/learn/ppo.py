@@ -36,25 +36,27 @@ _METRICS = {"train/approx_kl": "kl", "train/value_loss": "value_loss", "train/ex
 class Learner:
     """An actor, a critic and PPO over `env`, whose episodes all have `horizon` steps.
 
-    log_std: of the actor's exploration, in normalised units; None for what the network has.
+    log_std: of the actor's exploration, in normalised units. clone: whether the actor is one, for the defaults.
     """
 
-    def __init__(self, network: MLPNetwork, config: PPOConfig, env: VecEnv, horizon: int, log_std: float | None = None):
+    def __init__(
+        self, network: MLPNetwork, config: PPOConfig, env: VecEnv, horizon: int, log_std: float, *, clone: bool = False
+    ):
         if env.num_envs % config.minibatches:
             raise UsageError(
                 f"episodes is {env.num_envs}; expected a multiple of ppo.minibatches ({config.minibatches})"
             )
         self.network = network
-        if log_std is not None:
-            set_log_std(network, log_std)
+        set_log_std(network, log_std)
+        lr = config.first_lr(clone=clone)
         self.ppo = PPO(
             ActorCritic,
             env,
-            learning_rate=lambda remaining: config.lr * max(LAST_LR, remaining),
+            learning_rate=lambda remaining: lr * max(LAST_LR, remaining),
             n_steps=horizon,
             batch_size=env.num_envs * horizon // config.minibatches,
             n_epochs=config.epochs,
-            gamma=config.gamma,
+            gamma=config.discount(clone=clone),
             gae_lambda=config.gae_lambda,
             clip_range=config.clip_range,
             ent_coef=config.entropy,
