@@ -35,6 +35,7 @@ from manip_il.engine.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
+from manip_il.learn.card import learnt_by_reinforcement, write_card
 from manip_il.learn.checkpoint import (
     PRETRAINED_MODEL,
     TRAINING_STATE,
@@ -87,6 +88,7 @@ class LearningRun:
         self.conversion = start_conversion(config.start, config.action_space, spec)
         demonstrations = read_demonstrations(config.datasets, self.conversion.encode) if config.datasets else None
         rows = demonstrations.stacked if demonstrations else None
+        self._demonstrations = demonstrations
         self.horizon = _episode_steps(config, demonstrations)
         hold = demonstrations.hold if demonstrations and absorbing else None
         with threads(1), lent_generators(self._stream(0, "weights")):
@@ -180,12 +182,15 @@ class LearningRun:
 
     def finish(self) -> Iteration:
         """Write the iteration, which ends it; validate its policy where that is due."""
+        config = self.config
         meta = CheckpointMeta.of(
-            self._spec, env_fingerprint(self.config.env), self._options(), action_space=self.conversion.space
+            self._spec, env_fingerprint(config.env), self._options(), action_space=self.conversion.space
         )
         step = {"step": self._number, "simulated": self._simulated, "metrics": self._metrics}
+        origin = learnt_by_reinforcement(self._demonstrations, self._simulated, config.seed, clone=bool(config.start))
         with unpublished(self.folder / "checkpoints" / f"{self._number:06d}") as new:
             save_policy(self._policy, self.conversion, new / PRETRAINED_MODEL)
+            write_card(new / PRETRAINED_MODEL, self._policy.config, meta, origin)
             (new / TRAINING_STATE).mkdir()
             self._learner.save(new / TRAINING_STATE, self._modules)
             write_own_files(new, meta, step | {"validated_at": self._validated_at, "given": self._given})

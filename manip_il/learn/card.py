@@ -4,35 +4,68 @@ from __future__ import annotations
 
 import string
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import ModelCard, ModelCardData
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.pretrained import observation_of
+from manip_il.learn.transitions import Demonstrations
 
 CARD_FILE = "README.md"
 
 
-def write_card(
-    folder: Path, pipeline: TrainPipelineConfig, meta: CheckpointMeta, dataset: Any, metrics: Mapping[str, Any]
-) -> None:
-    """Write `README.md`, valid for the Hub, into a `pretrained_model` folder.
+@dataclass(frozen=True)
+class Origin:
+    """How a policy was learnt. story: a sentence; datasets: its dataset's `repo_id`, if any; rows: name, value."""
+
+    story: str
+    datasets: str | None
+    rows: tuple[tuple[str, str], ...]
+
+
+def fit_origin(pipeline: TrainPipelineConfig, dataset: Any, metrics: Mapping[str, Any]) -> Origin:
+    """Return the origin of a cloned policy.
 
     dataset: LeRobot's metadata of what was learnt from; metrics: the last record of the fit, may be empty.
     """
-    policy, optimizer = pipeline.policy, pipeline.optimizer
-    assert policy is not None
+    optimizer = pipeline.optimizer
+    rows = [
+        ("learnt from", f"{dataset.total_episodes:,} episodes, {dataset.total_frames:,} frames of `{dataset.repo_id}`"),
+        ("fit", f"{pipeline.steps:,} steps of {pipeline.batch_size} samples, seed {pipeline.seed}"),
+        ("optimiser", f"{optimizer.type if optimizer else 'none'}, lr {optimizer.lr if optimizer else 0:g}"),
+        *((name, f"{metrics[name]:.5g}") for name in ("loss", "val_loss") if name in metrics),
+    ]
+    story = "Cloned from an inverse-kinematics expert in MuJoCo; there were no human demonstrations."
+    return Origin(story, dataset.repo_id, tuple(rows))
+
+
+def learnt_by_reinforcement(demonstrations: Demonstrations | None, steps: int, seed: int, *, clone: bool) -> Origin:
+    """Return the origin of a policy after so many simulated steps. clone: whether it began as one."""
+    rows = [
+        ("began as", "a clone" if clone else "a new network"),
+        ("reinforcement learning", f"PPO, {steps:,} simulated control steps, seed {seed}"),
+    ]
+    if demonstrations is not None:
+        frames = sum(map(len, demonstrations.inputs))
+        rows.insert(1, ("demonstrations", f"{len(demonstrations.inputs):,} episodes, {frames:,} frames"))
+    return Origin("Learnt by reinforcement learning in MuJoCo.", None, tuple(rows))
+
+
+def write_card(folder: Path, policy: PreTrainedConfig, meta: CheckpointMeta, origin: Origin) -> None:
+    """Write `README.md`, valid for the Hub, into a `pretrained_model` folder."""
     data = ModelCardData(
         license=policy.license or "apache-2.0",
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=sorted({*(policy.tags or []), "robotics", "lerobot", "manip_il", policy.type, meta.robot, meta.task}),
         model_name=f"{policy.type}_{meta.robot}_{meta.task}",
-        datasets=dataset.repo_id,
+        datasets=origin.datasets,
     )
     inputs = policy.input_features or {}
     names = ", ".join(f"`{key}`" for key in inputs)
@@ -41,10 +74,7 @@ def write_card(
         ("robot, task", f"`{meta.robot}`, `{meta.task}`, {meta.fps} actions/s"),
         ("action", f"{meta.action_meaning}: {', '.join(meta.joint_names)}"),
         ("learnt as", f"`{meta.action_space}`"),
-        ("learnt from", f"{dataset.total_episodes:,} episodes, {dataset.total_frames:,} frames of `{dataset.repo_id}`"),
-        ("fit", f"{pipeline.steps:,} steps of {pipeline.batch_size} samples, seed {pipeline.seed}"),
-        ("optimiser", f"{optimizer.type if optimizer else 'none'}, lr {optimizer.lr if optimizer else 0:g}"),
-        *((name, f"{metrics[name]:.5g}") for name in ("loss", "val_loss") if name in metrics),
+        *origin.rows,
         ("made by", f"manip_il {version('manip_il')}"),
     ]
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)
@@ -52,7 +82,7 @@ def write_card(
     text = (
         f"---\n{data.to_yaml()}\n---\n\n"
         f"# {policy.type} for {meta.robot} {meta.task}\n\n"
-        "Cloned from an inverse-kinematics expert in MuJoCo; there were no human demonstrations.\n\n"
+        f"{origin.story}\n\n"
         f"| | |\n|---|---|\n{table}\n\n"
         "Success on unseen seeds, with its interval:\n\n"
         "```sh\nmanip-il eval --policy.path=FOLDER_OF_THIS_FILE --eval.n_episodes=500 --output_dir=eval\n```\n\n"

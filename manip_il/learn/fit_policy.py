@@ -32,7 +32,7 @@ from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for, same_width
 from manip_il.learn.action_steps import is_in_processors
 from manip_il.learn.batches import generator_of, order_of, pictures_to_float, prefetched
-from manip_il.learn.card import write_card
+from manip_il.learn.card import fit_origin, write_card
 from manip_il.learn.checkpoint import (
     PRETRAINED_MODEL,
     CheckpointMeta,
@@ -224,7 +224,8 @@ class PolicyTrainer:
                 state, processors = (self.optimizer, self.scheduler), (self.preprocessor, self.postprocessor)
                 save_checkpoint(new, self.step, self.pipeline, policy, *state, *processors)
                 write_own_files(new, self.meta, read_step(new) | own)
-                write_card(new / PRETRAINED_MODEL, self.pipeline, self.meta, self.dataset, record)
+                origin = fit_origin(self.pipeline, self.dataset, record)
+                write_card(new / PRETRAINED_MODEL, policy.config, self.meta, origin)
         self.accelerator.wait_for_everyone()
 
     def _update(self, batch: Batch) -> dict[str, float]:

@@ -27,7 +27,10 @@ from manip_il.store.manifest import CARD, CONFIG, Kind, journals_of, policy_fold
 PICTURE = "assets/episodes.png"
 _MADE_BY = "| made by | manip_il"  # a row of every card of ours
 _REPOSITORY = "USER/NAME"  # in the commands of a card that is not for a Hub
-_COMMANDS = {"RecordOptions": "record", "TrainOptions": "train", "DaggerOptions": "dagger"}
+_COMMANDS = {
+    **{"RecordOptions": "record", "TrainOptions": "train", "DaggerOptions": "dagger"},
+    **{"GailOptions": "gail", "AirlOptions": "airl", "PpoOptions": "ppo"},
+}
 _HEADER = re.compile(r"# manip-il \S+: resolved options \((\w+)\)")
 _NOT_SHOWN = (  # options that are places, or concern one machine
     *("root", "output_dir", "repo_id", "config_path", "resume", "overwrite", "engine", "device", "workers", "threads"),
