@@ -69,6 +69,14 @@ class ArmIK:
         data = self._configuration.data
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
+    def _at(self, q: F64) -> tuple[F64, F64]:
+        """`ee_pose` as views, which the next posture overwrites, and without what mink updates beside kinematics."""
+        model, data = self._configuration.model, self._configuration.data
+        data.qpos[self._address] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        return data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
         self._frame.transform_target_to_world = _se3(position, rotation)
@@ -126,7 +134,7 @@ class ArmIK:
         """Joints (B, arm) after one step of the expert's kind, and the poses that it is towards, (B, 3), (B, 3, 3)."""
         reached, positions, rotations = q.copy(), np.empty((len(q), 3)), np.empty((len(q), 3, 3))
         for row, motion in enumerate(motions):
-            position, rotation = self.ee_pose(q[row])
+            position, rotation = self._at(q[row])
             positions[row], rotations[row] = position + motion[:3], rotation_matrix(motion[3:]) @ rotation
             dq = self.displacement(positions[row], rotations[row], _LARGEST)
             if dq is not None:
@@ -135,12 +143,12 @@ class ArmIK:
 
     def _linearised(self, q: F64, positions: F64, rotations: F64) -> tuple[F64, F64]:
         """Pose errors (B, 6) [m, rad] and Jacobians (B, 6, arm) of `ee` at joints (B, arm)."""
-        errors, jacobians = np.empty((len(q), 6)), np.empty((len(q), 6, q.shape[1]))
+        at, turned, jacobians = np.empty((len(q), 3)), np.empty((len(q), 3, 3)), np.empty((len(q), 6, q.shape[1]))
         for row, joints in enumerate(q):
-            at, turned = self.ee_pose(joints)
-            errors[row, :3], errors[row, 3:] = positions[row] - at, rotation_vector(rotations[row] @ turned.T)
+            at[row], turned[row] = self._at(joints)
             jacobians[row] = self._site_jacobian()
-        return errors, jacobians
+        angles = [rotation_vector(rotation) for rotation in rotations @ turned.transpose(0, 2, 1)]
+        return np.hstack([positions - at, angles]), jacobians
 
     def _within(self, q: F64) -> F64:
         return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])
