@@ -42,7 +42,7 @@ from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
-from manip_il.robots.rotations import rotation_matrix, rotation_vector
+from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # inverse kinematics takes a second to import
     from manip_il.robots.ik import ArmIK

@@ -39,7 +39,7 @@ class ActorCritic(ActorCriticPolicy):
         inputs = network.input_mean.shape[0] + EXTRA
         self.actor = network
         self.critic = nn.Sequential(
-            nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), nn.Linear(width, 1)
+            nn.Linear(inputs, width), _Tanh(), nn.Linear(width, width), _Tanh(), nn.Linear(width, 1)
         )
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1), eps=1e-5, fused=True)
 
@@ -61,12 +61,13 @@ class ActorCritic(ActorCriticPolicy):
     @override
     def evaluate_actions(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return values (B, 1), log-densities (B,) and entropies (B,) [nats]."""
-        x, live = self._encoded(obs), _live(obs)
-        mean, log_std = self._gaussian(x)
-        free = self._free
-        each = -0.5 * ((actions - mean) * torch.exp(-log_std)).square() - log_std - _HALF_LOG_2PI
-        entropy = ((log_std + 0.5 + _HALF_LOG_2PI) * free).sum() * live
-        return self._values(x, obs), (each * free).sum(1) * live, entropy
+        x = self._encoded(obs)
+        log_prob, entropy = self._density(x, _live(obs), actions)
+        return self._values(x, obs), log_prob, entropy
+
+    def log_prob(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log-densities of actions (B, n) and entropies, (B,) both [nats]: `evaluate_actions` without values."""
+        return self._density(self._encoded(obs), _live(obs), actions)
 
     @override
     def predict_values(self, obs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -94,8 +95,22 @@ class ActorCritic(ActorCriticPolicy):
         """Mean (B, n) and log-deviations (n,) of actions, for encoded inputs."""
         return self.actor.layers(x), floored_log_std(_head(self.actor).raw_log_std)
 
+    def _density(self, x: Tensor, live: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_std = self._gaussian(x)
+        free = self._free
+        each = -0.5 * ((actions - mean) * torch.exp(-log_std)).square() - log_std - _HALF_LOG_2PI
+        return (each * free).sum(1) * live, ((log_std + 0.5 + _HALF_LOG_2PI) * free).sum() * live
+
     def _values(self, x: Tensor, obs: Tensor) -> Tensor:
         return self.critic(torch.cat([x * _live(obs).unsqueeze(1), obs[:, -EXTRA:]], dim=1))
+
+
+class _Tanh(nn.Module):
+    """tanh x = 2 / (1 + exp(-2 x)) - 1: torch's sigmoid and two products take a third of the time of its tanh."""
+
+    @override
+    def forward(self, x: Tensor) -> Tensor:
+        return 2.0 * torch.sigmoid(2.0 * x) - 1.0
 
 
 def set_log_std(network: MLPNetwork, log_std: float) -> None:

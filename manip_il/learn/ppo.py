@@ -91,7 +91,8 @@ class Learner:
 
     def _judge(self, buffer: RolloutBuffer) -> None:
         """Give the buffer values and log-densities of all its steps, which `ActorCritic.forward` leaves out."""
-        obs, actions = (torch.from_numpy(rows.reshape(-1, rows.shape[-1])) for rows in (buffer.observations, buffer.actions))
+        given = (buffer.observations, buffer.actions)
+        obs, actions = (torch.from_numpy(rows.reshape(-1, rows.shape[-1])) for rows in given)
         with torch.no_grad():
             values, log_probs, _ = self.policy.evaluate_actions(obs, actions)
         buffer.values[:] = values.numpy().reshape(buffer.values.shape)
@@ -123,8 +124,7 @@ class Learner:
         """
         obs = torch.from_numpy(np.pad(rows.states, ((0, 0), (0, EXTRA - 1))))
         with torch.no_grad():
-            _, log_prob, entropy = self.policy.evaluate_actions(obs, torch.from_numpy(rows.actions))
-        assert entropy is not None
+            log_prob, entropy = self.policy.log_prob(obs, torch.from_numpy(rows.actions))
         return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:
