@@ -57,7 +57,9 @@ def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
     alone.seeds, beside.seeds = [7], [5, 6, 7]
     alone.reset()
     beside.reset()
-    beside.episodes[1]._hold, beside.episodes[1]._held = 0, 1  # it has ended
+    middle = beside.episodes[1]
+    assert isinstance(middle, RobotEpisode)
+    middle._hold, middle._held = 0, 1  # it has ended
     one, three = np.stack([up(0.02)]), np.stack([up(0.03), up(-0.01), up(0.02)])
     for _ in range(2):
         alone.step_async(one)
