@@ -43,10 +43,9 @@ class Recorded(RobotEpisode):
         self.began, self.controls = mujoco.MjData(self._env.world.model), []
         mujoco.mj_copyData(self.began, self._env.world.model, self._env.data)
 
-    def advance(self, target: np.ndarray) -> np.ndarray:
-        action = super().advance(target)
+    def advance(self, action: np.ndarray) -> None:
+        super().advance(action)
         self.controls.append(self._env.data.ctrl.copy())
-        return action
 
     def replay(self) -> None:
         for control in self.controls:
@@ -77,7 +76,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
     env = EnvConfig(robot, task)
     config = LearningConfig(env=env, datasets=(demos,), episodes=16, steps=NEVER, validation_every=NEVER)
     run = LearningRun(config, folder, Engine())
-    recorded = [Recorded(env, run.conversion, None) for _ in range(config.episodes)]
+    recorded = [Recorded(env, None) for _ in range(config.episodes)]
     run.envs.episodes = recorded
     d = run.keep(lambda actor: GailDiscriminator(config.discriminator, actor))
     found = []
@@ -86,7 +85,7 @@ def measure(robot: str, task: str, folder: Path, iterations: int) -> list[tuple[
         learner = run.rollouts(number)
         times.append(time.process_time())
         run.discriminate(d, learner)
-        run.improve(d.reward(learner, run.log_prob(learner)))
+        run.improve(d.reward(learner))
         run.finish()
         times.append(time.process_time())
         for episode in recorded:

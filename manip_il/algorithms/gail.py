@@ -19,5 +19,5 @@ def gail(run: LearningRun, c: LearningConfig) -> Iterator[Iteration]:
     for i in run.iterations():
         learner = run.rollouts(i)
         run.discriminate(d, learner)
-        run.improve(d.reward(learner, run.log_prob(learner)))
+        run.improve(d.reward(learner))
         yield run.finish()

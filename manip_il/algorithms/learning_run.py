@@ -95,8 +95,8 @@ class LearningRun:
             seed = stream_base("training", config.seed)
             self._policy = start_policy(config.start, self.conversion.space, spec, seed, rows)
             self._actions = _action_range(self._policy.model)
-            episodes = [RobotEpisode(config.env, self.conversion, hold) for _ in range(config.episodes)]
-            self.envs = Lockstep(episodes, self._actions, self.horizon)
+            episodes = [RobotEpisode(config.env, hold) for _ in range(config.episodes)]
+            self.envs = Lockstep(episodes, self._actions, self.horizon, self.conversion)
             clone, log_std = config.start is not None, config.first_log_std
             self._learner = Learner(self._policy.model, config.ppo, self.envs, self.horizon, log_std, clone=clone)
         self._expert = demonstrations.padded(self.horizon, self._actions.normalised) if demonstrations else None
@@ -168,7 +168,8 @@ class LearningRun:
         rng = rng_for(self._stream(self._number, "discriminator"), "batches")
         with self._timed("fit"), threads(1):
             expert = self._learner.explored(self._expert, rng)
-            log_probs = self._learner.log_prob(expert), self._learner.log_prob(learner)
+            density = self._learner.log_prob
+            log_probs = (density(expert), density(learner)) if d.asks_density else None
             found = d.fit(expert, learner, log_probs, rng)
         self._metrics |= {f"discriminator_{name}": value for name, value in found.items()}
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from manip_il.engine.simulations import simulation_of
 from manip_il.errors import MismatchError
-from manip_il.learn.action_spaces import Conversion
+from manip_il.learn.action_spaces import Conversion, JointTarget
 from manip_il.mdp import Observation
 from manip_il.sim.config import EnvConfig
 
@@ -35,8 +35,8 @@ class Simulated(Protocol):
         """Return what the policy observes now, raw, (d,)."""
         ...
 
-    def advance(self, target: F32) -> F64:
-        """Apply the policy's raw target (n,) for one control step; return the action that it means, (n,)."""
+    def advance(self, action: F64) -> None:
+        """Apply an action (n,) for one control step."""
         ...
 
     @property
@@ -51,13 +51,10 @@ class Simulated(Protocol):
 
 
 class RobotEpisode:
-    """One of our environments. conversion: of the policy's actions. hold: control steps from success to the end.
+    """One of our environments. hold: control steps from success to the end; None: to the last step in any case."""
 
-    hold None: the episode goes on to its last step whatever happens.
-    """
-
-    def __init__(self, config: EnvConfig, conversion: Conversion, hold: int | None):
-        self._env, self._conversion, self._hold = simulation_of(config.robot).make(config), conversion, hold
+    def __init__(self, config: EnvConfig, hold: int | None):
+        self._env, self._hold = simulation_of(config.robot).make(config), hold
         self._held = 0
 
     def start(self, seed: int) -> None:
@@ -70,13 +67,11 @@ class RobotEpisode:
         """Return joint and environment state, raw, (n + k,)."""
         return np.concatenate([self._seen.state, self._seen.environment_state])
 
-    def advance(self, target: F32) -> F64:
-        """Apply a target (n,) in the policy's action space; return joint targets and opening (n,)."""
-        action = self._conversion.decode(target[None], self._seen.state[None])[0].astype(np.float64)
+    def advance(self, action: F64) -> None:
+        """Apply joint targets and opening (n,)."""
         self._env.advance(action)
         self._held += self._held > 0 or self._env.solved
         self._begin()
-        return action
 
     @property
     def ended(self) -> bool:
@@ -125,14 +120,18 @@ class ActionRange:
 class Lockstep(VecEnv):
     """Episodes of `horizon` steps, side by side. Observations (B, d + 2): inputs, absorbing or not, share of time gone.
 
+    conversion: of the policy's raw targets into actions; the first of the inputs are the measured joints that it needs.
     `seeds` are those of the next `reset`. simulated: control steps since then. executed: actions (T, B, n) since then.
     """
 
-    def __init__(self, episodes: Sequence[Simulated], actions: ActionRange, horizon: int):
+    def __init__(
+        self, episodes: Sequence[Simulated], actions: ActionRange, horizon: int, conversion: Conversion | None = None
+    ):
         self.episodes: Sequence[Simulated] = list(episodes)
-        self.actions, self.horizon = actions, horizon
+        self.actions, self.horizon, self._conversion = actions, horizon, conversion or JointTarget()
         self.seeds: Sequence[int] = range(len(episodes))
         self.simulated, self._step, self._given = 0, 0, np.empty((0, 0), np.float32)
+        self._seen = np.empty((0, 0), np.float32)
         self.executed: list[F64] = []
         self.episodes[0].start(0)
         d = len(self.episodes[0].inputs())
@@ -163,11 +162,14 @@ class Lockstep(VecEnv):
     def step_wait(self) -> Any:
         """Advance every episode that is under way; return observations, rewards of 0, dones and infos."""
         targets = self.actions.raw(self._given).astype(np.float32)
+        running = [row for row, episode in enumerate(self.episodes) if not episode.ended]
         executed = np.zeros(targets.shape)
-        for row, (episode, target) in enumerate(zip(self.episodes, targets, strict=True)):
-            if not episode.ended:
-                executed[row] = episode.advance(target)
-                self.simulated += 1
+        if running:
+            joints = self._seen[running, : targets.shape[1]]
+            executed[running] = self._conversion.decode(targets[running], joints)
+        for row in running:
+            self.episodes[row].advance(executed[row])
+        self.simulated += len(running)
         self._step += 1
         self.executed.append(executed)
         done = np.full(self.num_envs, self._step >= self.horizon)
@@ -182,6 +184,7 @@ class Lockstep(VecEnv):
             else:
                 row[:-2] = episode.inputs()
         rows[:, -1] = self._step / self.horizon
+        self._seen = rows
         return rows
 
     @override

@@ -13,7 +13,7 @@ the opening's command, what a dataset holds and an environment takes), and (p, R
 observed there, so that "towards it" is the same numbers however the hand is turned, and stock environments
 (robosuite's OSC_POSE, gymnasium-robotics) mean the same by it. It has as many numbers as the robot's action, so that a
 network has the environment's shape; those between the six and the opening are 0 and are not read. Six numbers need an
-arm of six joints or more. The way back finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.solve`). The pose is
+arm of six joints or more. The way back finds q* near q with FK(q*) = (p + dp, exp(dR) R) (`ArmIK.moved`). The pose is
 reached again to rounding, the joints are not: an arm of seven joints has a motion of the elbow that leaves the hand
 where it is, which six numbers do not hold. It is chosen as the expert chooses it, by the pull to the home posture. A
 pose out of reach is approached.
@@ -42,7 +42,7 @@ from manip_il.data.schema import JOINT_TARGETS, RobotTaskSpec
 from manip_il.errors import MismatchError, UnknownName, UsageError
 from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET
 from manip_il.robots import ROBOTS
-from manip_il.robots.rotations import rotation_matrix, rotation_vector
+from manip_il.robots.rotations import rotation_vector
 
 if TYPE_CHECKING:  # inverse kinematics takes a second to import
     from manip_il.robots.ik import ArmIK
@@ -122,13 +122,9 @@ class HandDelta:
 
     def decode(self, targets: NDArray[Numbers], states: NDArray[Any]) -> NDArray[Numbers]:
         """Return actions (N, n) whose joints bring the hand to where targets (N, n) say, by inverse kinematics."""
-        ik, actions = _arm_ik(self.robot), np.empty_like(targets)
-        for action, target, state in zip(actions, targets, states, strict=True):
-            q, motion = self._to_radians(state[ARM]), np.asarray(target, np.float64)
-            position, rotation = ik.ee_pose(q)
-            turned = rotation_matrix(motion[_ROTATION]) @ rotation
-            joints = ik.solve(q, position + motion[_POSITION], turned)
-            action[ARM], action[GRIPPER] = np.degrees(joints) if self._in_degrees else joints, target[GRIPPER]
+        actions, motions = targets.copy(), targets[:, :_POSE].astype(np.float64)
+        joints = _arm_ik(self.robot).moved(self._to_radians(states[:, ARM]), motions)
+        actions[:, ARM] = np.degrees(joints) if self._in_degrees else joints
         return actions
 
     @property
@@ -138,7 +134,7 @@ class HandDelta:
         return get_robot(self.robot).lerobot is not None
 
     def _to_radians(self, joints: NDArray[Any]) -> NDArray[np.float64]:
-        """Joints (n - 1,) [rad] in double precision of an action's or a state's."""
+        """Joints (..., n - 1) [rad] in double precision of an action's or a state's."""
         return np.radians(joints, dtype=np.float64) if self._in_degrees else np.asarray(joints, np.float64)
 
 

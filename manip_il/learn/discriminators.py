@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
 from torch.nn.utils.parametrizations import spectral_norm
 
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.learn.adversarial_config import REWARDS, DiscriminatorConfig
 from manip_il.learn.network import MLPNetwork
 from manip_il.learn.transitions import F32, Transitions
@@ -38,6 +38,7 @@ class Discriminator(nn.Module, ABC):
     scale: Tensor
     clamp: Tensor
     free: Tensor
+    asks_density = False  # whether the logit depends on how likely an action is for the learner
 
     def __init__(self, config: DiscriminatorConfig, network: MLPNetwork) -> None:
         super().__init__()
@@ -47,7 +48,7 @@ class Discriminator(nn.Module, ABC):
         self.register_buffer("clamp", torch.tensor(network.clamp))
         self.register_buffer("free", (network.target_scale > 0).float())
         self.build(len(self.mean) + 1, len(self.free))
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=config.lr, fused=True)
 
     @abstractmethod
     def build(self, e: int, n: int) -> None:
@@ -61,20 +62,23 @@ class Discriminator(nn.Module, ABC):
     def rewards_of(self, logits: Tensor) -> Tensor:
         """Return the learner's reward, (B,)."""
 
-    def reward(self, learner: Transitions, log_probs: F32) -> F32:
-        """Return the reward of every transition, (N,), within +-10. log_probs: of its action for the learner, (N,)."""
+    def reward(self, learner: Transitions, log_probs: F32 | None = None) -> F32:
+        """Return the reward of every transition, (N,), within +-10.
+
+        log_probs: of its action for the learner, (N,), where the discriminator `asks_density`.
+        """
         with torch.no_grad():
             rewards = self.rewards_of(self.logits(self._encode(learner, log_probs)))
         return rewards.clamp(-LARGEST_REWARD, LARGEST_REWARD).numpy().astype(np.float32)
 
     def fit(
-        self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32], rng: np.random.Generator
+        self, expert: Transitions, learner: Transitions, log_probs: tuple[F32, F32] | None, rng: np.random.Generator
     ) -> dict[str, float]:
         """Take an iteration's gradient steps; return the loss, and accuracies before them.
 
-        log_probs: of the expert's and the learner's actions for the learner, (N,) each.
+        log_probs: of the expert's and the learner's actions for the learner, (N,) each, where it `asks_density`.
         """
-        data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs, strict=True)]
+        data = [self._encode(one, log) for one, log in zip((expert, learner), log_probs or (None, None), strict=True)]
         with torch.no_grad():
             right = [(self.logits(data[0]) > 0).float().mean().item(), (self.logits(data[1]) < 0).float().mean().item()]
         losses = [self._step(data, rng) for _ in range(self.config.steps)]
@@ -115,9 +119,12 @@ class Discriminator(nn.Module, ABC):
             wrap(nn.Linear(width, 1)),
         )
 
-    def _encode(self, rows: Transitions, log_probs: F32) -> Batch:
+    def _encode(self, rows: Transitions, log_probs: F32 | None) -> Batch:
+        if log_probs is None and self.asks_density:
+            raise UsageError(f"{type(self).__name__} needs the log-densities of actions; give log_probs")
+        log_prob = torch.zeros(len(rows)) if log_probs is None else torch.from_numpy(log_probs)
         actions = torch.from_numpy(rows.actions) * self.free * (1.0 - torch.from_numpy(rows.states[:, -1:]))
-        return self._state(rows.states), actions, self._state(rows.next_states), torch.from_numpy(log_probs)
+        return self._state(rows.states), actions, self._state(rows.next_states), log_prob
 
     def _state(self, states: F32) -> Tensor:
         given = torch.from_numpy(states)
@@ -156,6 +163,8 @@ class AirlDiscriminator(Discriminator):
     pi is taken relative to exp(-H), H its entropy: else -log pi, which is H on average, rewards every step of living
     on, but none in the absorbing state, where nothing is drawn, and f has to follow H while the spread changes.
     """
+
+    asks_density = True
 
     def __init__(self, config: DiscriminatorConfig, network: MLPNetwork, gamma: float) -> None:
         self._gamma = gamma

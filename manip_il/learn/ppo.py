@@ -19,6 +19,7 @@ from gymnasium.spaces import Box
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from safetensors.torch import load_file, save_file
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
@@ -84,10 +85,20 @@ class Learner:
         self.ppo._last_obs = np.asarray(env.reset())
         self.ppo._last_episode_starts = np.ones(env.num_envs, dtype=bool)
         self.ppo.collect_rollouts(env, self._callback, buffer, self.ppo.n_steps)
+        self._judge(buffer)
         after = np.concatenate([buffer.observations[1:], np.asarray(self.ppo._last_obs)[None]])
         states, next_states = (rows[..., :-1].reshape(-1, rows.shape[-1] - 1) for rows in (buffer.observations, after))
         actions = np.clip(buffer.actions, *self._bounds).reshape(len(states), -1) * (1.0 - states[:, -1:])
         return Transitions(states.astype(np.float32), actions.astype(np.float32), next_states.astype(np.float32))
+
+    def _judge(self, buffer: RolloutBuffer) -> None:
+        """Give the buffer values and log-densities of all its steps, which `ActorCritic.forward` leaves out."""
+        given = (buffer.observations, buffer.actions)
+        obs, actions = (torch.from_numpy(rows.reshape(-1, rows.shape[-1])) for rows in given)
+        with torch.no_grad():
+            values, log_probs, _ = self.policy.evaluate_actions(obs, actions)
+        buffer.values[:] = values.numpy().reshape(buffer.values.shape)
+        buffer.log_probs[:] = log_probs.numpy().reshape(buffer.log_probs.shape)
 
     def improve(self, rewards: F32, *, actor: bool = True, remaining: float = 1.0) -> dict[str, float]:
         """Take an iteration's gradient steps on what `collect` ran; rewards: (N,) in its order. Returns metrics.
@@ -115,8 +126,7 @@ class Learner:
         """
         obs = torch.from_numpy(np.pad(rows.states, ((0, 0), (0, EXTRA - 1))))
         with torch.no_grad():
-            _, log_prob, entropy = self.policy.evaluate_actions(obs, torch.from_numpy(rows.actions))
-        assert entropy is not None
+            log_prob, entropy = self.policy.log_prob(obs, torch.from_numpy(rows.actions))
         return (log_prob + entropy).numpy()
 
     def explored(self, rows: Transitions, rng: np.random.Generator) -> Transitions:

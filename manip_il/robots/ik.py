@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.robots.robot import Robot
-from manip_il.robots.rotations import rotation_vector, yaw_ahead
+from manip_il.robots.rotations import rotation_matrix, rotation_vector, yaw_ahead
 from manip_il.robots.spec import arm_model
 
 F64 = NDArray[np.float64]
@@ -21,10 +21,10 @@ _LM_DAMPING = 1e-3
 _DAMPING = 1e-5
 _UNBOUNDED = 1e30  # DAQP's infinity
 _CONVERGED = 1e-4  # weighted pose error that is none [m]
-_CORRECTIONS = 3  # Gauss-Newton steps of `solve`; the error is squared by each
-_EXACT = 1e-9  # pose error that is none to `solve` [m] or [rad]
+_CORRECTIONS = 3  # Gauss-Newton steps of `moved`; the error is squared by each
+_EXACT = 1e-9  # pose error that is none to `moved` [m] or [rad]
 _LEVENBERG = 1e-8  # added to J J^T, so that a singular posture gives a short step
-_LARGEST = 0.5  # of a joint in one step of `solve` [rad]
+_LARGEST = 0.5  # of a joint in one step of `moved` [rad]
 
 
 class ArmIK:
@@ -69,6 +69,14 @@ class ArmIK:
         data = self._configuration.data
         return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
 
+    def _at(self, q: F64) -> tuple[F64, F64]:
+        """`ee_pose` as views, which the next posture overwrites, and without what mink updates beside kinematics."""
+        model, data = self._configuration.model, self._configuration.data
+        data.qpos[self._address] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        return data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
         self._frame.transform_target_to_world = _se3(position, rotation)
@@ -100,25 +108,47 @@ class ArmIK:
         mujoco.mj_kinematics(self._configuration.model, data)
         return dq, self._pose_error(position, rotation, weight) / before
 
-    def solve(self, q: F64, position: F64, rotation: F64) -> F64:
-        """Return joints (arm,) [rad], within their limits and near `q`, with which `ee` has a pose.
+    def moved(self, q: F64, motions: F64) -> F64:
+        """Return joints (B, arm) [rad], within their limits and near `q` (B, arm), with which `ee` has moved.
 
-        The first step is `step`, which resolves what the pose leaves open (the elbow of an arm of seven joints) as for
-        the expert; the corrections after it are the shortest that the linearised kinematics has (damped least squares).
-        A pose that is out of reach is approached.
+        motions: of its position [m] and rotation vectors [rad] in the world's axes, (B, 6). The first step is
+        `displacement`, which resolves what a pose leaves open (the elbow of an arm of seven joints) as for the expert;
+        the corrections after it are the shortest that the linearised kinematics has (damped least squares). A pose that
+        is out of reach is approached. A row's result does not depend on the rows beside it, bit for bit.
         """
-        self.ee_pose(q)
-        first = self.step(position, rotation, _LARGEST)
-        q = self._within(q if first is None else q + first[0])
+        reached, positions, rotations = self._first_steps(q, motions)
+        rows = np.arange(len(q))
         for _ in range(_CORRECTIONS):
-            at, turned = self.ee_pose(q)
-            error = np.concatenate([position - at, rotation_vector(rotation @ turned.T)])
-            if np.abs(error).max() < _EXACT:
+            errors, jacobians = self._linearised(reached[rows], positions[rows], rotations[rows])
+            far = np.abs(errors).max(axis=1) >= _EXACT
+            if not far.any():
                 break
-            jacobian = self._site_jacobian()
-            dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _LEVENBERG * np.eye(6), error)
-            q = self._within(q + dq * min(1.0, _LARGEST / max(float(np.abs(dq).max()), _LARGEST)))
-        return q
+            rows, errors, jacobians = rows[far], errors[far], jacobians[far]
+            back = jacobians.transpose(0, 2, 1)
+            dq = (back @ np.linalg.solve(jacobians @ back + _LEVENBERG * np.eye(6), errors[..., None]))[..., 0]
+            longest = np.maximum(np.abs(dq).max(axis=1, keepdims=True), _LARGEST)
+            reached[rows] = self._within(reached[rows] + dq * np.minimum(1.0, _LARGEST / longest))
+        return reached
+
+    def _first_steps(self, q: F64, motions: F64) -> tuple[F64, F64, F64]:
+        """Joints (B, arm) after one step of the expert's kind, and the poses that it is towards, (B, 3), (B, 3, 3)."""
+        reached, positions, rotations = q.copy(), np.empty((len(q), 3)), np.empty((len(q), 3, 3))
+        for row, motion in enumerate(motions):
+            position, rotation = self._at(q[row])
+            positions[row], rotations[row] = position + motion[:3], rotation_matrix(motion[3:]) @ rotation
+            dq = self.displacement(positions[row], rotations[row], _LARGEST)
+            if dq is not None:
+                reached[row] += dq
+        return self._within(reached), positions, rotations
+
+    def _linearised(self, q: F64, positions: F64, rotations: F64) -> tuple[F64, F64]:
+        """Pose errors (B, 6) [m, rad] and Jacobians (B, 6, arm) of `ee` at joints (B, arm)."""
+        at, turned, jacobians = np.empty((len(q), 3)), np.empty((len(q), 3, 3)), np.empty((len(q), 6, q.shape[1]))
+        for row, joints in enumerate(q):
+            at[row], turned[row] = self._at(joints)
+            jacobians[row] = self._site_jacobian()
+        angles = [rotation_vector(rotation) for rotation in rotations @ turned.transpose(0, 2, 1)]
+        return np.hstack([positions - at, angles]), jacobians
 
     def _within(self, q: F64) -> F64:
         return np.minimum(np.maximum(q, self.limits[:, 0]), self.limits[:, 1])

@@ -26,46 +26,65 @@ def up(height: float) -> np.ndarray:
 
 def lockstep(count: int, hold: int | None = 2, horizon: int = 12) -> Lockstep:
     ones = np.ones(8, np.float32)
-    return Lockstep(
-        [RobotEpisode(ENV, HAND, hold) for _ in range(count)], ActionRange(0 * ones, ones, -ones, ones), horizon
-    )
+    episodes = [RobotEpisode(ENV, hold) for _ in range(count)]
+    return Lockstep(episodes, ActionRange(0 * ones, ones, -ones, ones), horizon, HAND)
 
 
-def expert_target(episode: RobotEpisode) -> np.ndarray:
+def expert_action(episode: RobotEpisode) -> np.ndarray:
     env = episode._env
     turn = Turn(0, 0, env.observe(), env.get_state(), simulation_of("fetch").expert(ENV))
-    return HAND.encode(turn.query().action[None], turn.observation.state[None])[0].astype(np.float32)
+    return turn.query().action
 
 
 def test_a_target_reaches_the_robot_as_the_joints_it_means():
-    episode, env = RobotEpisode(ENV, HAND, None), ManipEnv.of(ENV)
-    episode.start(5)
+    ours, env = lockstep(2, hold=None), ManipEnv.of(ENV)
+    ours.seeds = [4, 5]
+    observed = ours.reset()
     env.start(5)
-    for _ in range(3):
+    for step in range(3):
         seen = env.observe()
-        assert np.array_equal(episode.inputs(), np.concatenate([seen.state, seen.environment_state]))
+        assert np.array_equal(observed[1, :-2], np.concatenate([seen.state, seen.environment_state]))
         action = HAND.decode(up(0.02)[None], seen.state[None])[0].astype(np.float64)
         env.begin_step()
         env.advance(action)
-        assert np.array_equal(episode.advance(up(0.02)), action)
+        ours.step_async(np.stack([up(-0.01), up(0.02)]))
+        observed = ours.step_wait()[0]
+        assert np.array_equal(ours.executed[step][1], action)
+
+
+def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
+    alone, beside = lockstep(1, hold=None), lockstep(3, hold=None)
+    alone.seeds, beside.seeds = [7], [5, 6, 7]
+    alone.reset()
+    beside.reset()
+    middle = beside.episodes[1]
+    assert isinstance(middle, RobotEpisode)
+    middle._hold, middle._held = 0, 1  # it has ended
+    one, three = np.stack([up(0.02)]), np.stack([up(0.03), up(-0.01), up(0.02)])
+    for _ in range(2):
+        alone.step_async(one)
+        beside.step_async(three)
+        assert np.array_equal(alone.step_wait()[0][0], beside.step_wait()[0][2])
+    assert not beside.executed[0][1].any()
+    assert beside.simulated == 4
 
 
 @pytest.mark.parametrize("hold", [0, 3])
 def test_an_episode_ends_as_many_steps_after_success_as_demonstrations_do(hold):
-    episode = RobotEpisode(ENV, HAND, hold)
+    episode = RobotEpisode(ENV, hold)
     episode.start(3)
     after = 0
     while not episode.ended:
-        episode.advance(expert_target(episode))
+        episode.advance(expert_action(episode))
         after += episode.solved
     assert after == hold + 1
 
 
 def test_without_a_hold_an_episode_goes_on_after_success():
-    episode = RobotEpisode(ENV, HAND, None)
+    episode = RobotEpisode(ENV, None)
     episode.start(3)
     for _ in range(40):
-        episode.advance(expert_target(episode))
+        episode.advance(expert_action(episode))
     assert episode.solved
     assert not episode.ended
 

@@ -25,9 +25,8 @@ class Point:
     def inputs(self) -> np.ndarray:
         return np.array([self.x, 0.0, 1.0], np.float32)
 
-    def advance(self, target: np.ndarray) -> np.ndarray:
-        self.x, self.moves = self.x + float(target[0]), self.moves + 1
-        return target.astype(np.float64)
+    def advance(self, action: np.ndarray) -> None:
+        self.x, self.moves = self.x + float(action[0]), self.moves + 1
 
     @property
     def solved(self) -> bool:

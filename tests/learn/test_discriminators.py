@@ -55,8 +55,7 @@ def test_it_learns_who_acted(kind):
 def test_every_form_of_the_reward_prefers_the_expert(form):
     d, _ = trained("gail")
     d._form = form
-    zeros = np.zeros(N, np.float32)
-    expert, learner = (d.reward(rows(action, seed=7), zeros).mean() for action in (0.5, -0.5))
+    expert, learner = (d.reward(rows(action, seed=7)).mean() for action in (0.5, -0.5))
     assert expert > learner
     assert (expert > 0, learner > 0) == {"logit": (True, False), "log_d": (False, False)}.get(form, (True, True))
 
@@ -72,11 +71,19 @@ def test_the_reward_of_airl_is_f_less_the_log_density():
     np.testing.assert_allclose(d.reward(steps, logs), expected, rtol=1e-5, atol=1e-5)
 
 
+def test_densities_change_nothing_for_gail_and_are_missed_by_airl():
+    steps = rows(0.0, seed=3)
+    gail, airl = trained("gail")[0], trained("airl")[0]
+    assert np.array_equal(gail.reward(steps), gail.reward(steps, log_density(steps, 0.0)))
+    with pytest.raises(UsageError, match="AirlDiscriminator needs the log-densities of actions"):
+        airl.reward(steps)
+
+
 def test_in_the_absorbing_state_nothing_but_the_flag_is_seen():
     d, _ = trained("gail")
     states = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
     states[:, -1] = 1.0
-    found = d.reward(Transitions(states, np.float32([[1, 0], [-1, 0]]), states), np.zeros(2, np.float32))
+    found = d.reward(Transitions(states, np.float32([[1, 0], [-1, 0]]), states))
     assert found[0] == found[1]
 
 

@@ -74,6 +74,21 @@ def test_an_episode_that_has_ended_goes_on_in_the_absorbing_state_to_its_last_st
     assert np.array_equal(rows.states.reshape(STEPS, EPISODES, -1)[1:], after[:-1])
 
 
+def test_the_buffer_has_the_value_and_density_of_every_step():
+    one, env = learner()
+    env.seeds = range(EPISODES)
+    with lent_generators(0):
+        one.collect()
+    buffer = one.ppo.rollout_buffer
+    assert buffer.values.any()
+    for step in range(STEPS):
+        obs, actions = torch.from_numpy(buffer.observations[step]), torch.from_numpy(buffer.actions[step])
+        with torch.no_grad():
+            values, log_probs, _ = one.policy.evaluate_actions(obs, actions)
+        np.testing.assert_allclose(buffer.values[step], values[:, 0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(buffer.log_probs[step], log_probs, rtol=1e-5, atol=1e-5)
+
+
 def test_it_learns_what_the_reward_asks_for():
     one, env = learner(ends=False, epochs=10)
     first = np.abs(iterate(one, env, 0).next_states[:, 0]).mean()

@@ -12,7 +12,7 @@ import pytest
 from manip_il.robots import ik
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.robot import Robot, get_robot
-from manip_il.robots.rotations import hand_down
+from manip_il.robots.rotations import hand_down, rotation_matrix, rotation_vector
 from manip_il.robots.spec import arm_model
 
 from ..tables import every_robot
@@ -58,3 +58,48 @@ def compare(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
         assert arm.displacement(position, rotation, 0.1) is not None
         for ours, theirs in zip(solved[-1], problem_of_mink(robot, q, position, rotation), strict=False):
             np.testing.assert_array_equal(ours, theirs)
+
+
+def moves(robot: Robot, largest: float, rows: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (rows, arm) around home, and motions of the hand (rows, 6) up to so many [m] and, tripled, [rad]."""
+    arm, rng = ArmIK(robot), np.random.default_rng(1)
+    q = np.asarray(robot.home) + rng.uniform(-0.5, 0.5, (rows, len(robot.home)))
+    motions = rng.uniform(-largest, largest, (rows, 6)) * np.repeat([1.0, 3.0], 3)
+    return np.clip(q, arm.limits[:, 0], arm.limits[:, 1]), motions
+
+
+def moved_step_by_step(arm: ArmIK, q: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """The joints of one motion: one step of the expert's, then damped least squares, a row by itself."""
+    at, turned = arm.ee_pose(q)
+    position, rotation = at + motion[:3], rotation_matrix(motion[3:]) @ turned
+    first = arm.step(position, rotation, ik._LARGEST)
+    q = arm._within(q if first is None else q + first[0])
+    for _ in range(ik._CORRECTIONS):
+        at, turned = arm.ee_pose(q)
+        error = np.concatenate([position - at, rotation_vector(rotation @ turned.T)])
+        if np.abs(error).max() < ik._EXACT:
+            break
+        jacobian = arm._site_jacobian()
+        dq = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + ik._LEVENBERG * np.eye(6), error)
+        q = arm._within(q + dq * min(1.0, ik._LARGEST / max(float(np.abs(dq).max()), ik._LARGEST)))
+    return q
+
+
+@every_robot
+@pytest.mark.parametrize(("largest", "atol"), [(0.02, 1e-8), (0.3, 1e-6)])  # where a pose is far, rounding grows
+def test_a_batch_of_motions_is_solved_as_one_by_one(robot: str, largest: float, atol: float):
+    arm = ArmIK(get_robot(robot))
+    q, motions = moves(get_robot(robot), largest)
+    expected = np.array([moved_step_by_step(arm, *row) for row in zip(q, motions, strict=True)])
+    np.testing.assert_allclose(arm.moved(q, motions), expected, rtol=0, atol=atol)
+
+
+@every_robot
+def test_a_motion_does_not_depend_on_its_batch(robot: str):
+    arm = ArmIK(get_robot(robot))
+    q, motions = moves(get_robot(robot), 0.1)
+    together = arm.moved(q, motions)
+    for size in (1, 3, 16):
+        parts = [arm.moved(q[i : i + size], motions[i : i + size]) for i in range(0, len(q), size)]
+        np.testing.assert_array_equal(np.concatenate(parts), together)
+    np.testing.assert_array_equal(arm.moved(q[::-1], motions[::-1]), together[::-1])
