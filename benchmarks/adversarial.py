@@ -115,11 +115,11 @@ class CartPole:
     @staticmethod
     def expert(inputs: F32) -> F32:
         """Push against the sum of what is off, as a linear controller does: 1 or -1."""
-        return np.where(inputs @ np.float32([0.3, 0.7, 10.0, 2.0]) > 0, 1.0, -1.0).astype(np.float32)[:, None]
+        return np.where(inputs @ np.array([0.3, 0.7, 10.0, 2.0], np.float32) > 0, 1.0, -1.0).astype(np.float32)[:, None]
 
     @staticmethod
     def random(inputs: F32, rng: np.random.Generator) -> F32:
-        return rng.choice(np.float32([-1.0, 1.0]), (len(inputs), 1))
+        return rng.choice(np.array([-1.0, 1.0], np.float32), (len(inputs), 1))
 
 
 ENVIRONMENTS: dict[str, type[Pendulum] | type[CartPole]] = {one.name: one for one in (Pendulum, CartPole)}
