@@ -141,8 +141,8 @@ class Settings:
 
 # What is not here is as on robots. Chosen on training seeds from 100 on.
 SETTINGS = {
-    "Pendulum-v1": Settings(steps=120_000, ppo=PPOConfig(lr=1e-3, minibatches=16)),
-    "CartPole-v1": Settings(steps=60_000, ppo=PPOConfig(minibatches=16)),
+    "Pendulum-v1": Settings(steps=100_000, ppo=PPOConfig(lr=2e-3, minibatches=8)),
+    "CartPole-v1": Settings(steps=30_000, ppo=PPOConfig(lr=1e-3, minibatches=8)),
 }
 SHAPE = Shape(64, 2, "silu", "gaussian", 1, 2, 10.0, action_space="joint_target")
 _QUICK = {"steps": 1_000, "episode_steps": 20, "demonstrations": 2}
@@ -215,6 +215,8 @@ def main() -> int:
     parser.add_argument("--algorithm", choices=[*LOOPS], help="by default both")
     parser.add_argument("--quick", action="store_true", help="a few of each: shows that it runs, measures nothing")
     options = parser.parse_args()
+    if options.seeds < 1:
+        parser.error(f"--seeds is {options.seeds}; expected at least 1")
     names = [options.env] if options.env else [*ENVIRONMENTS]
     seeds = range(2 if options.quick else options.seeds)
     print(describe_machine())
