@@ -66,10 +66,9 @@ class Pendulum:
     def inputs(self) -> F32:
         return self._seen
 
-    def advance(self, target: F32) -> F64:
-        seen, reward, *_ = self._env.step(target)
+    def advance(self, action: F64) -> None:
+        seen, reward, *_ = self._env.step(action)
         self._seen, self.total = np.asarray(seen, np.float32), self.total + float(reward)
-        return target.astype(np.float64)
 
     @staticmethod
     def expert(inputs: F32) -> F32:
@@ -103,10 +102,9 @@ class CartPole:
     def inputs(self) -> F32:
         return self._seen
 
-    def advance(self, target: F32) -> F64:
-        seen, reward, self.ended, *_ = self._env.step(int(target[0] > 0))
+    def advance(self, action: F64) -> None:
+        seen, reward, self.ended, *_ = self._env.step(int(action[0] > 0))
         self._seen, self.total = np.asarray(seen, np.float32), self.total + float(reward)
-        return np.sign(target).astype(np.float64)
 
     @property
     def solved(self) -> bool:
@@ -136,6 +134,7 @@ class Settings:
     reward_form: str = "logit"
     demonstrations: int = 20
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    discount: float = 0.9
     discriminator: DiscriminatorConfig = field(default_factory=DiscriminatorConfig)
 
 
@@ -188,7 +187,7 @@ class Run:
     def discriminate(self, d: Discriminator, learner: Transitions) -> None:
         rng = rng_for(self._stream("discriminator"), "batches")
         expert = self._learner.explored(self._expert, rng)
-        log_probs = self.log_prob(expert), self.log_prob(learner)
+        log_probs = (self.log_prob(expert), self.log_prob(learner)) if d.asks_density else None
         self.metrics = d.fit(expert, learner, log_probs, rng)
 
     def improve(self, rewards: F32) -> None:
