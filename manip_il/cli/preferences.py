@@ -174,7 +174,7 @@ class PreferencesFitOptions:
 
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward and the page."""
-        from manip_il.learn.preference.network import RewardShape, ways_of
+        from manip_il.learn.preference.network import shape_for
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fit_report import fit_report, summary_lines
         from manip_il.preferences.fitting import fit_answers
@@ -185,7 +185,7 @@ class PreferencesFitOptions:
         given = [Preferences.read(path, pairs) for path in self.answers]
         begin, answers, clips = time.monotonic(), join_answers(given), read_clips(pairs)
         with progress(None, f"fit {len(answers.better):,} answers") as bar:
-            shape = RewardShape(self.members, ways=ways_of(clips.frames[0].spec))
+            shape = shape_for(clips.frames[0].spec, self.members)
             found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
         timings = {"fit": time.monotonic() - begin}
         who = [one.who or "somebody" for one in given]
