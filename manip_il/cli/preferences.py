@@ -150,12 +150,13 @@ class PreferencesFitOptions:
     """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
 
     Every pair is held out by one network; agreement and calibration on those are in report.html. ANSWERS are files of
-    ask or answer, of one person or several. OUTPUT_DIR/pretrained_model is a reward model in LeRobot's form.
+    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model is a reward model in LeRobot's form.
     """
 
     example: ClassVar[str] = "manip-il preferences fit pairs.json preferences.json --output_dir=runs/reward"
     pairs: Path = option(MISSING, _PAIRS, positional=True)
     answers: list[Path] = option(MISSING, "preferences.json of ask or answer", positional=True)
+    more_pairs: list[Path] = option(list, "further files of pairs of the same task and length of clip")
     members: int = option(8, "networks of the ensemble, and folds of the pairs; at least 3")
     seed: int = option(0, "seed of weights, folds and batches, 0 to 1000")
     output_dir: Path = option(Path("runs/reward"), "folder of pretrained_model and report.html")
@@ -167,25 +168,27 @@ class PreferencesFitOptions:
 
         if not 3 <= self.members <= 64:
             raise UsageError(f"--members is {self.members}; expected 3 to 64")
-        for path in (self.pairs, *self.answers):
-            _require_file(path, _PAIRS if path == self.pairs else "preferences.json of manip-il preferences ask")
+        for path in (self.pairs, *self.more_pairs):
+            _require_file(path, _PAIRS)
+        for path in self.answers:
+            _require_file(path, "preferences.json of manip-il preferences ask")
         stream_base("training", self.seed)
         require_new(self.output_dir, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Fit, measure on held-out pairs, write the reward and the page."""
-        from manip_il.learn.preference.network import RewardShape, ways_of
+        from manip_il.learn.preference.network import shape_for
         from manip_il.preferences.answers import Preferences, join_answers
         from manip_il.preferences.fit_report import fit_report, summary_lines
         from manip_il.preferences.fitting import fit_answers
-        from manip_il.preferences.pairs import Pairs, read_clips
+        from manip_il.preferences.pairs import Pairs, join_pairs, read_clips
         from manip_il.seeding import stream_base
 
-        pairs = Pairs.read(self.pairs)
+        pairs = [Pairs.read(path) for path in (self.pairs, *self.more_pairs)]
         given = [Preferences.read(path, pairs) for path in self.answers]
-        begin, answers, clips = time.monotonic(), join_answers(given), read_clips(pairs)
+        begin, answers, clips = time.monotonic(), join_answers(given), read_clips(join_pairs(pairs))
         with progress(None, f"fit {len(answers.better):,} answers") as bar:
-            shape = RewardShape(self.members, ways=ways_of(clips.frames[0].spec))
+            shape = shape_for(clips.frames[0].spec, self.members)
             found = fit_answers(clips, answers, shape, stream_base("training", self.seed), bar.advance)
         timings = {"fit": time.monotonic() - begin}
         who = [one.who or "somebody" for one in given]

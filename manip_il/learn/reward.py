@@ -17,7 +17,7 @@ from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
 from manip_il.learn.checkpoint import CheckpointMeta, check_fits, read_meta
 from manip_il.learn.limits import Budget, threads
-from manip_il.learn.preference.network import MOST_WAYS, RewardNetwork, RewardShape
+from manip_il.learn.preference.network import MOST_INPUTS, MOST_WAYS, RewardNetwork, RewardShape
 from manip_il.learn.pretrained import CONFIG, WEIGHTS, read_config
 
 F32 = NDArray[np.float32]
@@ -105,8 +105,9 @@ def _width(path: Path, config: dict[str, Any], key: str) -> int:
 def _read_network(path: Path, config: dict[str, Any], width: int) -> RewardNetwork:
     try:
         ways = tuple(map(tuple, checks.array("ways", config.get("ways"), MOST_WAYS)))
+        unread = tuple(checks.array("unread", config.get("unread", []), MOST_INPUTS))
         sizes: dict[str, Any] = {name: config.get(name) for name in ("members", "width", "depth")}
-        shape = RewardShape(**sizes, ways=ways)
+        shape = RewardShape(**sizes, ways=ways, unread=unread, logarithms=config.get("logarithms", False))
         with Budget(path / WEIGHTS):
             network = RewardNetwork(width, shape)
         tensors = load_file(path / WEIGHTS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -74,19 +74,24 @@ class Preferences:
         return cls(data["pairs"], data["who"], tuple(_answer(number, one) for number, one in enumerate(given)))
 
     @classmethod
-    def read(cls, path: Path, pairs: Pairs) -> Preferences:
-        """Return the answers in a file. Raises `ManipError` naming it for what they cannot be, or of other pairs."""
+    def read(cls, path: Path, pairs: Sequence[Pairs]) -> Preferences:
+        """Return the answers in a file, with the numbers that its pairs have among those of all files (`join_pairs`).
+
+        Raises `ManipError` naming the file for what its answers cannot be, or of other pairs.
+        """
         data = checks.read_json(path, "answers of manip-il preferences ask or answer", _LARGEST)
         try:
             found = cls.from_json(data)
         except ManipError as error:
             raise ManipError(f"{path}: {error}") from error
+        place = next((number for number, one in enumerate(pairs) if one.sha256 == found.pairs), 0)
+        own, before = pairs[place], sum(map(len, pairs[:place]))
         for one in found.answers:
-            if one.pair >= len(pairs):
-                raise ManipError(f"{path} has an answer about pair {one.pair}; there are pairs 0 to {len(pairs) - 1}")
-        if found.pairs != pairs.sha256:
-            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", pairs.sha256[:12])
-        return found
+            if one.pair >= len(own):
+                raise ManipError(f"{path} has an answer about pair {one.pair}; there are pairs 0 to {len(own) - 1}")
+        if found.pairs != own.sha256:
+            raise MismatchError("pairs (sha256)", str(path), found.pairs[:12], "the file of pairs", own.sha256[:12])
+        return replace(found, answers=tuple(replace(one, pair=before + one.pair) for one in found.answers))
 
 
 @dataclass(frozen=True, eq=False)

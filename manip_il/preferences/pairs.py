@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -181,6 +181,24 @@ class Clips:
                 f"{clip.first} of episode {clip.episode}"
             )
         return int(self.offsets[clip.source] + frames.firsts[clip.episode] + clip.first)
+
+
+def join_pairs(given: Sequence[Pairs]) -> Pairs:
+    """Return the pairs of several files, numbered one after another. Raises `MismatchError` where clips differ in kind."""
+    first = given[0]
+    for name in ("robot", "task", "control_hz", "length"):
+        for other in given[1:]:
+            if (one := getattr(first, name)) != (two := getattr(other, name)):
+                raise MismatchError(name, "the first file of pairs", one, "another", two)
+    sources = tuple(dict.fromkeys(source for one in given for source in one.sources))
+    joined: list[tuple[Clip, Clip]] = []
+    for one in given:
+        place = [sources.index(source) for source in one.sources]
+        joined += [
+            (replace(left, source=place[left.source]), replace(right, source=place[right.source]))
+            for left, right in one.pairs
+        ]
+    return replace(first, sources=sources, pairs=tuple(joined))
 
 
 def read_clips(pairs: Pairs) -> Clips:

@@ -9,7 +9,7 @@ import numpy as np
 
 from manip_il.evaluation.figures import CLONING, DAGGER, EXPERT, Figure, Section, SectionsReport, drawing, to_figure
 from manip_il.evaluation.tables import Table
-from manip_il.preferences.scores import Scores, episode_scores
+from manip_il.preferences.scores import BELOW, Scores, episode_scores
 
 WORST = 10  # episodes that are listed
 _SHOWN = 3  # of the worst and of the best, drawn over time
@@ -34,8 +34,9 @@ def worst_table(scores: Scores, count: int = WORST) -> Table:
 
 
 def fact_lines(scores: Scores) -> list[str]:
-    """Return how well the score finds failed episodes, and follows true progress."""
-    lines: list[str] = []
+    """Return which episodes are kept, how well the score finds failed ones, and how it follows true progress."""
+    kept, count = int((scores.episodes > scores.bar).sum()), len(scores.episodes)
+    lines = [f"{kept:,} of {count:,} episodes score more than {scores.bar:.2f}: the frames of the others weigh 0"]
     if scores.auc is not None:
         beside = "" if scores.true_auc is None else f", by true progress {scores.true_auc:.3f}"
         lines.append(f"area under the ROC curve of finding failed episodes: {scores.auc:.3f}{beside}")
@@ -65,7 +66,10 @@ def score_report(
     )
 
 
-_MEANING = "An episode's score is the mean of its last second's frames."
+_MEANING = (
+    f"An episode's score is the mean of its last second's frames. One that is {BELOW:g} or more below the best quarter's "
+    "has weight 0."
+)
 
 
 def curves_figure(scores: Scores) -> Figure:

@@ -1,7 +1,11 @@
 """Scores of a dataset's frames and episodes by a reward, and the file that LeRobot's RA-BC weights samples by.
 
-What is scored is the reward itself, as progress: Bradley-Terry answers about clips of equal length leave a constant of
-the reward open, which its differences between two frames do not hold and its running sum does.
+RA-BC learns from frames after which progress rises. A frame's score does not tell whether it is worth learning from:
+what fails gets nearer, too, before it does. Whether its episode ends well does, so what is written as progress is
+
+    progress_t = t (score of the episode - bar),    bar = upper quartile of the episodes' scores - BELOW
+
+which rises all along an episode that ends near the best quarter, and falls along the others.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from manip_il.preferences.frames import Frames
 F64, I64 = NDArray[np.float64], NDArray[np.int64]
 FILE_NAME, WEIGHTS_FILE = "scores.json", "rabc.parquet"
 LAST = 1.0  # of an episode, over which its score is the mean [s]
+BEST, BELOW = 0.75, 0.25  # quantile of the episodes' scores, and how far below it an episode may end
 _METADATA = b"reward_model_path"  # as LeRobot's own scripts say it
 
 
@@ -49,6 +54,11 @@ class Scores:
     def episodes(self) -> F64:
         """Score of every episode, (E,)."""
         return episode_scores(self.frames, self.data)
+
+    @property
+    def bar(self) -> float:
+        """Score below which an episode's frames weigh nothing: where the best quarter begins, less `BELOW`."""
+        return float(np.quantile(self.episodes, BEST)) - BELOW
 
     @property
     def succeeded(self) -> NDArray[np.bool_] | None:
@@ -85,13 +95,14 @@ class Scores:
     def to_json(self) -> dict[str, Any]:
         """Return everything for `scores.json`; frames' scores are in the parquet file."""
         true = episode_scores(self.data.progress, self.data) if self.data.progress is not None else None
-        succeeded = self.succeeded
+        succeeded, scores, bar = self.succeeded, self.episodes, self.bar
         numbers = self.data.episodes[self.data.firsts].tolist()
         episodes: list[Mapping[str, Any]] = [
             {
                 "episode": number,
                 "frames": int(self.data.lengths[place]),
-                "score": float(self.episodes[place]),
+                "score": float(scores[place]),
+                "kept": bool(scores[place] > bar),
                 "progress": None if true is None else float(true[place]),
                 "success": None if succeeded is None else bool(succeeded[place]),
             }
@@ -103,6 +114,7 @@ class Scores:
             "auc": self.auc,
             "auc_of_progress": self.true_auc,
             "correlation_with_progress": self.correlation,
+            "bar": bar,
             "episodes": episodes,
         }
 
@@ -130,15 +142,18 @@ def roc_auc(scores: F64, succeeded: NDArray[np.bool_] | None) -> float | None:
 def write_weights(path: Path, scores: Scores) -> None:
     """Write what LeRobot's RA-BC reads: `index`, `episode_index`, `frame_index`, `progress_sparse` of every frame.
 
-    Raises `WriteError` where the disk is full or read-only.
+    Beside them `score`, which it does not read. Raises `WriteError` where the disk is full or read-only.
     """
     data = scores.data
+    steps = np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths)
+    above = np.repeat(scores.episodes - scores.bar, data.lengths)
     table = pa.table(
         {
             "index": np.arange(len(scores.frames), dtype=np.int64),
             EPISODE_INDEX: data.episodes,
-            "frame_index": np.arange(len(scores.frames)) - np.repeat(data.firsts, data.lengths),
-            "progress_sparse": scores.frames.astype(np.float32),
+            "frame_index": steps,
+            "progress_sparse": (steps * above).astype(np.float32),
+            "score": scores.frames.astype(np.float32),
         },
         metadata={_METADATA: scores.reward.encode()},
     )

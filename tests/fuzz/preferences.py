@@ -12,7 +12,7 @@ import torch
 
 from manip_il.engine.environments import env_spec
 from manip_il.learn.preference.modeling_preference import write_reward
-from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
+from manip_il.learn.preference.network import RewardNetwork, RewardShape, joints_of, ways_of
 from manip_il.learn.reward import LearnedReward
 from manip_il.learn.weights import rabc_weights, read_progress
 from manip_il.preferences.answers import Answer, Preferences, join_answers
@@ -41,13 +41,13 @@ def _read_pairs(folder: Path) -> None:
 
 
 def _read_answers(folder: Path) -> None:
-    join_answers([Preferences.read(folder / "preferences.json", Pairs.read(folder / "pairs.json"))])
+    join_answers([Preferences.read(folder / "preferences.json", [Pairs.read(folder / "pairs.json")])])
 
 
 def make_reward(folder: Path) -> None:
     """`reward`: three small networks of random weights."""
     spec = env_spec(ENV)
-    shape = RewardShape(3, 4, ways=ways_of(spec))
+    shape = RewardShape(3, 4, ways=ways_of(spec), unread=joints_of(spec), logarithms=True)
     network = RewardNetwork(2 * len(spec.joint_names) + len(spec.environment_state_names), shape)
     network.initialise(torch.Generator().manual_seed(0))
     write_reward(folder / "reward", network, shape, spec, {}, {})

@@ -55,7 +55,7 @@ def saved(window: Opened, pairs: Pairs, folder: Path) -> Preferences:
         window.page.click("form button")
     assert download.value.suggested_filename == "preferences.json"
     download.value.save_as(folder / "preferences.json")
-    return Preferences.read(folder / "preferences.json", pairs)
+    return Preferences.read(folder / "preferences.json", [pairs])
 
 
 def test_keys_answer_undo_and_skip_and_the_download_is_what_fit_reads(browser, page, pairs, tmp_path):

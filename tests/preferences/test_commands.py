@@ -43,6 +43,12 @@ def test_a_reward_is_learnt_and_weighs_the_frames_of_a_clone(here, capsys):
     assert (here / "weighted/checkpoints/last/pretrained_model/model.safetensors").is_file()
     assert run("preferences pairs good bad --clip=10 --count=5 --reward=reward --output=more.json") == 0
     assert Pairs.read(here / "more.json").chosen == "where rewards disagree"
+    assert run("preferences answer more.json --output=c.json") == 0
+    words = "pairs.json a.json c.json --more_pairs=more.json --members=3 --output_dir=again"
+    assert run(f"preferences fit {words}") == 0
+    assert "45 answers about 45 pairs" in capsys.readouterr().out
+    assert run("preferences fit pairs.json c.json --members=3 --output_dir=third") == 1
+    assert "pairs (sha256) differs: c.json has" in capsys.readouterr().err
 
 
 def test_true_progress_scores_without_a_reward(here, capsys):

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.preference.fitting import Compared, answer_losses, deal, fit_reward
 from manip_il.learn.preference.modeling_preference import write_reward
-from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
+from manip_il.learn.preference.network import RewardNetwork, RewardShape, joints_of, shape_for, ways_of
 from manip_il.learn.reward import LearnedReward
 from manip_il.preferences.answers import join_answers
 from manip_il.preferences.fit_report import fit_report
@@ -106,6 +106,39 @@ def test_the_length_of_a_way_is_an_input():
     assert network.features(torch.tensor([[9.0, 2.0, 3.0, 6.0]])).tolist() == [[9, 2, 3, 6, 7]]
 
 
+def test_the_last_centimetres_of_a_way_count_as_much_as_the_first_decimetres():
+    network = RewardNetwork(3, RewardShape(ways=((0, 1, 2),), logarithms=True))
+    far, near, there = network.features(torch.tensor([[0.43, 0.0, 0.0], [0.1, 0.0, 0.0], [0.015, 0.0, 0.0]]))[:, 3]
+    assert (far - near).item() == pytest.approx(np.log(4), abs=1e-6)
+    assert (near - there).item() == pytest.approx(np.log(4.4), abs=1e-6)
+
+
+def test_joints_are_not_read_where_the_hands_pose_is_there(spec):
+    names = ("ee.x", "ee.y", "ee.z", "object.x")
+    n, k = len(spec.joint_names), 4
+    there = replace(spec, environment_state_names=names)
+    assert joints_of(there) == (*range(n - 1), *range(n + k, n + k + n - 1))
+    assert joints_of(replace(spec, environment_state_names=names[1:])) == ()
+    network = RewardNetwork(2 * n + k, shape_for(there, 3))
+    network.initialise(torch.Generator().manual_seed(0))
+    inputs = torch.zeros(2, 2 * n + k)
+    inputs[1, list(joints_of(there))] = 1.0
+    with torch.no_grad():
+        assert network(inputs)[0] == network(inputs)[1]
+        inputs[1, [n - 1, 2 * n + k - 1]] = 1.0  # how far the gripper is open, and its command
+        assert network(inputs)[0] != network(inputs)[1]
+
+
+def test_a_reward_that_does_not_say_what_it_leaves_unread_reads_everything(folder, tmp_path, clips):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["unread"], config["logarithms"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    first, second = (LearnedReward.load(one).of_inputs(clips.inputs) for one in (folder, tmp_path))
+    assert (first == second).all()
+
+
 def test_ours_and_lerobots_factory_give_the_same_rewards(folder, clips):
     from lerobot.configs.rewards import RewardModelConfig
     from lerobot.rewards import make_reward_model, make_reward_pre_post_processors
@@ -139,6 +172,9 @@ def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
         ({"members": 64, "width": 1024, "depth": 8}, "much larger network than its weights"),
         ({"ways": [[0, 1, 99]]}, "a way has column 99; there are"),
         ({"ways": [[0]]}, "expected columns of x, y and z"),
+        ({"unread": [0, 1_000]}, "2 columns up to 1000 are not read of"),
+        ({"unread": ["x"]}, "a column that is not read is 'x'"),
+        ({"logarithms": "yes"}, "logarithms is 'yes'"),
         ({"width": 8}, "size mismatch"),
         ({"type": "sarm"}, "is of type 'sarm'; expected a reward"),
         ({"input_features": {}}, "observation.state is None"),

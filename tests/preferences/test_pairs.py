@@ -11,7 +11,8 @@ import pytest
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.preferences.choose import choose_pairs, disagreement, open_supply
 from manip_il.preferences.frames import find_datasets
-from manip_il.preferences.pairs import Clips, Pairs, read_clips
+from manip_il.preferences.answers import Answer, Preferences
+from manip_il.preferences.pairs import Clips, Pairs, join_pairs, read_clips
 
 from .made import clips_of
 
@@ -120,3 +121,24 @@ def test_a_dataset_that_was_changed_since_is_refused(clips):
     tree["sources"][0]["sha256"] = "0" * 64
     with pytest.raises(MismatchError, match=r"sha256 of .*good differs"):
         read_clips(Pairs.from_json(tree))
+
+
+def test_answers_to_a_second_file_of_pairs_are_about_its_clips(datasets, tmp_path):
+    """The second file's sources are in another order, and one is in both."""
+    roots = [datasets / "good", datasets / "bad"]
+    files = [clips_of(roots, 12).pairs, clips_of(roots[::-1], 7, seed=1).pairs]
+    joined = join_pairs(files)
+    assert len(joined) == 19
+    assert [source.root for source in joined.sources] == list(map(str, roots))
+    both = read_clips(joined)
+    alone = read_clips(files[1])
+    assert (both.inputs[both.rows[12:]] == alone.inputs[alone.rows]).all()
+    path = tmp_path / "preferences.json"
+    path.write_text(json.dumps(Preferences(files[1].sha256, "Ada", (Answer(3, "left"),)).to_json()))
+    assert [one.pair for one in Preferences.read(path, files).answers] == [15]
+
+
+def test_clips_of_two_lengths_are_not_joined(datasets):
+    roots = [datasets / "good", datasets / "bad"]
+    with pytest.raises(MismatchError, match=r"length differs: the first file of pairs has 10, another has 5"):
+        join_pairs([clips_of(roots, 5).pairs, clips_of(roots, 5, length=5).pairs])

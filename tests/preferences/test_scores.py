@@ -82,6 +82,25 @@ def test_weights_are_lerobots(ahead, scored, tmp_path):
     assert {0.0, 1.0} < set(ours.tolist())
 
 
+def test_frames_weigh_by_how_their_episode_ends(scored, tmp_path):
+    """But for an episode's last frame, after which nothing rises or falls."""
+    path, data = tmp_path / "rabc.parquet", scored.data
+    write_weights(path, scored)
+    weights = rabc_weights(read_progress(path, data.episodes), data.episodes, 5)
+    inner = np.delete(np.arange(len(weights)), data.firsts + data.lengths - 1)
+    assert (weights[inner] == scored.succeeded.repeat(data.lengths)[inner]).all()
+    assert pq.read_table(path)["score"].to_numpy() == pytest.approx(scored.frames, abs=1e-6)
+    assert [one["kept"] for one in scored.to_json()["episodes"]] == [True] * 8 + [False] * 8
+
+
+@pytest.mark.parametrize("level", [0.1, 0.9])
+def test_where_all_episodes_end_alike_all_are_kept(level, scored, tmp_path):
+    path, data = tmp_path / "rabc.parquet", scored.data
+    write_weights(path, replace(scored, frames=np.full(len(data.states), level)))
+    weights = rabc_weights(read_progress(path, data.episodes), data.episodes, 1)
+    assert (np.delete(weights, data.firsts + data.lengths - 1) == 1).all()
+
+
 def test_lerobot_weights_a_batch_by_the_file(scored, tmp_path):
     from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
 

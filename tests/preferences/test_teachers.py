@@ -109,8 +109,8 @@ def test_answers_edited_into_nonsense_are_one_line(change, says, clips, tmp_path
     path = tmp_path / "preferences.json"
     path.write_text(json.dumps(whole | change))
     with pytest.raises(ManipError) as refused:
-        Preferences.read(path, clips.pairs)
+        Preferences.read(path, [clips.pairs])
     assert says in str(refused.value)
     assert str(path) in str(refused.value)
     path.write_text(json.dumps(whole))
-    assert Preferences.read(path, clips.pairs).who == "a"
+    assert Preferences.read(path, [clips.pairs]).who == "a"

@@ -24,6 +24,8 @@ class PreferenceConfig(RewardModelConfig):
     width: int = RewardShape.width
     depth: int = RewardShape.depth
     ways: list[list[int]] = field(default_factory=list)
+    unread: list[int] = field(default_factory=list)
+    logarithms: bool = RewardShape.logarithms
 
     device: str | None = "cpu"
 
@@ -33,7 +35,8 @@ class PreferenceConfig(RewardModelConfig):
 
     def network_shape(self) -> RewardShape:
         """Return the part that the network is built from."""
-        return RewardShape(self.members, self.width, self.depth, tuple(map(tuple, self.ways)))
+        ways = tuple(map(tuple, self.ways))
+        return RewardShape(self.members, self.width, self.depth, ways, tuple(self.unread), self.logarithms)
 
     @override
     def validate_features(self) -> None:

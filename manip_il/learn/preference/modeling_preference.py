@@ -58,7 +58,7 @@ def write_reward(
     kinds = {STATE: (FeatureType.STATE, n), ENVIRONMENT_STATE: (FeatureType.ENV, k), ACTION: (FeatureType.ACTION, n)}
     features = {key: PolicyFeature(type=kind, shape=(size,)) for key, (kind, size) in kinds.items()}
     reward = PolicyFeature(type=FeatureType.REWARD, shape=(1,))
-    sizes: dict[str, Any] = asdict(shape) | {"ways": [list(way) for way in shape.ways]}
+    sizes: dict[str, Any] = asdict(shape) | {"ways": [list(way) for way in shape.ways], "unread": list(shape.unread)}
     made = PreferenceConfig(input_features=features, output_features={"reward": reward}, **sizes)
     model = PreferenceRewardModel(made)
     model.model.load_state_dict(network.state_dict())

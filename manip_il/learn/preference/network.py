@@ -24,14 +24,17 @@ class RewardShape:
     """Sizes of the networks. members: of the ensemble; width: units a layer; depth: hidden layers.
 
     ways: columns of inputs that are the way from one thing to another [m], x, y and z or x and y alone; its length is
-    an input, too. How far things are apart is most of what progress is, and a few hundred answers are few to learn a
-    square root from.
+    an input, too, or with `logarithms` the logarithm of that: the last centimetres count as much as the first
+    decimetres. How far things are apart is most of what progress is, and a few hundred answers are few to learn a square
+    root from. unread: columns that are no inputs of the networks.
     """
 
     members: int = 8
     width: int = 32
     depth: int = 2
     ways: tuple[tuple[int, ...], ...] = ()
+    unread: tuple[int, ...] = ()
+    logarithms: bool = False
 
     def __post_init__(self) -> None:
         checks.whole("members", self.members, LEAST_MEMBERS, MOST_MEMBERS)
@@ -42,6 +45,9 @@ class RewardShape:
                 raise ManipError(f"a way is {checks.shorten(way)}; expected columns of x, y and z, or of x and y")
             for column in way:
                 checks.whole("column of a way", column, 0, MOST_INPUTS - 1)
+        for column in checks.array("unread", self.unread, MOST_INPUTS):
+            checks.whole("a column that is not read", column, 0, MOST_INPUTS - 1)
+        checks.truth("logarithms", self.logarithms)
 
 
 def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
@@ -55,6 +61,22 @@ def ways_of(spec: RobotTaskSpec) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(place[one] for one in way) for way in axes if set(way) <= place.keys())
 
 
+def joints_of(spec: RobotTaskSpec) -> tuple[int, ...]:
+    """Return the columns of the arm's joints and of their targets, where the environment state has the hand's pose.
+
+    None where it has not. A few hundred answers are few to find out that joints say the same in another way.
+    """
+    if not {"ee.x", "ee.y", "ee.z"} <= set(spec.environment_state_names):
+        return ()
+    arm, action = len(spec.joint_names) - 1, len(spec.joint_names) + len(spec.environment_state_names)
+    return (*range(arm), *range(action, action + arm))
+
+
+def shape_for(spec: RobotTaskSpec, members: int) -> RewardShape:
+    """Return the networks that are fitted to answers about a task's clips."""
+    return RewardShape(members, ways=ways_of(spec), unread=joints_of(spec), logarithms=True)
+
+
 class RewardNetwork(nn.Module):
     """M perceptrons from (state, environment state, action) to a reward.
 
@@ -63,6 +85,7 @@ class RewardNetwork(nn.Module):
     """
 
     CLAMP = 5.0
+    NEAR = 0.01  # added to a length before its logarithm is taken [m]
     mean: Tensor
     std: Tensor
     low: Tensor
@@ -72,8 +95,12 @@ class RewardNetwork(nn.Module):
         super().__init__()
         if any(column >= inputs for way in shape.ways for column in way):
             raise ManipError(f"a way has column {max(map(max, shape.ways))}; there are {inputs} inputs")
-        self.ways = [list(way) for way in shape.ways]
-        inputs += len(shape.ways)
+        unread = set(shape.unread)
+        if not unread < set(range(inputs)):
+            raise ManipError(f"{len(unread)} columns up to {max(unread, default=0)} are not read of {inputs} inputs")
+        self.ways, self.logarithms = [list(way) for way in shape.ways], shape.logarithms
+        self.read = [column for column in range(inputs) if column not in unread]
+        inputs = len(self.read) + len(shape.ways)
         sizes = [inputs, *[shape.width] * shape.depth, 1]
         layers = list(itertools.pairwise(sizes))
         self.weights = nn.ParameterList(torch.zeros(shape.members, fan_in, out) for fan_in, out in layers)
@@ -92,8 +119,11 @@ class RewardNetwork(nn.Module):
                 weight.copy_(spread * torch.randn(weight.shape, generator=generator))
 
     def features(self, inputs: Tensor) -> Tensor:
-        """Return inputs (B, d) with the lengths of their ways, (B, d + K)."""
-        return torch.cat([inputs, *(inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways)], dim=-1)
+        """Return the columns of inputs (B, d) that are read, with the lengths of their ways, (B, up to d + K)."""
+        lengths = [inputs[:, way].norm(dim=-1, keepdim=True) for way in self.ways]
+        if self.logarithms:
+            lengths = [(one + self.NEAR).log() for one in lengths]
+        return torch.cat([inputs[:, self.read], *lengths], dim=-1)
 
     def members(self, inputs: Tensor) -> Tensor:
         """Return each network's reward, (M, B), of inputs (B, d), in the units in which preferences are log-odds."""
