@@ -150,7 +150,8 @@ class PreferencesFitOptions:
     """Learn a reward of state and action from answers about pairs (Bradley-Terry): an ensemble of small networks.
 
     Every pair is held out by one network; agreement and calibration on those are in report.html. ANSWERS are files of
-    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model is a reward model in LeRobot's form.
+    ask or answer, of one person or several, about these pairs or those of --more_pairs. OUTPUT_DIR/pretrained_model is
+    a reward model in LeRobot's form.
     """
 
     example: ClassVar[str] = "manip-il preferences fit pairs.json preferences.json --output_dir=runs/reward"

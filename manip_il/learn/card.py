@@ -22,7 +22,7 @@ CARD_FILE = "README.md"
 
 @dataclass(frozen=True)
 class Origin:
-    """How a policy was learnt. story: a sentence; datasets: its dataset's `repo_id`, if any; rows: name, value."""
+    """Origin of a policy, for its card. story: a sentence; datasets: `repo_id`, if any; rows: name, value."""
 
     story: str
     datasets: str | None

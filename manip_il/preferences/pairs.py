@@ -184,7 +184,10 @@ class Clips:
 
 
 def join_pairs(given: Sequence[Pairs]) -> Pairs:
-    """Return the pairs of several files, numbered one after another. Raises `MismatchError` where clips differ in kind."""
+    """Return the pairs of several files, numbered one after another.
+
+    Raises `MismatchError` where clips differ in robot, task, rate or length.
+    """
     first = given[0]
     for name in ("robot", "task", "control_hz", "length"):
         for other in given[1:]:

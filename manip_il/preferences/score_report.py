@@ -67,8 +67,8 @@ def score_report(
 
 
 _MEANING = (
-    f"An episode's score is the mean of its last second's frames. One that is {BELOW:g} or more below the best quarter's "
-    "has weight 0."
+    "An episode's score is the mean of its last second's frames. "
+    f"One that is {BELOW:g} or more below the best quarter's has weight 0."
 )
 
 

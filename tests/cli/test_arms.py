@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from manip_il.cli.adversarial import GailOptions
+from manip_il.cli.adversarial import AirlOptions, GailOptions
 from manip_il.cli.arms import begun, charged
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
@@ -54,6 +55,7 @@ def test_names_of_arms_become_their_runs_of_the_same_training_seed(file):
     start = Path("s/seed_3/cloning/round_000")
     assert isinstance(gail, GailOptions)
     assert (gail.dataset.root, gail.init, gail.steps) == ([start / "dataset"], start / "policy", 300)
+    assert isinstance(scratch, AirlOptions)
     assert (list(scratch.roots), scratch.init) == ([start / "dataset"], None)
     assert isinstance(ppo, PpoOptions)
     assert (ppo.init, ppo.reward) == (start / "policy", Path("somewhere"))
@@ -94,7 +96,7 @@ def test_an_arm_that_cannot_begin_is_one_line(before, after, words, file, error)
     assert not Path("s").exists()
 
 
-def lines(*validated: float | None) -> list[dict[str, object]]:
+def lines(*validated: float | None) -> list[dict[str, Any]]:
     """Iterations of a run from a clone, a hundred steps each."""
     seconds = {"collect": 1.0, "fit": 2.0, "validate": 4.0}
     return [

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.inputs import find_policy
 from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
@@ -98,8 +99,10 @@ def test_a_study_trusts_for_its_runs_what_its_file_may_not(tmp_path):
     with pytest.raises(UsageError, match=r"arms\.b: trust: this can only be set on the command line"):
         read_plan(path, None)
     path.write_text("arms: {a: {rounds: 1}}\ntraining_seeds: 1\n")
-    assert read_plan(path, None).arms["a"].trust is False
-    assert read_plan(path, None, trust=True).arms["a"].trust is True
+    for trust in (False, True):
+        options = read_plan(path, None, trust=trust).arms["a"]
+        assert isinstance(options, DaggerOptions)
+        assert options.trust is trust
 
 
 def test_a_run_means_its_best_policy_else_its_newest(tmp_path, policy):

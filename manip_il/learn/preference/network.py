@@ -25,8 +25,8 @@ class RewardShape:
 
     ways: columns of inputs that are the way from one thing to another [m], x, y and z or x and y alone; its length is
     an input, too, or with `logarithms` the logarithm of that: the last centimetres count as much as the first
-    decimetres. How far things are apart is most of what progress is, and a few hundred answers are few to learn a square
-    root from. unread: columns that are no inputs of the networks.
+    decimetres. How far things are apart is most of what progress is, and a few hundred answers are few to learn a
+    square root from. unread: columns that are no inputs of the networks.
     """
 
     members: int = 8
