@@ -151,4 +151,4 @@ def shrink_study(path: Path) -> None:
     if ":" in study.get("at", ""):
         study["at"] = f"{study['at'].partition(':')[0]}:{_REACHED}"
     study["eval"]["n_episodes"] = SMALL["eval.n_episodes"]
-    path.write_text(yaml.safe_dump(study), encoding="utf-8")
+    path.write_text(yaml.safe_dump(study, sort_keys=False), encoding="utf-8")
