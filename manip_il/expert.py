@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from manip_il.mdp import Label, State
 from manip_il.robots.ik import ArmIK
-from manip_il.robots.rotations import angle_between
+from manip_il.robots.rotations import angle_between, rotation_matrix
 from manip_il.sim.world import Scene, World
 from manip_il.tasks.table import get_task
 from manip_il.tasks.task import Refusing, Target, objects_in
@@ -53,11 +53,12 @@ class Expert:
 
     def _unsound(self) -> str:
         world = self._world
+        hand = world.ee.position.tolist()
         for name in objects_in(self._task, world):
             position = world.pose(name).position.tolist()
             if position[2] < FALLEN:
                 return f"{name} off the table"
-            in_hand = math.dist(position, world.ee.position.tolist()) < world.extents(name)[0] / 2
+            in_hand = math.dist(position, hand) < world.extents(name)[0] / 2
             reaches = world.reach.leaning if name in self._task.grasped else world.reach.nearly
             if not in_hand and not reaches(position):
                 return f"{name} out of reach"
@@ -71,7 +72,7 @@ class Expert:
         if step is None:
             return self._hold(q, "inverse kinematics has no solution")
         dq, residual = step
-        if residual > NO_PROGRESS and math.dist(position, ee) > NEAR:
+        if residual > NO_PROGRESS and math.dist(position.tolist(), ee.tolist()) > NEAR:
             return self._hold(q, "no joint step brings the hand nearer")
         low, high = self._scene.actions.low, self._scene.actions.high
         action = self._scene.actions.join(q + dq, target.opening)
@@ -95,21 +96,19 @@ class Expert:
 
 
 def _clip_norm(vector: F64, longest: float) -> F64:
-    norm = math.hypot(*vector)
+    norm = math.hypot(*vector.tolist())
     return vector if norm <= longest else vector * (longest / norm)
 
 
 def _turn_towards(rotation: F64, target: F64, largest: float) -> F64:
-    """The rotation at most `largest` [rad] from `rotation` on the shortest way to `target` (Rodrigues' formula)."""
-    angle = angle_between(rotation, target)
-    if angle <= largest:
+    """The rotation at most `largest` [rad] from `rotation` on the shortest way to `target`."""
+    if angle_between(rotation, target) <= largest:
         return target
-    between = rotation.T @ target
-    skew = between - between.T
-    axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    (_, xy, xz), (yx, _, yz), (zx, zy, _) = rotation.T.dot(target).tolist()
+    axis = zy - yz, xz - zx, yx - xy
     length = math.hypot(*axis)
     if length < 1e-6:  # half a turn: every axis is as near
-        axis, length = np.array([0.0, 0.0, 1.0]), 1.0
-    x, y, z = axis / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return rotation @ (np.eye(3) + np.sin(largest) * cross + (1 - np.cos(largest)) * cross @ cross)
+        axis, length = (0.0, 0.0, 1.0), 1.0
+    x, y, z = axis
+    turn = largest / length
+    return rotation.dot(rotation_matrix(np.array([turn * x, turn * y, turn * z])))

@@ -72,11 +72,13 @@ class Gripper:
 
     def opening(self, qpos: F64) -> float:
         """Return the opening between the pads [m]."""
-        share = sum(weight * qpos[at] for at, weight in self._weights) - self._offset
+        share = -self._offset
+        for at, weight in self._weights:
+            share += weight * qpos.item(at)
         shares, openings = self._points
         last = min(max(bisect.bisect_right(shares, share), 1), len(shares) - 1)
         along = min(max((share - shares[last - 1]) / (shares[last] - shares[last - 1]), 0.0), 1.0)
-        return float(openings[last - 1] + along * (openings[last] - openings[last - 1]))
+        return openings[last - 1] + along * (openings[last] - openings[last - 1])
 
     def command(self, opening: float) -> F64:
         """Return the actuators' commands for an opening [m], (g,)."""

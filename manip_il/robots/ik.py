@@ -39,10 +39,15 @@ class ArmIK:
         self._site = model.site("ee").id
         self._costs = costs = robot.costs
         self._frame = mink.FrameTask("ee", "site", _POSITION_COST, costs.orientation, lm_damping=_LM_DAMPING)
+        self._frame.set_target(mink.SE3.identity())
+        assert self._frame.transform_target_to_world is not None
+        self._target = self._frame.transform_target_to_world.wxyz_xyz
         self._program = _Program(model, costs.posture, home[: model.nv])
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
-        self._qpos = np.zeros(model.nq)
+        data = self._configuration.data  # views of which each says what the posture is now
+        self._ee, self._ee_flat = data.site_xpos[self._site], data.site_xmat[self._site]
+        self._ee_rotation, self._qpos = self._ee_flat.reshape(3, 3), data.qpos
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._jacobian = np.zeros((6, model.nv))
         self._robot, self._shoulder = robot, joints[0].id
@@ -64,28 +69,27 @@ class ArmIK:
 
     def ee_pose(self, q: F64) -> tuple[F64, F64]:
         """Return position (3,) [m] and rotation matrix (3, 3) of `ee` in the world at `q` (arm,) [rad]."""
-        self._qpos[self._address] = q
-        self._configuration.update(self._qpos)
-        data = self._configuration.data
-        return data.site_xpos[self._site].copy(), data.site_xmat[self._site].reshape(3, 3).copy()
+        position, rotation = self._at(q)
+        return position.copy(), rotation.copy()
 
     def _at(self, q: F64) -> tuple[F64, F64]:
-        """`ee_pose` as views, which the next posture overwrites, and without what mink updates beside kinematics."""
+        """`ee_pose` as views, which the next posture overwrites."""
         model, data = self._configuration.model, self._configuration.data
-        data.qpos[self._address] = q
+        self._qpos[self._address] = q
         mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        return data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        mujoco.mj_comPos(model, data)  # for Jacobians
+        return self._ee, self._ee_rotation
 
     def displacement(self, position: F64, rotation: F64, largest: float, weight: float | None = None) -> F64 | None:
         """Return the displacement of `step` alone, (arm,) [rad]; weight: of the rotation, by default as upright."""
-        self._frame.transform_target_to_world = _se3(position, rotation)
+        mujoco.mju_mat2Quat(self._target[:4], rotation.ravel())
+        self._target[4:] = position
         self._frame.cost[3:] = self._costs.orientation if weight is None else weight
         x = self._program.solve(self._configuration, self._frame)
         if x is None:
             return None
         dq = x[self._address]
-        longest = float(np.abs(dq).max())
+        longest = max(map(abs, dq.tolist()))
         return dq * (largest / longest) if longest > largest else dq
 
     def step(self, position: F64, rotation: F64, largest: float, lean: float = 0.0) -> tuple[F64, float] | None:
@@ -103,9 +107,8 @@ class ArmIK:
             return None
         if before < _CONVERGED:
             return dq, 0.0
-        data = self._configuration.data
-        data.qpos[self._address] += dq
-        mujoco.mj_kinematics(self._configuration.model, data)
+        self._qpos[self._address] += dq
+        mujoco.mj_kinematics(self._configuration.model, self._configuration.data)
         return dq, self._pose_error(position, rotation, weight) / before
 
     def moved(self, q: F64, motions: F64) -> F64:
@@ -161,9 +164,8 @@ class ArmIK:
 
     def _pose_error(self, position: F64, rotation: F64, weight: float) -> float:
         """Distance to a pose, position and angle weighted as the frame task weights them, the angle by `weight`."""
-        data = self._configuration.data
-        dx, dy, dz = (data.site_xpos[self._site] - position).tolist()
-        cosine = (float(data.site_xmat[self._site] @ rotation.ravel()) - 1) / 2
+        dx, dy, dz = (self._ee - position).tolist()
+        cosine = (float(self._ee_flat.dot(rotation.ravel())) - 1) / 2
         angle = math.acos(min(1.0, max(-1.0, cosine)))
         return math.hypot(dx, dy, dz, weight * angle)
 
@@ -191,17 +193,10 @@ class _Program:
         q = configuration.data.qpos
         self._rows[:6], self._errors[:6], damping = frame.compute_qp_residual(configuration)
         self._errors[6:] = self._cost * (self._home - q)
-        hessian = self._rows.T @ self._rows
+        hessian = self._rows.T.dot(self._rows)  # of few numbers faster than `@`
         hessian.flat[:: len(q) + 1] += _DAMPING + damping
         at = q[self._limited]
         upper = self._gain * np.concatenate([self._most - at, at - self._least])
-        gradient = -(self._errors @ self._rows)
+        gradient = -self._errors.dot(self._rows)
         x, _, exit_flag, _ = daqp.solve(hessian, gradient, self._matrix, upper, self._lower, self._sense)
         return x if exit_flag > 0 else None
-
-
-def _se3(position: F64, rotation: F64) -> mink.SE3:
-    wxyz_xyz = np.empty(7)
-    mujoco.mju_mat2Quat(wxyz_xyz[:4], rotation.ravel())
-    wxyz_xyz[4:] = position
-    return mink.SE3(wxyz_xyz=wxyz_xyz)

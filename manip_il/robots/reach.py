@@ -95,8 +95,12 @@ class Reach:
 
     def has(self, position: Sequence[float] | F64) -> bool:
         """Return whether the hand gets to `position` [m], (3,), and all around it within a cell of the map."""
-        cells = self._arrives
-        x, y, z = (math.floor((at - start) / _CELL) for at, start in zip(position, self._corner, strict=True))
+        cells, (x, y, z), (first_x, first_y, first_z) = self._arrives, position, self._corner
+        x, y, z = (
+            math.floor((x - first_x) / _CELL),
+            math.floor((y - first_y) / _CELL),
+            math.floor((z - first_z) / _CELL),
+        )
         if not (0 <= x < len(cells) and 0 <= y < len(cells[0]) and 0 <= z < len(cells[0][0])):
             return False
         return cells[x][y][z]

@@ -71,4 +71,4 @@ def angle_from_down(rotation: F64, yaw: float) -> float:
 
 def angle_between(a: F64, b: F64) -> float:
     """Return angle of the rotation from `a` to `b`, (3, 3) each [rad]."""
-    return math.acos(min(1.0, max(-1.0, (float(a.ravel() @ b.ravel()) - 1) / 2)))
+    return math.acos(min(1.0, max(-1.0, (float(a.ravel().dot(b.ravel())) - 1) / 2)))

@@ -102,7 +102,8 @@ class World:
         self._plain = self.model, self.data
         self._own: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._cache: dict[Any, Any] = {}  # until the world moves
-        self._bodies: dict[str, int] = {}
+        self._poses: dict[str, Pose] = {}  # until the data change their identity
+        self._ee: Pose | None = None
         self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
 
     # Physics
@@ -117,6 +118,8 @@ class World:
             return
         variations.check(variation, self.scene.nominal)
         self._cache.clear()
+        self._poses.clear()
+        self._ee = None
         self._extents.clear()
         self.variation = variation.copy()
         if variations.same_physics(variation, self.scene.nominal):
@@ -172,17 +175,19 @@ class World:
     @property
     def ee(self) -> Pose:
         """The frame between the fingertips: z out of the hand, y along the fingers' motion."""
-        at = self.scene.ee_site
-        return self.remember("ee", lambda: Pose(self.data.site_xpos[at], self.data.site_xmat[at].reshape(3, 3)))
+        if self._ee is None:
+            at, data = self.scene.ee_site, self.data
+            self._ee = Pose(data.site_xpos[at], data.site_xmat[at].reshape(3, 3))
+        return self._ee
 
     def pose(self, name: str) -> Pose:
-        """Return the pose of a body. Raises `UnknownName`."""
-        key = "pose", name
-        if key not in self._cache:
+        """Return the pose of a body, which follows it as the world moves. Raises `UnknownName`."""
+        pose = self._poses.get(name)
+        if pose is None:
             one = self.scene.objects.get(name)
-            body = one.body if one is not None else self._body_id(name)
-            self._cache[key] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
-        return self._cache[key]
+            body = one.body if one is not None else self._body(name).id
+            pose = self._poses[name] = Pose(self.data.xpos[body], self.data.xmat[body].reshape(3, 3))
+        return pose
 
     @property
     def goal(self) -> F64:
@@ -318,11 +323,6 @@ class World:
     @cached_property
     def _mocap_goal(self) -> int:
         return int(self._body(GOAL).mocapid[0])
-
-    def _body_id(self, name: str) -> int:
-        if name not in self._bodies:  # MuJoCo's own look-up takes 10 us
-            self._bodies[name] = self._body(name).id
-        return self._bodies[name]
 
     def _body(self, name: str) -> Any:
         try:

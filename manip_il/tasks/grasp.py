@@ -191,6 +191,8 @@ def _nearest(
 
 def _crowding(yaw: float, widest: float, neighbours: Sequence[tuple[float, float]]) -> float:
     """Return how much the open fingers of a grasp would meet a neighbour of the object, 0 to 1."""
+    if not neighbours:
+        return 0.0
     thick, half, clear = FINGER
     c, s, worst = math.cos(yaw), math.sin(yaw), 0.0
     for x, y in neighbours:

@@ -101,12 +101,11 @@ def close_on(world: World, name: str) -> Target:
 
 def carry(world: World, name: str, to: F64, lift: Lift = CARRY) -> Target:
     """Carry the held object's centre to a point (3,) [m], above it first and then down."""
-    way = to - world.pose(name).position
-    off = math.hypot(way[0], way[1])
+    x, y, z = (to - world.pose(name).position).tolist()
+    off = math.hypot(x, y)
     height = lift.over(off)
-    if off > lift.free:
-        way[:2] *= min(1.0, max(0.0, 1.0 - (way[2] + height) / lift.rise_first))
-    position = world.ee.position + way + [0.0, 0.0, height]
+    sideways = min(1.0, max(0.0, 1.0 - (z + height) / lift.rise_first)) if off > lift.free else 1.0
+    position = world.ee.position + [sideways * x, sideways * y, z + height]
     position[2] = max(position[2], world.lowest)
     return Target(position, hand_down(world.ahead(position)), CLOSED, max_step=lift.max_step)
 
@@ -156,7 +155,7 @@ def pick_rungs(name: str) -> tuple[Rung, ...]:
     """Return the ladder that grasps an object and carries it to the goal."""
 
     def at_goal(world: World) -> bool:
-        return held(world, name) and math.dist(world.pose(name).position, world.goal) < AT_GOAL
+        return held(world, name) and math.dist(world.pose(name).position.tolist(), world.goal.tolist()) < AT_GOAL
 
     def to_goal(world: World) -> Target:
         return carry(world, name, world.goal)
@@ -188,10 +187,10 @@ def carry_progress(world: World, name: str, to: F64, lift: Lift = CARRY) -> floa
 
     That is up to its height, sideways, and down.
     """
-    way = to - world.pose(name).position
-    off = math.hypot(way[0], way[1])
+    x, y, z = (to - world.pose(name).position).tolist()
+    off = math.hypot(x, y)
     height = lift.over(off)
-    return nearness(abs(way[2] + height) + off + height)
+    return nearness(abs(z + height) + off + height)
 
 
 def nearness(rest: float) -> float:

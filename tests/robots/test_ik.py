@@ -25,7 +25,8 @@ def problem_of_mink(robot: Robot, q: np.ndarray, position: np.ndarray, rotation:
     address = [model.joint(name).qposadr[0] for name in robot.joints]
     home[address] = robot.home
     frame = mink.FrameTask("ee", "site", 1.0, robot.costs.orientation, lm_damping=ik._LM_DAMPING)
-    frame.set_target(ik._se3(position, rotation))
+    turned = mink.SO3.from_matrix(rotation)
+    frame.set_target(mink.SE3.from_rotation_and_translation(turned, position))
     posture = mink.PostureTask(model, cost=robot.costs.posture)
     posture.set_target(home)
     there = np.zeros(model.nq)
