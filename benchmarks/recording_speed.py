@@ -126,7 +126,7 @@ def record_seconds(
     selection = recording.selection()
     with recording.open(root, spec, fingerprint) as writer:
         for collected in collect(engine, job, seeds, journals):
-            for episode in selection.take([collected.read(spec, fingerprint)]):
+            for episode in selection.take([collected.read()]):
                 writer.add(episode)
             if between is not None:
                 writer.wait()  # else what is still being encoded would slow down what comes now

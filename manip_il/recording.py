@@ -21,16 +21,16 @@ from manip_il.data.journal import (
     list_seeds,
     read_header,
     read_journal,
-    set_aside_damaged,
+    set_aside,
 )
 from manip_il.data.lerobot_read import DatasetInfo
-from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
+from manip_il.data.schema import IMAGES, check_same_spec
 from manip_il.engine.engine import Engine
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob
 from manip_il.engine.pool import Job
 from manip_il.engine.redraw import STATES, RedrawJob, write_states
-from manip_il.errors import ManipError, MismatchError
+from manip_il.errors import ManipError, MismatchError, OlderSchemaError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
@@ -41,17 +41,15 @@ MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostl
 
 @dataclass(frozen=True)
 class Collected:
-    """One episode on disk. episode: all of it, where it is in memory still; else None."""
+    """One episode on disk. entry: what `read_journal` gives, where it is in memory still; else None."""
 
     path: Path
     success: bool
-    episode: Episode | None
+    entry: tuple[Header, Episode] | None
 
-    def read(self, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> tuple[Header, Episode]:
-        """Return what `read_journal` gives. spec, fingerprint: of what was run here."""
-        if self.episode is None:
-            return read_journal(self.path)
-        return Header.of(self.episode, spec, fingerprint), self.episode
+    def read(self) -> tuple[Header, Episode]:
+        """Return what `read_journal` gives."""
+        return self.entry or read_journal(self.path)
 
 
 def collect(
@@ -59,34 +57,53 @@ def collect(
 ) -> Iterator[Collected]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
-    Yields them in the order of the seeds, as soon as all before one are there. A seed that kills its worker again
-    and again is left out: a warning names it. on_episode is called once an episode is on disk; what it raises ends
-    the run, and what is on disk stays.
+    Yields them in the order of the seeds, as soon as all before one are there. A journal that was there is read when
+    its turn comes; a damaged one is set aside, with a warning, and its seed runs again. A seed that kills its worker
+    again and again is left out: a warning names it. on_episode is called once an episode is on disk; what it raises
+    ends the run, and what is on disk stays.
     """
-    on_disk = dict.fromkeys(list_seeds(journals), False)  # seed -> whether it was run here and succeeded
-    in_memory: dict[int, Episode] = {}
+    spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
+    keep, waiting = JournalKeep(journals, spec, fingerprint), deque(seeds)
+    on_disk = dict.fromkeys(list_seeds(journals))  # seed -> whether it succeeded, of those that were run here
+    in_memory: dict[int, tuple[Header, Episode]] = {}
 
-    def collected(seed: int) -> Collected:
-        path = episode_path(journals, seed)
-        return Collected(path, on_disk[seed] or read_header(path).success, in_memory.pop(seed, None))
-
-    missing = [seed for seed in seeds if seed not in on_disk]
-    keep = JournalKeep(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
-    waiting = deque(seeds)
-    for episode in engine.run(job, missing, keep):
-        on_disk[episode.seed] = episode.success
-        whole = job.cameras is None or any(key.startswith(IMAGES) for key in episode.columns)
-        if whole and len(in_memory) < _IN_MEMORY:
-            in_memory[episode.seed] = episode
-        if on_episode is not None:
-            on_episode(episode)
+    def ready() -> Iterator[Collected]:
         while waiting and waiting[0] in on_disk:
-            yield collected(waiting.popleft())
-    for seed in waiting:
-        if seed in on_disk:
-            yield collected(seed)
-        else:
-            _LOG.warning("seed %d is left out: it repeatedly killed its worker", seed)
+            path, success = episode_path(journals, waiting[0]), on_disk[waiting[0]]
+            entry = in_memory.pop(waiting[0], None)
+            if success is None:
+                entry = _read_or_set_aside(path)
+                if entry is None:
+                    del on_disk[waiting[0]]
+                    return
+                success = entry[0].success
+            waiting.popleft()
+            yield Collected(path, success, entry)
+
+    while waiting:
+        missing = [seed for seed in waiting if seed not in on_disk]
+        yield from ready()
+        for episode in engine.run(job, missing, keep):
+            on_disk[episode.seed] = episode.success
+            whole = job.cameras is None or any(key.startswith(IMAGES) for key in episode.columns)
+            if whole and len(in_memory) < _IN_MEMORY:
+                in_memory[episode.seed] = Header.of(episode, spec, fingerprint), episode
+            if on_episode is not None:
+                on_episode(episode)
+            yield from ready()
+        if waiting and waiting[0] in missing and waiting[0] not in on_disk:
+            _LOG.warning("seed %d is left out: it repeatedly killed its worker", waiting.popleft())
+
+
+def _read_or_set_aside(path: Path) -> tuple[Header, Episode] | None:
+    """A journal; None for a damaged one, which is renamed, so that its seed is free."""
+    try:
+        return read_journal(path)
+    except OlderSchemaError:
+        raise  # nothing is wrong with it
+    except ManipError as error:
+        _LOG.warning("%s (set aside as %s)", error, set_aside(path).name)
+        return None
 
 
 def collect_successes(
@@ -128,7 +145,7 @@ def record(
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
     selection = recording.selection()
     with recording.open(root, spec, fingerprint, replace=replace) as writer:
-        for episode in selection.take(collected.read(spec, fingerprint) for collected in episodes):
+        for episode in selection.take(collected.read() for collected in episodes):
             writer.add(episode)
         return writer.finish(recording.provenance | selection.provenance), selection.failed
 
@@ -170,19 +187,26 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
 def check_journals(journals: Path, job: Job) -> list[str]:
     """Check that a recording may continue from these journals: `MismatchError`, or a list of warnings to show.
 
-    Every file is read; one that is damaged is set aside, so that its seed runs again.
+    The first that can be read speaks for all; `collect` reads the others when their turn comes.
     """
     clean_temporary(journals)
-    warnings = set_aside_damaged(journals)
-    paths = list_episodes(journals)
-    if not paths:
-        return warnings
-    header, spec = read_header(paths[0]), env_spec(job.env, job.cameras)
-    here = f"{job.env.robot} {job.env.task}"
+    header = next(filter(None, map(_header, list_episodes(journals))), None)
+    if header is None:
+        return []
+    spec, here = env_spec(job.env, job.cameras), f"{job.env.robot} {job.env.task}"
     check_same_spec(str(journals), header.spec, here, spec)
     for what in ("task", "cameras", "image_size"):
         left, right = getattr(header.spec, what), getattr(spec, what)
         if left != right:
             raise MismatchError(what, str(journals), left, here, right)
     fingerprint = env_fingerprint(job.env, job.cameras)
-    return warnings + compare_fingerprints(str(journals), header.fingerprint, "this machine", fingerprint)
+    return compare_fingerprints(str(journals), header.fingerprint, "this machine", fingerprint)
+
+
+def _header(path: Path) -> Header | None:
+    try:
+        return read_header(path)
+    except OlderSchemaError:
+        raise
+    except ManipError:
+        return None

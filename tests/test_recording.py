@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manip_il import recording
 from manip_il.data.build import Recording, build
-from manip_il.data.journal import list_episodes, read_episode, read_header
+from manip_il.data.journal import list_episodes, read_episode, read_header, read_journal
 from manip_il.data.lerobot_read import read_table
 from manip_il.engine.engine import Engine
 from manip_il.engine.jobs import RolloutJob
@@ -126,17 +127,28 @@ def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
     assert len(warnings) == 1
 
 
-def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path):
+def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog):
     whole = [one.path.read_bytes() for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
     damaged = list_episodes(tmp_path)[1]
     damaged.write_bytes(whole[1][:5000])
-    warnings = check_journals(tmp_path, JOB)
-    assert len(warnings) == 1
-    assert damaged.name in warnings[0]
-    assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
+    assert check_journals(tmp_path, JOB) == []
     engine = Recorded()
-    assert [one.path.read_bytes() for one in collect(engine, JOB, SEEDS[:3], tmp_path)] == whole
-    assert engine.asked == [SEEDS[1]]
+    assert [one.path.read_bytes() for one in collect(engine, JOB, SEEDS[:4], tmp_path)][:3] == whole
+    assert engine.asked == [SEEDS[3], SEEDS[1]]
+    [record] = caplog.records
+    assert f"{damaged} is not a complete episode" in record.getMessage()
+    assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
+
+
+def test_journals_that_are_there_are_read_when_their_turn_comes(tmp_path, monkeypatch):
+    list(collect(Recorded(), JOB, SEEDS[:3], tmp_path))
+    read: list[Path] = []
+    monkeypatch.setattr(recording, "read_journal", lambda path: read.append(path) or read_journal(path))
+    assert check_journals(tmp_path, JOB) == []
+    episodes = collect(Recorded(), JOB, SEEDS[:3], tmp_path)
+    assert read == []
+    assert next(episodes).path == read[0]
+    assert len(read) == 1
 
 
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):

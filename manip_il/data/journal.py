@@ -145,21 +145,9 @@ def list_episodes(folder: Path) -> list[Path]:
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
-def set_aside_damaged(folder: Path) -> list[str]:
-    """Rename every file that cannot be read to `<name>.damaged`, so that its seed is free; return what was wrong.
-
-    Only for when no writer is at work in `folder`.
-    """
-    wrong: list[str] = []
-    for path in list_episodes(folder):
-        try:
-            read_journal(path)
-        except OlderSchemaError:
-            raise  # nothing is wrong with it
-        except ManipError as error:
-            path.rename(path.with_name(path.name + _DAMAGED))
-            wrong.append(f"{error} (set aside as {path.name}{_DAMAGED})")
-    return wrong
+def set_aside(path: Path) -> Path:
+    """Rename a damaged file to `<name>.damaged`, so that its seed is free; return the new path."""
+    return path.rename(path.with_name(path.name + _DAMAGED))
 
 
 def clean_temporary(folder: Path) -> list[Path]:

@@ -17,7 +17,6 @@ from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
 from manip_il.data.lerobot_read import dataset_info, read_episodes, read_fingerprint, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.errors import ManipError
 from manip_il.learn.columns import LEARNING_COLUMNS, check_table, learning_rows
 from manip_il.mcap.importing import features_of, frames_of, list_files, read_import
 from manip_il.mcap.mapping import load_mapping
@@ -137,11 +136,6 @@ def _journals(folder: Path) -> None:
         journal.read_journal(path)
 
 
-def _set_aside(folder: Path) -> None:
-    if wrong := journal.set_aside_damaged(folder / "demos.journals"):
-        raise ManipError(wrong[0])
-
-
 def _import(folder: Path) -> None:
     mapping = load_mapping(folder / "mapping.yaml")
     for path in list_files(folder / "in.mcap"):
@@ -177,7 +171,7 @@ TARGETS = (
     ),
     Target("video", make_pictured, "dataset/videos/*/*/*.mp4", damaged_video, (_episodes, _DOCTOR), share=0.3),
     Target("recording.json", make_journals, "demos.journals/recording.json", mutate_json, (_BUILD,)),
-    Target("journal", make_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _BUILD, _set_aside)),
+    Target("journal", make_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _BUILD)),
     Target("pictured journal", make_pictured_journals, "demos.journals/*.mcap", mutate_mcap, (_journals, _BUILD)),
     Target("mcap", make_mcap, "in.mcap", mutate_mcap, (_import,)),
     Target("mcap mapping", make_mcap, "mapping.yaml", mutate_yaml, (_import,)),
