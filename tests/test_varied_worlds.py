@@ -21,7 +21,8 @@ from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.render import open_source, render_states
+from manip_il.engine.render import render_states
+from manip_il.engine.source import open_source
 from manip_il.errors import MismatchError
 from manip_il.expert import Expert
 from manip_il.mdp import Episode, State

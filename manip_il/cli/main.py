@@ -45,6 +45,7 @@ COMMANDS = {
         "manip_il.cli.record:RenderOptions", "render a dataset again, with other cameras, sizes or lights"
     ),
     "redraw": Command("manip_il.cli.redraw:RedrawOptions", "draw visited states anew, for policies on pictures"),
+    "relabel": Command("manip_il.cli.relabel:RelabelOptions", "label a dataset's states anew, by the expert of today"),
     "build": Command("manip_il.cli.record:BuildOptions", "rebuild a dataset from its journals"),
     "train": Command("manip_il.cli.train:TrainOptions", "train a policy on a dataset (behaviour cloning)"),
     "dagger": Command("manip_il.cli.dagger:DaggerOptions", "train by DAgger: roll out, label, refit, repeat"),

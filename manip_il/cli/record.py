@@ -228,7 +228,8 @@ class RenderOptions:
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
         from manip_il.engine.engine import default_workers
-        from manip_il.engine.render import open_source, render_dataset
+        from manip_il.engine.render import render_dataset
+        from manip_il.engine.source import open_source
 
         source = open_source(self.source, self.robot.type)
         warn(source.warnings)

@@ -19,7 +19,7 @@ from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
     from manip_il.engine.redraw import RedrawJob
-    from manip_il.engine.render import Source
+    from manip_il.engine.source import Source
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
 
@@ -73,7 +73,7 @@ class RedrawOptions:
 
     def make(self) -> None:
         """Draw all frames, and say nothing of what comes next."""
-        from manip_il.engine.render import open_source
+        from manip_il.engine.source import open_source
 
         source = open_source(self._dataset(), self.robot.type)
         warn(source.warnings)

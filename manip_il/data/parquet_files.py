@@ -78,14 +78,14 @@ class ParquetFiles:
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(
-                self._path,
-                self.schema,
-                compression="snappy",
-                use_dictionary=True,
-                write_page_checksum=True,  # else a changed bit is read as another number
-            )
+            self._writer = open_writer(self._path, self.schema)
         self._writer.write_table(table)
+
+
+def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Return a writer with the settings that all our files have."""
+    checksums = True  # else a changed bit is read as another number
+    return pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=True, write_page_checksum=checksums)
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:

@@ -13,7 +13,8 @@ from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_pro
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.render import open_source, recorded_conditions, render_dataset, render_episodes, render_states
+from manip_il.engine.render import render_dataset, render_episodes, render_states
+from manip_il.engine.source import open_source, recorded_conditions
 from manip_il.errors import ManipError, MismatchError
 from manip_il.expert import Expert
 from manip_il.mdp import Episode, State

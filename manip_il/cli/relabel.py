@@ -1,0 +1,83 @@
+"""`manip-il relabel`: a dataset with the labels that the expert of today gives its states."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from manip_il.cli import common_options as common
+from manip_il.cli.inputs import require_dataset
+from manip_il.cli.outputs import require_new
+from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.record import OwnRobotGroup
+from manip_il.data.atomic import exclusive
+from manip_il.errors import UsageError
+from manip_il.option import option
+
+if TYPE_CHECKING:
+    from manip_il.engine.relabel import Changes
+
+
+@dataclass
+class RelabelOptions:
+    """Label every state of a dataset anew, by the expert of today, in place of recording again.
+
+    TARGET is DATASET with other labels: what was executed, pictures and all else stay as they are. States in which the
+    expert was not asked are labelled, too. Says how many labels changed.
+    """
+
+    example: ClassVar[str] = "manip-il relabel datasets/demos"
+    dataset: Path = option(MISSING, "a dataset of this program, with or without pictures", positional=True)
+    target: Path | None = option(None, "folder of the new dataset; by default DATASET_relabelled", positional=True)
+    robot: OwnRobotGroup = field(default_factory=OwnRobotGroup)
+    workers: int | None = option(None, "processes; by default one per core")
+    overwrite: bool = option(False, "replace an existing dataset")
+
+    def check(self) -> None:
+        """Refuse what paths and values show to be wrong."""
+        common.require_workers(self.workers)
+        require_dataset(self.dataset)
+        source, target = self.dataset.resolve(), self._target().resolve()
+        if source.is_relative_to(target) or target.is_relative_to(source):
+            raise UsageError(f"TARGET {self._target()} overlaps DATASET {self.dataset}; expected a folder of its own")
+        require_new(self._target(), overwrite=self.overwrite)
+
+    def run(self) -> None:
+        """Label every state; TARGET appears when all are labelled."""
+        from manip_il.data.build import local_id
+        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.engine.engine import default_workers
+        from manip_il.engine.relabel import relabel_dataset
+        from manip_il.engine.source import open_source
+
+        target, workers = self._target(), self.workers or default_workers()
+        source = open_source(self.dataset, self.robot.type)
+        warn(source.warnings)
+        with exclusive(target), progress(dataset_info(self.dataset).episodes, f"relabel {self.dataset}") as bar:
+            changes = relabel_dataset(
+                source,
+                target,
+                repo_id=local_id(target.name),
+                workers=workers,
+                replace=self.overwrite,
+                on_episode=lambda _: bar.advance(),
+            )
+        say(f"relabelled {changes.episodes:,} episodes, {changes.frames:,} frames: {in_words(changes)}")
+        say(f"dataset: {target}")
+
+    def _target(self) -> Path:
+        folder = self.dataset.absolute()
+        return self.target or self.dataset.with_name(f"{folder.name}_relabelled")
+
+
+def in_words(changes: Changes) -> str:
+    """Return what relabelling changed."""
+    parts = {
+        "actions differ by more than 1 % of a joint's longest step": changes.actions,
+        "phases differ": changes.phases,
+        "states have a sound label now": changes.gained,
+        "states have none any more": changes.lost,
+    }
+    found = [f"{count:,} {what}" for what, count in parts.items() if count]
+    return ", ".join(found) if found else "all labels are as they were"
