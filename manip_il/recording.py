@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import shutil
 from collections import deque
@@ -36,6 +37,7 @@ from manip_il.mdp import Episode
 _LOG = logging.getLogger(__name__)
 OnEpisode = Callable[[Episode], None]
 _IN_MEMORY = 64  # episodes that may wait in memory; others are read again
+_BETWEEN = 20  # at most so many are handed on between two that end, as there may be thousands from before
 MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
 
 
@@ -82,7 +84,6 @@ def collect(
 
     while waiting:
         missing = [seed for seed in waiting if seed not in on_disk]
-        yield from ready()
         for episode in engine.run(job, missing, keep):
             on_disk[episode.seed] = episode.success
             whole = job.cameras is None or any(key.startswith(IMAGES) for key in episode.columns)
@@ -90,7 +91,8 @@ def collect(
                 in_memory[episode.seed] = Header.of(episode, spec, fingerprint), episode
             if on_episode is not None:
                 on_episode(episode)
-            yield from ready()
+            yield from itertools.islice(ready(), _BETWEEN)
+        yield from ready()
         if waiting and waiting[0] in missing and waiting[0] not in on_disk:
             _LOG.warning("seed %d is left out: it repeatedly killed its worker", waiting.popleft())
 

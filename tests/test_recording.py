@@ -140,15 +140,16 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog
     assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
 
 
-def test_journals_that_are_there_are_read_when_their_turn_comes(tmp_path, monkeypatch):
-    list(collect(Recorded(), JOB, SEEDS[:3], tmp_path))
-    read: list[Path] = []
-    monkeypatch.setattr(recording, "read_journal", lambda path: read.append(path) or read_journal(path))
+def test_new_episodes_run_before_all_that_are_there_have_been_read(tmp_path, monkeypatch):
+    before = [one.path.read_bytes() for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
+    steps: list[str] = []
+    monkeypatch.setattr(recording, "read_journal", lambda path: steps.append(path.name) or read_journal(path))
     assert check_journals(tmp_path, JOB) == []
-    episodes = collect(Recorded(), JOB, SEEDS[:3], tmp_path)
-    assert read == []
-    assert next(episodes).path == read[0]
-    assert len(read) == 1
+    episodes = collect(Recorded(), JOB, SEEDS[:4], tmp_path, lambda _: steps.append("new"))
+    assert next(episodes).path.read_bytes() == before[0]
+    assert steps == ["new", list_episodes(tmp_path)[0].name]
+    assert [one.path.read_bytes() for one in episodes][:2] == before[1:]
+    assert len(steps) == 4
 
 
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):

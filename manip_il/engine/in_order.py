@@ -11,7 +11,8 @@ from typing import TypeVar
 from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.errors import ManipError
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def map_in_order(function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:

@@ -42,9 +42,9 @@ def recorded(env: EnvConfig, count: int = 2, cameras: CameraConfig | None = None
 def without_labels(episode: Episode) -> Episode:
     """As if the expert had not been asked: other actions, no phase, not sound."""
     columns = dict(episode.columns)
-    columns[schema.ACTION] = columns[schema.EXECUTED_ACTION] * 0
+    columns[schema.ACTION] = np.zeros_like(episode.columns[schema.ACTION])
     for key in LABELS[1:]:
-        columns[key] = columns[key] * 0
+        columns[key] = np.zeros_like(columns[key])
     return dataclasses.replace(episode, columns=columns)
 
 
@@ -129,7 +129,7 @@ def test_videos_are_copied_and_lerobot_reads_all(tmp_path):
     )
     relabel(bare, tmp_path / "again")
     assert content(tmp_path / "again") == content(whole)
-    dataset = lerobot_windows(tmp_path / "again", "local/new", None)
+    dataset: Any = lerobot_windows(tmp_path / "again", "local/new", None)
     np.testing.assert_array_equal(dataset[5][schema.ACTION], episodes[0].columns[schema.ACTION][5])
     assert main(["doctor", str(tmp_path / "again")]) == 0
 
