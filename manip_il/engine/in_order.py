@@ -6,16 +6,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import TypeVar
 
 from manip_il.child_processes import bound_to_this_process, initialize_worker
 from manip_il.errors import ManipError
 
-T = TypeVar("T")
-R = TypeVar("R")
 
-
-def map_in_order(function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
+def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
     """Yield each item with its result, in order; at most `workers` + 1 of them wait in memory.
 
     One worker is this process. Items and results are pickled for others. Raises `ManipError` where a worker dies.
@@ -39,6 +35,6 @@ def map_in_order(function: Callable[[T], R], items: Iterable[T], workers: int) -
         pool.shutdown(cancel_futures=True)
 
 
-def _next(waiting: deque[tuple[T, Future[R]]]) -> tuple[T, R]:
+def _next[T, R](waiting: deque[tuple[T, Future[R]]]) -> tuple[T, R]:
     item, result = waiting.popleft()
     return item, result.result()
