@@ -65,11 +65,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     with writing(root):
         root.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(root)
-        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
-    lock = os.open(partial, os.O_RDONLY)
+        partial, lock = _held_sibling(root)
     try:
-        with contextlib.suppress(OSError):  # a network file system may know no locks; then leftovers stay
-            fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel lets go when the writer dies: so leftovers are known
         partial.chmod(0o777 & ~umask())
         with writing(root):
             yield partial
@@ -86,6 +83,22 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
         raise
     finally:
         os.close(lock)
+
+
+def _held_sibling(root: Path) -> tuple[Path, int]:
+    """Make a hidden folder beside `root`; return it and its descriptor, which holds it.
+
+    One that another writer took for a leftover, before it was held, is made again.
+    """
+    while True:
+        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
+        with contextlib.suppress(FileNotFoundError):
+            lock = os.open(partial, os.O_RDONLY)
+            with contextlib.suppress(OSError):  # a network file system may know no locks; then leftovers stay
+                fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel lets go when the writer dies: so leftovers are known
+            if partial.is_dir():
+                return partial, lock
+            os.close(lock)
 
 
 @contextlib.contextmanager
