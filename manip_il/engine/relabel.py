@@ -31,7 +31,7 @@ NOTICEABLE = 0.01  # of a joint's longest step, or of the gripper's whole openin
 
 @dataclass
 class Changes:
-    """Counts of what relabelling changed. actions: sound labels before and after that differ by more than `NOTICEABLE`."""
+    """Counts of what relabelling changed. actions: of labels sound before and after, by more than `NOTICEABLE`."""
 
     episodes: int = 0
     frames: int = 0
