@@ -1,6 +1,6 @@
 """How recording, resuming, checking, training and pushing grow with the number of episodes.
 
-python benchmarks/scale.py [--quick] [--episodes=100000] [--folder=FOLDER]
+python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER]
 
 Fetch's reach, the cheapest to simulate, on one worker. A recording grows tenfold again and again by
 `record --resume=true`; at every size each command runs whole, as a process of its own. Processor time, as it does not
@@ -40,7 +40,7 @@ class Run:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="ten episodes: shows that it runs, measures little")
-    parser.add_argument("--episodes", type=int, default=100_000)
+    parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument("--folder", type=Path, help="where it works, and leaves what it made")
     options = parser.parse_args()
     most, first = (10, 10) if options.quick else (options.episodes, FIRST)

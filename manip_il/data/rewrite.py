@@ -38,8 +38,7 @@ def rewrite_columns(
     check_dataset(source)
     with new_folder(target, replace=replace) as folder:
         shutil.copytree(source, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.parquet"))
-        for path in source.glob(layout.TASKS):
-            shutil.copy2(path, folder / layout.TASKS)
+        shutil.copy2(source / layout.TASKS, folder / layout.TASKS)
         with closing(_Statistics(folder)) as statistics:
             for path in sorted(source.glob(layout.DATA_FILES)):
                 _rewrite_data(path, folder / path.relative_to(source), columns, statistics)
