@@ -109,6 +109,15 @@ def test_a_reload_keeps_the_answers_and_the_name(browser, page):
         assert window.evaluate("document.getElementById('count').innerText") == "Pair 2 of 4"
 
 
+def test_opening_the_page_overwrites_nothing_that_is_kept(browser, page):
+    with opened(browser, page, 1280) as window:
+        window.page.fill("#who", "Ada")
+        window.page.add_init_script("Storage.prototype.getItem = () => null")  # what is kept is not here yet
+        window.page.reload()
+        assert window.page.input_value("#who") == ""
+        window.wait_until("Object.values(localStorage).some(one => one.includes('Ada'))")
+
+
 def test_both_films_play_the_clips_of_their_pair(browser, page):
     with opened(browser, page, 1280) as window:
         for side in ("left", "right"):

@@ -17,6 +17,12 @@ function keep() {
 
 function recall() {
   try {
+    localStorage.setItem(key + " probe", "");  // under another key: a reload may come before what was kept is here
+    localStorage.removeItem(key + " probe");
+  } catch {
+    keeps = false;
+  }
+  try {
     const kept = JSON.parse(localStorage.getItem(key));
     const sound = (one, place) => one.pair === place && typeof one.answer === "string" && typeof one.when === "string";
     if (kept && kept.answers.length <= data.films.length && kept.answers.every(sound)) {
@@ -93,5 +99,4 @@ element("save").addEventListener("submit", (event) => {
 });
 who.addEventListener("input", keep);
 recall();
-keep();
 show();
