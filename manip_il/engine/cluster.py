@@ -1,6 +1,7 @@
 """Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-They send what is to be stored to this process, and get the policy's files from it: nodes need no shared disk.
+They send what is to be stored to this process, and get the policy's files from it, once a node: nodes need no shared
+disk. `nodes.py` says which nodes get work.
 """
 
 from __future__ import annotations
@@ -8,11 +9,14 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import pickle
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+
+import zstandard
 
 from manip_il.data.atomic import new_folder
 from manip_il.engine.pool import Message, Task, portable, run_task
@@ -22,6 +26,8 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is import
 try:
     import ray
     from ray import exceptions
+
+    from manip_il.engine.nodes import Nodes
 except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
@@ -31,11 +37,15 @@ _DIED = (
     exceptions.ObjectLostError,
     exceptions.OutOfMemoryError,
 )
+_LEVEL = 1  # of compression; what is below 100 kB then goes by Ray's short way, past its object stores
 Files = dict[str, bytes]
 
 
 class RayCluster:
-    """Up to `workers` tasks at once, one core each; by default as many as the cluster has cores."""
+    """Up to `workers` tasks at once, one core each; by default as many as the cluster has cores.
+
+    Raises `ManipError` where there is no cluster, or no node with this version of the program.
+    """
 
     def __init__(self, workers: int | None):
         self._running: dict[Any, Task] = {}  # Ray's generator of a task's answers -> the task
@@ -46,7 +56,12 @@ class RayCluster:
                 ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
             except (ConnectionError, RuntimeError, ValueError) as error:
                 raise ManipError(f"no Ray cluster: {error}; check RAY_ADDRESS, or unset it for a local one") from error
-        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self._most, self._nodes = workers, Nodes()
+
+    @property
+    def workers(self) -> int:
+        """Tasks that run at once."""
+        return self._most or self._nodes.cores
 
     def has_room(self) -> bool:
         """Return whether fewer tasks run than may."""
@@ -55,7 +70,7 @@ class RayCluster:
     def submit(self, task: Task) -> None:
         """Send a task to the cluster."""
         # Deaths are counted by the engine, which knows which seeds had ended: Ray itself is to try once.
-        remote = _run_remote.options(num_returns="streaming", max_retries=0)
+        remote = _run_remote.options(num_returns="streaming", max_retries=0, label_selector=self._nodes.selector())
         self._running[remote.remote(task, self._ship(task.job.files))] = task
 
     def wait(self) -> list[tuple[Task, Message]]:
@@ -74,7 +89,7 @@ class RayCluster:
 
     def _next(self, answers: Any) -> tuple[Task, Message]:
         try:
-            message = cast(Message, ray.get(next(answers)))
+            message = cast(Message, pickle.loads(zstandard.decompress(cast(bytes, ray.get(next(answers))))))
         except _DIED as death:
             message = Message("died", error=death)
         except exceptions.RayError as failure:  # what the task itself raises comes as a message
@@ -94,11 +109,17 @@ class RayCluster:
 
 
 @ray.remote(num_cpus=1)
-def _run_remote(task: Task, files: Files | None) -> Iterator[Message]:
+def _run_remote(task: Task, files: Files | None) -> Iterator[bytes]:
     def unpacked() -> Task:
         return task if files is None else replace(task, job=task.job.with_files(_unpack(files)))
 
-    yield from run_task(unpacked, store=False)
+    for message in run_task(unpacked, store=False):
+        yield pack_message(message)
+
+
+def pack_message(message: Message) -> bytes:
+    """Return what goes over the wire."""
+    return zstandard.compress(pickle.dumps(message, pickle.HIGHEST_PROTOCOL), _LEVEL)
 
 
 def _unpack(files: Files) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -33,9 +34,10 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
+def cluster(tmp_path_factory) -> Iterator[Cluster]:
     """Two nodes of one core each on this machine, whose workers find `kept`."""
     patch = pytest.MonkeyPatch()
+    patch.chdir(tmp_path_factory.mktemp("cwd"))  # workers on this machine would find its packages there
     patch.setenv("PYTHONPATH", str(Path(__file__).parent))
     quick = {"health_check_initial_delay_ms": 500, "health_check_period_ms": 500}  # a dead node is missed five times
     head = {"num_cpus": 1, "include_dashboard": False, "_system_config": quick}
@@ -87,4 +89,51 @@ def test_a_node_that_is_killed_costs_no_episode(cluster, tmp_path, expected):
             if count == 3:
                 cluster.remove_node(node, allow_graceful=False)
         assert engine.given_up == []
+    assert contents(tmp_path) == expected
+
+
+STUBS = {"has no manip_il": 'raise ImportError("no such program")', "has manip_il 0.0.0, not": '__version__ = "0.0.0"'}
+
+
+def test_nodes_without_this_version_are_named_and_get_no_work(cluster, tmp_path, expected, monkeypatch, caplog):
+    added = []
+    for number, stub in enumerate(STUBS.values()):
+        package = tmp_path / f"stub{number}" / "manip_il"
+        package.mkdir(parents=True)
+        (package / "__init__.py").write_text(stub)
+        monkeypatch.setenv("PYTHONPATH", str(package.parent))
+        added.append(cluster.add_node(num_cpus=4))
+    cluster.wait_for_nodes()
+    with Engine(None, "ray") as engine:
+        assert len(list(engine.run(JOB, SEEDS, journal(tmp_path / "j", JOB)))) == len(SEEDS)
+    for node in added:
+        cluster.remove_node(node)
+    assert contents(tmp_path / "j") == expected
+    said = sorted(record.getMessage() for record in caplog.records)
+    assert len(said) == len(STUBS)
+    for words in STUBS:
+        [line] = (line for line in said if words in line)
+        assert line.startswith("node ")
+        assert line.endswith("; it gets no work")
+
+
+def test_a_cluster_without_a_node_that_can_work_is_one_line(cluster, monkeypatch):
+    monkeypatch.setattr("manip_il.engine.nodes.__version__", "9.9")
+    with (
+        Engine(None, "ray") as engine,
+        pytest.raises(ManipError, match=r"no node .* has manip_il .*, not 9\.9; install"),
+    ):
+        list(engine.run(JOB, SEEDS))
+
+
+def test_a_node_that_comes_later_gets_work_too(cluster, tmp_path, expected):
+    node, seen = None, set[int]()
+    with Engine(None, "ray") as engine:
+        for count, _ in enumerate(engine.run(JOB, SEEDS, journal(tmp_path, JOB))):
+            if count == 1:
+                node = cluster.add_node(num_cpus=2)
+            time.sleep(0.5)  # so that it can answer before the last seed is given away
+            seen.add(engine._pool.workers)  # pyright: ignore
+    cluster.remove_node(node)
+    assert (min(seen), max(seen)) == (2, 4)
     assert contents(tmp_path) == expected

@@ -1,0 +1,104 @@
+"""Recording on four Ray nodes of one core each, all on this machine, against one such node and against two processes.
+
+python benchmarks/ray_nodes.py [--quick]
+
+Journals of the same episodes, by turns, every worker warm; medians over the turns, with their range. Overhead: how much
+longer an episode takes on the four nodes than in two processes of the engine, whose cores they share. Over the wire:
+what a worker sends home, packed, an episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import ray
+from _machine import describe_machine
+from ray.cluster_utils import Cluster
+
+from manip_il.data.journal import JournalKeep
+from manip_il.engine.cluster import pack_message
+from manip_il.engine.engine import Engine
+from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.engine.jobs import RolloutJob
+from manip_il.engine.pool import Task, run_task
+from manip_il.seeding import stream_seeds
+from manip_il.sim.env import EnvConfig
+
+NODES = 4
+TURNS = 5
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
+    quick = parser.parse_args().quick
+    episodes, turns = (4, 1) if quick else (60, TURNS)
+    job = RolloutJob(EnvConfig("panda"), "expert")
+    print(describe_machine())
+    print(f"over the wire: {wire(job):,.0f} bytes an episode of panda pick_place")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    for _ in range(1, NODES):
+        cluster.add_node(num_cpus=1)
+    cluster.wait_for_nodes()
+    try:
+        ray.init(address=cluster.address, log_to_driver=False, logging_level=logging.ERROR)
+        with Engine(None, "ray") as four, Engine(1, "ray") as one, Engine(2) as local:
+            ways = {"two processes": local, "four nodes": four, "one node": one}
+            times = measured({name: recorder(engine, job) for name, engine in ways.items()}, episodes, turns)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    for name, seconds in times.items():
+        print(f"{name:14s} {episodes / statistics.median(seconds):7.2f} episodes/s")
+    print("four nodes / two processes, time an episode:", spread(times["four nodes"], times["two processes"]))
+    print("one node / four nodes, time an episode:     ", spread(times["one node"], times["four nodes"]))
+    return 0
+
+
+def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
+    """Return what records that many episodes and says how long it took [s]."""
+
+    def record(count: int) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            keep = JournalKeep(Path(folder), env_spec(job.env), env_fingerprint(job.env))
+            started = time.perf_counter()
+            done = sum(1 for _ in engine.run(job, stream_seeds("certificate", count), keep))
+            assert done == count == len(list(Path(folder).glob("*.mcap")))
+            return time.perf_counter() - started
+
+    return record
+
+
+def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int) -> dict[str, list[float]]:
+    for record in ways.values():
+        record(2 * NODES)  # workers start, load and compile
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(turns):
+        for name, record in ways.items():
+            times[name].append(record(episodes))
+    return times
+
+
+def wire(job: RolloutJob) -> float:
+    """Bytes of an episode's messages."""
+    with tempfile.TemporaryDirectory() as folder:
+        keep = JournalKeep(Path(folder), env_spec(job.env), env_fingerprint(job.env))
+        seeds = tuple(stream_seeds("certificate", 8))
+        messages = list(run_task(lambda: Task(job, seeds, keep), store=False))
+    return sum(len(pack_message(message)) for message in messages) / len(seeds)
+
+
+def spread(above: list[float], below: list[float]) -> str:
+    ratios = sorted(a / b for a, b in zip(above, below, strict=True))
+    return f"{statistics.median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
