@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.arrays import Allocate, in_memory
 from manip_il.data.draws import read_drawn
 from manip_il.data.frame_source import find_clips, to_part
 from manip_il.data.info import LARGEST_META, PICTURES, info_problems
@@ -52,11 +53,9 @@ def read_table(
     that is not there, `UsageError` for an episode that is not there.
     """
     info = _read_info(root)
-    table_features = {key: value for key, value in info["features"].items() if value["dtype"] not in PICTURES}
+    table_features = _number_features(info)
     names = list(table_features) if columns is None else list(columns)
-    for name in names:
-        if name not in table_features:
-            raise UnknownName(f"column in {root}", name, table_features)
+    _check_known(root, names, table_features)
     wanted = names if episodes is None else list(dict.fromkeys([*names, layout.EPISODE_INDEX]))
     check_files(root, _data_files(root), wanted)
     table = pa.concat_tables(read_file(path, wanted) for path in _data_files(root))
@@ -66,18 +65,29 @@ def read_table(
     return {name: read_column(root, name, table, table_features[name]) for name in names}
 
 
-def read_tables(roots: Sequence[Path], columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+def read_tables(
+    roots: Sequence[Path], columns: Sequence[str], allocate: Allocate = in_memory
+) -> dict[str, NDArray[Any]]:
     """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
 
-    Raises what `read_table` raises.
+    One data file is held at a time, beside what `allocate` makes. Raises what `read_table` raises.
     """
-    tables = [read_table(root, columns) for root in roots]
-    counts = {layout.EPISODE_INDEX: "total_episodes", layout.INDEX: "total_frames"}
     infos = [_read_info(root) for root in roots]
-    joined = {name: np.concatenate([table[name] for table in tables]) for name in columns}
-    for name in counts.keys() & joined.keys():
-        before = np.cumsum([0, *(info[counts[name]] for info in infos[:-1])])
-        joined[name] = np.concatenate([table[name] + start for table, start in zip(tables, before, strict=True)])
+    total = sum(info["total_frames"] for info in infos)
+    joined: dict[str, NDArray[Any]] = {}
+    row = episode = 0
+    for root, info in zip(roots, infos, strict=True):
+        before = {layout.EPISODE_INDEX: episode, layout.INDEX: row}
+        for piece in _pieces(root, info, list(columns)):
+            for name, values in piece.items():
+                if name not in joined:
+                    joined[name] = allocate((total, *values.shape[1:]), _dtype(info["features"][name], values))
+                part = joined[name][row : row + len(values)]
+                part[:] = values.reshape(part.shape)
+                if before.get(name):
+                    part += before[name]
+            row += len(next(iter(piece.values()), ()))
+        episode += info["total_episodes"]
     return joined
 
 
@@ -258,6 +268,35 @@ def _cameras(info: dict[str, Any]) -> dict[str, Any]:
         raise ManipError(f"cameras of different sizes: {sizes}; this project's datasets have one size for all")
     video = not any(info["features"][s.IMAGES + camera]["dtype"] == "image" for camera in sizes)
     return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
+
+
+def _pieces(root: Path, info: Mapping[str, Any], names: list[str]) -> Iterator[dict[str, NDArray[Any]]]:
+    """Columns of one data file after the other. Raises what `read_table` raises, at the end for a wrong count."""
+    known, found = _number_features(info), 0
+    _check_known(root, names, known)
+    check_files(root, _data_files(root), names)
+    for path in _data_files(root):
+        table = read_file(path, names)
+        found += len(table)
+        if found > info["total_frames"]:
+            break
+        yield {name: read_column(root, name, table, known[name]) for name in names}
+    _check_rows(root, found)
+
+
+def _number_features(info: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in info["features"].items() if value["dtype"] not in PICTURES}
+
+
+def _check_known(root: Path, names: Iterable[str], known: Mapping[str, Any]) -> None:
+    for name in names:
+        if name not in known:
+            raise UnknownName(f"column in {root}", name, known)
+
+
+def _dtype(feature: Mapping[str, Any], values: NDArray[Any]) -> np.dtype[Any]:
+    """The type of numbers that the dataset declares; its files may hold them narrower."""
+    return values.dtype if values.dtype.kind == "O" else np.dtype(feature["dtype"])
 
 
 def _check_rows(root: Path, found: int) -> None:

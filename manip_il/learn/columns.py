@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.data.arrays import Allocate, in_memory, pieces
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
 from manip_il.learn.action_spaces import JOINT_DELTAS, Conversion
@@ -46,10 +47,9 @@ def check_table(table: Table, spec: RobotTaskSpec) -> None:
 def require_finite(table: Table, keys: Sequence[str]) -> None:
     """Raise `NotFiniteError` naming column, row, episode and frame unless all values of these columns are finite."""
     for key in keys:
-        finite = np.isfinite(table[key]).reshape(len(table[key]), -1).all(axis=1)
-        if finite.all():
+        row = next((part.start + at for part in pieces(len(table[key])) for at in _not_finite(table[key][part])), None)
+        if row is None:
             continue
-        row = int(np.flatnonzero(~finite)[0])
         place = [f"row {row}"]
         for name, column in (("episode", EPISODE_INDEX), ("frame", FRAME_INDEX)):
             if column in table:
@@ -57,21 +57,31 @@ def require_finite(table: Table, keys: Sequence[str]) -> None:
         raise NotFiniteError(f"column {key}, {', '.join(place)}: {np.asarray(table[key])[row]} is not finite")
 
 
-def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS) -> Rows:
+def _not_finite(values: NDArray[Any]) -> Sequence[int]:
+    """The rows that have a value that is not finite."""
+    return np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1)).tolist()
+
+
+def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS, allocate: Allocate = in_memory) -> Rows:
     """Return the rows whose `label_valid` is not 0 (all of them where there is no such column).
 
     Targets are the actions in the space of `conversion`. Without `episode_index` all rows count as one episode. Raises
     `ManipError` where no row is left.
     """
-    state, action = np.asarray(table[STATE], np.float32), np.asarray(table[ACTION], np.float32)
-    environment = np.asarray(table.get(ENVIRONMENT_STATE, np.empty((len(state), 0))), np.float32)
+    state, action = table[STATE], table[ACTION]
+    environment = table.get(ENVIRONMENT_STATE, np.empty((len(state), 0), np.float32))
     episodes = np.asarray(table.get(EPISODE_INDEX, np.zeros(len(state))), np.int64).reshape(-1)
     valid = valid_frames(table)
     if not valid.any():
         raise ManipError(f"none of {len(valid)} frames has a valid label: there is nothing to learn from")
-    targets = conversion.encode(action[valid], state[valid])
-    inputs = np.concatenate([state, environment], axis=1)
-    return Rows(inputs[valid], targets, episodes[valid])
+    sound, n = np.flatnonzero(valid), state.shape[1]
+    inputs = allocate((len(sound), n + environment.shape[1]), np.float32)
+    targets = allocate((len(sound), action.shape[1]), np.float32)
+    for part in pieces(len(sound)):
+        rows = sound[part]
+        inputs[part, :n], inputs[part, n:] = state[rows], environment[rows]
+        targets[part] = conversion.encode(action[rows].astype(np.float32, copy=False), inputs[part, :n])
+    return Rows(inputs, targets, episodes[valid])
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +26,7 @@ from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.room import room
 
 _LOG = logging.getLogger(__name__)
 I64 = NDArray[np.int64]
@@ -193,19 +195,32 @@ def load_samples(
     policy: PreTrainedConfig,
     config: FitConfig,
     meta: Any,
+    folder: Path,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
     """Return the samples of datasets, taken as one, for a policy that has its features; in memory where they fit.
 
-    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'. on_frames:
-    sees how many frames more have been decoded. Raises `NotFiniteError`, and what `windows_of` and `Windows.usable`
-    raise.
+    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'. folder: for
+    columns that do not fit in the memory given. on_frames: sees how many frames more have been decoded. Raises
+    `NotFiniteError`, `UsageError` for less memory than a batch needs, and what `windows_of` and `Windows.usable` raise.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = tuple(key for key in features if key in meta.camera_keys)
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    table = read_tables(roots, [*numbers, *_ALWAYS, *label])
+    sizes = {key: math.prod(meta.features[key]["shape"]) for key in features}
+    in_batch = sum(sizes[key] * _window_length(policy, key) for key in features)  # pictures become floats, too
+    table = read_tables(
+        roots,
+        [*numbers, *_ALWAYS, *label],
+        room(
+            config,
+            folder,
+            meta.total_frames,
+            sum(sizes[key] for key in numbers),
+            4 * in_batch * config.samples_per_step,
+        ),
+    )
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     if meta.learnt_actions is not None:
         table[ACTION] = meta.learnt_actions
@@ -228,11 +243,15 @@ def load_samples(
             dataset = WithActions(dataset, windows, meta.learnt_actions)
         source = LibrarySource(dataset, config.num_workers)
     else:
-        columns = {key: torch.from_numpy(np.array(table[key])) for key in (*numbers, *_ALWAYS)}
+        columns = {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)}
         source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
     return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
+
+
+def _window_length(policy: PreTrainedConfig, key: str) -> int:
+    return len((policy.action_delta_indices if key == ACTION else policy.observation_delta_indices) or (0,))
 
 
 def _frames(
@@ -257,5 +276,5 @@ def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
         digest.update((root / "meta" / "stats.json").read_bytes())
     for key, column in table.items():
         digest.update(key.encode())
-        digest.update(np.ascontiguousarray(column).tobytes())
+        digest.update(np.ascontiguousarray(column))
     return digest.hexdigest()

@@ -34,7 +34,7 @@ _COMMANDS = {
 _HEADER = re.compile(r"# manip-il \S+: resolved options \((\w+)\)")
 _NOT_SHOWN = (  # options that are places, or concern one machine
     *("root", "output_dir", "repo_id", "config_path", "resume", "overwrite", "engine", "device", "workers", "threads"),
-    *("num_workers", "image_cache_gb", "log_freq", "save_freq", "tensorboard"),
+    *("num_workers", "memory", "image_cache_gb", "log_freq", "save_freq", "tensorboard"),
 )
 _SECRET = re.compile(r"token|secret|password|passwd|credential|api_?key", re.IGNORECASE)
 _LARGEST_CONFIG = 100_000  # [bytes]
