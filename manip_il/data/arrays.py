@@ -19,7 +19,7 @@ _ROWS = 65_536  # of a large array that are worked on at once
 
 
 def in_memory(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return a new array whose content is not set."""
+    """Return a new array (N, ...) whose content is not set."""
     return np.empty(shape, dtype)
 
 
