@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
 from manip_il.data.lerobot_read import check_dataset
+from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError
 
@@ -69,7 +70,8 @@ def _save(dataset: LeRobotDataset) -> None:
     enabled = is_progress_bar_enabled()
     disable_progress_bar()
     try:
-        dataset.save_episode(parallel_encoding=False)
+        with scheduling_kept():
+            dataset.save_episode(parallel_encoding=False)
     finally:
         if enabled:
             enable_progress_bar()

@@ -19,6 +19,7 @@ from typing import Any, cast
 import av
 import av.logging
 import numpy as np
+from av.packet import Packet
 from av.video.codeccontext import VideoCodecContext
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.lerobot_stats import I64, pixel_counts
 from manip_il.data.pictures import Pictures, count_packets, open_video
+from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
 
@@ -158,10 +160,16 @@ class _VideoFile:
         self._container.close()
 
     def _mux(self, encoder: VideoCodecContext, frame: av.VideoFrame | None) -> None:
-        for packet in encoder.encode(frame):
+        for packet in _encode(encoder, frame):
             packet.stream = self._stream
             self.bytes += packet.size
             self._container.mux_one(packet)
+
+
+def _encode(encoder: VideoCodecContext, frame: av.VideoFrame | None) -> list[Packet]:
+    """Encode a frame, or what is left; the first one opens the encoder."""
+    with contextlib.nullcontext() if encoder.is_open else scheduling_kept():
+        return encoder.encode(frame)
 
 
 def _encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> VideoCodecContext:
@@ -193,8 +201,8 @@ def try_encoder(config: VideoConfig, size: tuple[int, int], fps: int) -> None:
             if len(av.VideoFormat(config.pix_fmt).components) < 3:
                 raise ValueError(f"{config.pix_fmt} has no colour")
             encoder = _encoder(config, size, fps)
-            encoder.encode(_video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
-            encoder.encode(None)
+            _encode(encoder, _video_frame(np.zeros((*size, 3), np.uint8), 0, fps))
+            _encode(encoder, None)
         except (av.FFmpegError, ValueError) as error:
             reason = log[0][2].strip() if log else str(error)
             raise UsageError(f"cannot encode {size[1]} x {size[0]} pictures with {config}: {reason}") from error

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import resource
+import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from fractions import Fraction
@@ -136,6 +138,12 @@ def test_settings_that_cannot_be_are_refused_before_anything_is_written(tmp_path
     with pytest.raises(error, match=message):
         write([], tmp_path / "lift", two, video=VideoConfig(**settings))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such call")
+def test_an_encoder_makes_no_thread_a_real_time_one():
+    video.try_encoder(VideoConfig(vcodec="libsvtav1"), (64, 64), 10)
+    assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {os.SCHED_OTHER}
 
 
 def test_pictures_of_another_size_are_refused(tmp_path, make_episode, filmed, two):
