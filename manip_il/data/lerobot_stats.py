@@ -25,6 +25,7 @@ Stats = dict[str, dict[str, list[float]]]  # column -> name -> one value a dimen
 I64 = NDArray[np.int64]
 _LEVELS = np.arange(256)  # of a pixel
 _BLOCK_BYTES = 16 * 1024 * 1024  # of a dataset's numbers held at once
+_GROUP_BYTES = 4 * 1024 * 1024  # of episodes that are written together, so that reading one dimension is few reads
 
 
 class RunningStats:
@@ -36,7 +37,9 @@ class RunningStats:
     def __init__(self, folder: Path):
         self._numbers = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  # open until `close`
         self._widths: dict[str, int] = {}
-        self._lengths: list[int] = []
+        self._waiting: list[F64] = []  # episodes, each (dimensions, T)
+        self._waiting_bytes = 0
+        self._lengths: list[int] = []  # frames of every group that is written
 
     def add(self, columns: Mapping[str, NDArray[Any]]) -> Stats:
         """Return {column: {min, max, mean, std, count, q01, ...}} of one episode, one value a dimension.
@@ -46,13 +49,17 @@ class RunningStats:
         flat = {key: values.reshape(len(values), -1) for key, values in columns.items()}
         matrix = np.concatenate(list(flat.values()), axis=1, dtype=np.float64, casting="unsafe")
         rows = np.ascontiguousarray(matrix.T)
-        self._numbers.write(rows.data)
         self._widths = {key: values.shape[1] for key, values in flat.items()}
-        self._lengths.append(len(matrix))
-        return self._named(_row_stats(rows), len(matrix))
+        self._waiting.append(rows)
+        self._waiting_bytes += rows.nbytes
+        if self._waiting_bytes >= _GROUP_BYTES:
+            self._write()
+        return self._named(_row_stats(rows.copy()), len(matrix))
 
     def result(self) -> Stats:
         """Return the same of all frames so far."""
+        if self._waiting:
+            self._write()
         self._numbers.flush()
         frames, width = sum(self._lengths), sum(self._widths.values())
         step = max(1, _BLOCK_BYTES // (8 * frames))
@@ -63,6 +70,13 @@ class RunningStats:
     def close(self) -> None:
         """Let go of the file."""
         self._numbers.close()
+
+    def _write(self) -> None:
+        """Append the episodes that wait, dimension by dimension."""
+        group = np.concatenate(self._waiting, axis=1)
+        self._numbers.write(group.data)
+        self._lengths.append(group.shape[1])
+        self._waiting, self._waiting_bytes = [], 0
 
     def _block(self, start: int, stop: int, frames: int) -> F64:
         """Dimensions `start` to `stop - 1` of all frames, (stop - start, frames)."""

@@ -125,7 +125,8 @@ def test_a_writer_that_was_not_finished_leaves_nothing(tmp_path, episodes, spec,
 
 
 def test_statistics_do_not_depend_on_how_much_memory_they_may_use(root, tmp_path, episodes, spec, monkeypatch):
-    monkeypatch.setattr(lerobot_stats, "_BLOCK_BYTES", 1)
+    for limit in ("_BLOCK_BYTES", "_GROUP_BYTES"):
+        monkeypatch.setattr(lerobot_stats, limit, 1)
     write_dataset(episodes, tmp_path / "frugal", spec, **OPTIONS)
     assert (tmp_path / "frugal" / layout.STATS).read_bytes() == (root / layout.STATS).read_bytes()
     table = read_table(root)
