@@ -40,6 +40,7 @@ GIVEN: Sizes = {"refit_steps": 1, "label_budget": 300, "episode": 1, "redraw": 3
 OF_COMMAND: dict[str, Sizes] = {
     "dagger": {"image.height": 32, "image.width": 32},
     "robot check": {"episodes": 1},
+    "theory": {"episodes": 2},
     "preferences pairs": {"count": 12},
     "preferences fit": {"members": 3},
     "gail": {"episodes": 2, "ppo.minibatches": 2, "ppo.epochs": 1, "discriminator.steps": 1},
