@@ -1,6 +1,6 @@
 """How recording, resuming, checking, training and pushing grow with the number of episodes.
 
-python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER]
+python benchmarks/scale.py [--quick] [--episodes=10000] [--folder=FOLDER] [--plot=FILE]
 
 Fetch's reach, the cheapest to simulate, on one worker. A recording grows tenfold again and again by
 `record --resume=true`; at every size each command runs whole, as a process of its own. Processor time, as it does not

@@ -1,4 +1,4 @@
-"""Where large arrays are made: in memory, or in files that are mapped into it."""
+"""Make large arrays in memory, or in files that are mapped into it."""
 
 from __future__ import annotations
 

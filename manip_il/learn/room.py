@@ -1,4 +1,4 @@
-"""Whether a fit's numbers are kept in memory or in files, by `--memory`."""
+"""Choose whether a fit's numbers are kept in memory or in files, by `--memory`."""
 
 from __future__ import annotations
 
