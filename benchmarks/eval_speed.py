@@ -5,7 +5,8 @@ python benchmarks/eval_speed.py [--quick]
 The first limit is `mj_step` replaying the same controls from the same starts and nothing else, on one core, by turns in
 the same run; the median ratio over the repeats counts. The peer is the whole command `lerobot-eval`, with films off, on
 the same checkpoint and seeds, in the faster of its two ways (environments in its own process, or in processes of their
-own), against the whole command `manip-il eval`; both may use every core. Outcomes must be the same, seed by seed.
+own), against the whole command `manip-il eval`; both may use every core. Outcomes must be the same, seed by seed; of a
+diffusion policy (`configs/diffusion_state.yaml`, a tenth of its steps) they cannot, as it draws by its own seeds.
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ def main() -> int:
             spread = f"{shares.min():.2f} to {shares.max():.2f}"
             print(f"{robot:5s}  {ours:15,.0f}  {raw:28,.0f}  {np.median(shares):.2f} ({spread})")
         print("whole commands, panda          seconds  episodes/s")
-        against_lerobot(policies["panda"], Path(folder), 10 if quick else 500)
+        against_lerobot(policies["panda"], Path(folder) / "mlp", 10 if quick else 500)
+        print("whole commands, diffusion      seconds  episodes/s")
+        diffusion = denoising(Path(folder) / "denoising", quick)
+        against_lerobot(diffusion, Path(folder) / "diffusion", 4 if quick else 100, draws=True)
     return 0
 
 
@@ -93,7 +97,18 @@ def replay_seconds(config: EnvConfig, episode: Episode) -> float:
     return time.perf_counter() - started
 
 
-def against_lerobot(policy: Path, folder: Path, episodes: int) -> None:
+def denoising(folder: Path, quick: bool) -> Path:
+    """A diffusion policy from 50 demonstrations."""
+    demos, steps = folder / "demos", 2 if quick else 1_600
+    config = Path(__file__).parent.parent / "configs" / "diffusion_state.yaml"
+    seconds(["manip-il", "record", f"--dataset.num_episodes={4 if quick else 50}", f"--dataset.root={demos}"])
+    words = ["manip-il", "train", f"--config_path={config}", f"--dataset.root={demos}", f"--steps={steps}"]
+    seconds([*words, f"--output_dir={folder / 'run'}"])
+    return folder / "run" / "checkpoints" / "last" / "pretrained_model"
+
+
+def against_lerobot(policy: Path, folder: Path, episodes: int, draws: bool = False) -> None:
+    """Whole commands by turns. draws: the policy draws, so that outcomes differ."""
     ours: list[float] = []
     theirs: list[float] = []
     success = ""
@@ -107,6 +122,8 @@ def against_lerobot(policy: Path, folder: Path, episodes: int) -> None:
             theirs.append(seconds(lerobot_words(policy, out, episodes, asynchronous)))
             name = f"lerobot-eval, {'in processes' if asynchronous else 'in one process'}"
             print(f"{name:29s}  {theirs[-1]:7.1f}  {episodes / theirs[-1]:10.1f}")
+            if draws:
+                continue
             metrics = json.loads((out / "eval_info.json").read_text())["per_task"][0]["metrics"]
             pairs = zip(metrics["successes"], result.episodes, strict=True)
             if differing := sum(a != b.success for a, b in pairs):

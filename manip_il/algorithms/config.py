@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manip_il.errors import UnknownName, UsageError
-from manip_il.learn.fit_config import FitConfig
+from manip_il.learn.fit_config import FitConfig, MLPOptions
 from manip_il.option import option
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.stock.table import ROBOT as STOCK
@@ -298,5 +298,5 @@ def check_labels(config: RunConfig) -> None:
     if rule.kind == "likelihood":
         from manip_il.learn.policy import LIKELIHOODS, NO_LIKELIHOOD
 
-        if not fit.is_mlp or fit.policy.get("loss", "mse") not in LIKELIHOODS:
+        if not fit.is_mlp or fit.policy.get("loss", MLPOptions.loss) not in LIKELIHOODS:
             raise UsageError(NO_LIKELIHOOD)

@@ -56,7 +56,7 @@ def _by_default(name: str) -> str:
 class MLPOptions:
     """The options of the mlp that change most; `MLPConfig` has them all."""
 
-    loss: str = option("mse", "mse, l1, gaussian, mixture or categorical")
+    loss: str = option("l1", "l1, mse, gaussian, mixture or categorical")
     width: int = option(256, "units per layer")
     depth: int = option(3, "hidden layers")
 

@@ -2,7 +2,8 @@
 
 They keep what they remember (queues of actions, past observations, ensembles) as plain attributes, one for all rows of
 a batch. Here every episode has a copy of its own that shares the weights and acts alone: it plans at its own clock, and
-its actions are the same bits whatever runs beside it.
+its actions are the same bits whatever runs beside it. Diffusion policies, which take long to plan, share calls of their
+network (`SharedPlans`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import io
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.error import URLError
 
 import draccus
@@ -41,6 +42,9 @@ from manip_il.learn.pretrained import (
     require_trust,
 )
 
+if TYPE_CHECKING:  # it imports diffusers, which takes a second
+    from manip_il.learn.shared_plans import SharedPlans
+
 Batch = dict[str, Any]
 _DEVICE_STEP = "device_processor"
 _LONGEST = 300  # characters of another program's message
@@ -65,6 +69,7 @@ class EpisodePolicy:
         self.module, self._before, self._after, self._task = policy, before, after, task
         self._device = torch.device(policy.config.device or "cpu")
         self._shared = _shared(policy)
+        self._plans = _plans_of(policy)
         self._instructions: dict[int, str] = {}
         self._memories: dict[int, tuple[PreTrainedPolicy, Iterator[int]]] = {}  # and the number of each step
 
@@ -73,7 +78,12 @@ class EpisodePolicy:
         self.forget(self._memories.keys() - set(episodes))
         rows = ({key: values[i : i + 1] for key, values in batch.items()} for i in range(len(episodes)))
         try:
-            actions = [self._one(row, episode) for row, episode in zip(rows, episodes, strict=True)]
+            # mixed precision where the policy was trained so, as lerobot-eval has it
+            with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
+                if self._plans is not None:
+                    actions = self._together(self._plans, rows, episodes)
+                else:
+                    actions = [self._one(row, episode) for row, episode in zip(rows, episodes, strict=True)]
         except ManipError:
             raise
         except Exception as error:  # the code of any policy, with options and statistics from anywhere
@@ -91,15 +101,33 @@ class EpisodePolicy:
         self._instructions.update({episode: text for episode, text in instructions.items() if text})
 
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
+        policy, step = self._remembered(episode)
+        with _drawing(_seed(episode, step), self._device):
+            return self._after(policy.select_action(self._observed(row, episode)))
+
+    def _together(self, plans: SharedPlans, rows: Iterable[Batch], episodes: Sequence[int]) -> list[torch.Tensor]:
+        from manip_il.learn.shared_plans import Turn
+
+        turns: list[Turn] = []
+        for row, episode in zip(rows, episodes, strict=True):
+            policy, step = self._remembered(episode)
+            generator = torch.Generator(self._device).manual_seed(_seed(episode, step))
+            turns.append(Turn(episode, generator, policy, self._observed(row, episode)))
+        plans.make(turns)
+        return [self._after(turn.memory.select_action(dict(turn.observation))) for turn in turns]
+
+    def _remembered(self, episode: int) -> tuple[PreTrainedPolicy, int]:
+        """The policy with an episode's memory, and the number of this step."""
         if episode not in self._memories:
-            self._memories[episode] = copy.deepcopy(self.module, dict(self._shared)), itertools.count()
+            policy = copy.deepcopy(self.module, dict(self._shared))
+            if self._plans is not None:
+                self._plans.serve(policy)
+            self._memories[episode] = policy, itertools.count()
         policy, steps = self._memories[episode]
-        with _drawing(episode, next(steps), self._device):
-            observation = self._before({**row, "task": [self._instructions.get(episode, self._task)]})
-            # mixed precision where the policy was trained so, as lerobot-eval has it
-            with torch.autocast(self._device.type) if policy.config.use_amp else contextlib.nullcontext():
-                action = policy.select_action(observation)
-            return self._after(action)
+        return policy, next(steps)
+
+    def _observed(self, row: Batch, episode: int) -> Batch:
+        return self._before({**row, "task": [self._instructions.get(episode, self._task)]})
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
@@ -155,10 +183,23 @@ def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
     return {id(part): part for part in (policy.config, *policy.parameters(), *policy.buffers(), *layers)}
 
 
+def _plans_of(policy: PreTrainedPolicy) -> SharedPlans | None:
+    """What plans for many episodes at once, where the policy is one that takes long."""
+    if policy.config.type != "diffusion":
+        return None
+    from manip_il.learn.shared_plans import SharedPlans
+
+    return SharedPlans(policy)
+
+
+def _seed(episode: int, step: int) -> int:
+    """The seed of what is drawn in a step."""
+    return int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
+
+
 @contextlib.contextmanager
-def _drawing(episode: int, step: int, device: torch.device) -> Iterator[None]:
-    """Let torch draw what depends on episode and step alone; after it, the global generator is as before."""
-    seed = int(np.random.SeedSequence([episode, step]).generate_state(1, np.uint64)[0])
+def _drawing(seed: int, device: torch.device) -> Iterator[None]:
+    """Let torch draw what depends on the seed alone; after it, the global generator is as before."""
     cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if cuda else []):
         # Not `torch.manual_seed`, which visits every kind of device and takes as long as a small policy.

@@ -70,10 +70,10 @@ class FiniteMDP:
 
     def visits(self, policy: F64) -> F64:
         """Return the distribution of the state at each step under a policy (H, S, A), (H, S)."""
-        found, now = np.empty((len(policy), self.states)), self.start
+        found, now, arrivals = np.empty((len(policy), self.states)), self.start, self.transitions.T
         for t, one in enumerate(policy):
             found[t] = now
-            now = (now[:, None] * one).ravel() @ self.transitions
+            now = arrivals @ (now[:, None] * one).ravel()
         return found
 
     def worth(self, policy: F64) -> float:

@@ -33,6 +33,12 @@ def hash_file(path: Path, digest: HASH) -> int:
         return file.tell()
 
 
+def sized_and_hashed(path: Path) -> tuple[int, str]:
+    """Return a file's size [bytes] and sha256."""
+    digest = hashlib.sha256()
+    return hash_file(path, digest), digest.hexdigest()
+
+
 def copy_file(source: Path, target: str) -> str:
     """Copy into a new file; return the sha256 of the copy, read back."""
     with source.open("rb", buffering=0) as old, open(target, "x+b", buffering=0) as new:

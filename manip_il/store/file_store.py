@@ -93,23 +93,41 @@ class FileBlobs:
 
     def put(self, key: str, source: Path, size: int, advance: Advance) -> bool:
         """Copy, read back, rename."""
-        folder = f"{self.root}/{OBJECTS}/{key[:2]}"
-        partial = f"{folder}/.{key[:12]}.{secrets.token_hex(6)}{PARTIAL}"
+        self._copy(source, key)
+        advance(size)
+        return True
+
+    def take(self, source: Path) -> tuple[int, str]:
+        """Copy, read back, rename to the sha256 of what was read."""
+        before = source.stat()
+        key, after = self._copy(source, None), source.stat()
+        if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+            raise TransientError(f"{source} changed while it was being pushed")
+        return after.st_size, key
+
+    def _copy(self, source: Path, expected: str | None) -> str:
+        """Make an object of a file; return its key. Raises `TransientError` for another one than is expected."""
         with self._translated(f"write to {self.name}"):
-            if folder not in self._folders:
-                os.makedirs(folder, exist_ok=True)
-                self._folders.add(folder)
+            partial = f"{self._folder(expected or '00')}/.{secrets.token_hex(9)}{PARTIAL}"
             try:
-                if copy_file(source, partial) != key:
+                key = copy_file(source, partial)
+                if expected not in (None, key):
                     text = f"{source} changed while it was being pushed, or {self.name} did not store it intact"
                     raise TransientError(text)
-                os.replace(partial, f"{folder}/{key}")
+                os.replace(partial, f"{self._folder(key)}/{key}")
             except BaseException:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(partial)
                 raise
-        advance(size)
-        return True
+        return key
+
+    def _folder(self, key: str) -> str:
+        """The folder of an object, which is made."""
+        folder = f"{self.root}/{OBJECTS}/{key[:2]}"
+        if folder not in self._folders:
+            os.makedirs(folder, exist_ok=True)
+            self._folders.add(folder)
+        return folder
 
     def find(self, keys: Iterable[str]) -> dict[str, Stored]:
         """Return those of `keys` that are there."""
@@ -174,7 +192,7 @@ class FileBlobs:
             fcntl.flock(handle, fcntl.LOCK_SH)
         except OSError:
             text = f"{self.name} is on a file system without locks: two pushes at once can overwrite each other"
-            self.warnings = (*self.warnings, text)
+            self.warnings = (text,)
         finally:
             os.close(handle)
 

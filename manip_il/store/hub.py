@@ -72,6 +72,9 @@ class HubRemote:
         if left := self._repo.stream(snapshot.token, entry.path, target, offset, entry.size):
             raise TransientError(f"{self.name}: {entry.path} ended {left:,} bytes too early")
 
+    def intake(self, before: Snapshot | None, size: int) -> None:
+        """Take no file without its hash, by which the Hub says whether it has it."""
+
     def publish(
         self, local: Mapping[str, Path], manifest: Manifest, before: Snapshot | None, progress: Advance
     ) -> Published:

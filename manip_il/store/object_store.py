@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 from manip_il.store.errors import ConflictError, HashError, ManifestError, NotFoundError, RemoteError, Retry
 from manip_il.store.manifest import FileEntry, Manifest
-from manip_il.store.remote import Advance, Published, Sink, Snapshot
+from manip_il.store.remote import Advance, Intake, Published, Sink, Snapshot
 
 OBJECTS = "objects"  # folder of the objects
 STALE = 24 * 3600.0  # an object that no version names is removed from this age on: no push takes so long [s]
@@ -85,12 +85,22 @@ class Blobs(Protocol):
         ...
 
 
+@runtime_checkable
+class TakesUnhashed(Protocol):
+    """A store of objects that need not be told an object's key: it hashes what it stores."""
+
+    def take(self, source: Path) -> tuple[int, str]:
+        """Store a file as an object, whole or not at all, and verified; return its size [bytes] and key."""
+        ...
+
+
 @dataclass
 class ObjectRemote:
     """A `Remote` on top of `Blobs`."""
 
     blobs: Blobs
     retry: Retry = field(default_factory=Retry)
+    _taken: set[str] = field(default_factory=set[str])  # keys of the objects that came in unhashed
 
     def __post_init__(self) -> None:
         self.name, self.threads = self.blobs.name, self.blobs.threads
@@ -119,17 +129,34 @@ class ObjectRemote:
         """Write the bytes of one file from `offset` on to `target`, in one try."""
         self.blobs.fetch(entry.sha256, target, offset)
 
+    def intake(self, before: Snapshot | None, size: int) -> Intake | None:
+        """Make ready to take files unhashed, where the store can and holds no object yet."""
+        blobs = self.blobs
+        if before is not None or not isinstance(blobs, TakesUnhashed):
+            return None
+        self.retry(lambda: blobs.prepare(size))
+        if self.retry(self.blobs.list):
+            return None  # of a push that was cut off: only what is missing is copied
+
+        def take(source: Path) -> tuple[int, str]:
+            taken = self.retry(lambda: blobs.take(source))
+            self._taken.add(taken[1])
+            return taken
+
+        return take
+
     def publish(
         self, local: Mapping[str, Path], manifest: Manifest, before: Snapshot | None, progress: Advance
     ) -> Published:
         """Upload, verify, switch, remove old objects; objects that the store has lost are uploaded again."""
-        known = before.manifest.keys if before else frozenset[str]()
+        known, taken = before.manifest.keys if before else frozenset[str](), self._taken
+        self._taken = set()
         is_same = bool(before) and (before.manifest.kind, before.manifest.files) == (manifest.kind, manifest.files)
         sizes = {entry.sha256: entry.size for entry in manifest.files}
         sources = {entry.sha256: local[entry.path] for entry in manifest.files}
         new = {key: size for key, size in sizes.items() if key not in known}
         if not is_same:
-            self.retry(lambda: self.blobs.prepare(sum(new.values())))
+            self.retry(lambda: self.blobs.prepare(sum(new[key] for key in new.keys() - taken)))
         stored = self._stored(sizes)
         usable = {
             key for key, one in stored.items() if one.size == sizes.get(key) and (key in known or one.age < FRESH)
@@ -137,11 +164,12 @@ class ObjectRemote:
         missing = {key: size for key, size in sizes.items() if key not in usable}
         to_send = {key: size for key, size in new.items() if key in missing}
         progress(sum(entry.size for entry in manifest.files if entry.sha256 in new) - sum(to_send.values()))
-        verified = self._upload(to_send, sources, progress)
+        verified = taken | self._upload(to_send, sources, progress)
         verified |= self._upload({key: size for key, size in missing.items() if key in known}, sources, lambda _: None)
         self._verify({key: size for key, size in (new | missing).items() if key not in verified}, sources)
-        uploaded = sum(entry.sha256 in missing for entry in manifest.files)
-        kept, size = len(manifest.files) - uploaded, sum(missing.values())
+        sent = missing.keys() | taken
+        uploaded = sum(entry.sha256 in sent for entry in manifest.files)
+        kept, size = len(manifest.files) - uploaded, sum(sizes[key] for key in sizes.keys() & sent)
         if before and is_same:
             return Published(uploaded, size, kept, 0, before.token)
         token = self._switch(manifest, before, sizes, sources)

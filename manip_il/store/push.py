@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import tempfile
@@ -15,7 +14,7 @@ from manip_il.data.lerobot_layout import INFO
 from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import NotWhole, Severity
 from manip_il.errors import UsageError
-from manip_il.store.disk import HASHERS, hash_file, is_whole
+from manip_il.store.disk import HASHERS, is_whole, sized_and_hashed
 from manip_il.store.errors import ManifestError
 from manip_il.store.manifest import (
     CHECKPOINTS,
@@ -25,12 +24,13 @@ from manip_il.store.manifest import (
     Kind,
     Manifest,
     check_path,
+    check_together,
     fold,
     journals_of,
     newest,
     policy_files,
 )
-from manip_il.store.remote import MANIFEST_FILE, Progress, Published, Remote, RemoteUrl, Snapshot
+from manip_il.store.remote import MANIFEST_FILE, Advance, Intake, Progress, Published, Remote, RemoteUrl, Snapshot
 
 _LEFT_OUT = re.compile(r"\..*|.*\.(partial|incomplete|tmp)|__pycache__|" + re.escape(MANIFEST_FILE))
 _POLICY_FILES = ("config.yaml", "config.json", "eval.json", CHECKPOINTS, "best")
@@ -65,17 +65,28 @@ def push(
     """
     kind = check_source(source, url)
     with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
-        if url.scheme == "hf":
-            cards = _write_cards(source, kind, url, Path(folder))
-            scanned = with_root_copies(scan(source, kind, journals=journals, extra=cards))
-        else:  # other stores keep the folder byte for byte, without a card
-            scanned = scan(source, kind, journals=journals)
-        before = remote.read()
+        is_hub = url.scheme == "hf"  # other stores keep the folder byte for byte, without a card
+        cards = _write_cards(source, kind, url, Path(folder)) if is_hub else {}
+        local, before = list_files(source, kind, journals=journals, extra=cards), remote.read()
+        size = sum(path.stat().st_size for path in local.values())
+        if not dry_run and (take := remote.intake(before, size)):
+            with progress(size, "push") as advance:
+                scanned = hash_files(local, kind, lambda path: _advanced(take(path), advance))
+                published = remote.publish(local, scanned.manifest, before, lambda _: None)
+            return make_plan(scanned, before, remote.name), published
+        scanned = hash_files(local, kind)
+        if is_hub:
+            scanned = with_root_copies(scanned)
         plan = make_plan(scanned, before, remote.name)
         if dry_run:
             return plan, None
         with progress(plan.size, "push") as advance:
             return plan, remote.publish(scanned.local, scanned.manifest, before, advance)
+
+
+def _advanced(taken: tuple[int, str], advance: Advance) -> tuple[int, str]:
+    advance(taken[0])
+    return taken
 
 
 def check_source(source: Path, url: RemoteUrl) -> Kind:
@@ -143,12 +154,14 @@ def datasets_in(source: Path) -> Iterator[Path]:
             yield Path(folder)
 
 
-def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None) -> Scanned:
-    """Return every file of a dataset or of a run, hashed.
+def list_files(
+    root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, Path] | None = None
+) -> dict[str, Path]:
+    """Return every file of a dataset or of a run by its path in the manifest.
 
     journals: include a dataset's folder `<root>.journals` as `journals/`, and those inside a run. extra: files that
     replace the folder's own, by path. Hidden files and what a killed writer left are skipped. Raises `ManifestError`
-    for links, and for what `FileEntry` refuses.
+    for links, and for paths that `FileEntry` refuses.
     """
     local = _files_below(root, journals)
     if journals and kind == "dataset":
@@ -160,14 +173,23 @@ def scan(root: Path, kind: Kind, *, journals: bool = False, extra: Mapping[str, 
         raise ManifestError(f"{root} holds no file to push; expected a dataset or a run")
     for path in local:
         check_path(path)
+    check_together(local)
+    return local
 
-    def hashed(item: tuple[str, Path]) -> FileEntry:
-        digest = hashlib.sha256()
-        size = hash_file(item[1], digest)
-        return FileEntry(item[0], size, digest.hexdigest())
+
+def scan(root: Path, kind: Kind, *, journals: bool = False) -> Scanned:
+    """Return every file of `list_files`, hashed."""
+    return hash_files(list_files(root, kind, journals=journals), kind)
+
+
+def hash_files(local: Mapping[str, Path], kind: Kind, hashed: Intake = sized_and_hashed) -> Scanned:
+    """Return the manifest of files, by their paths. hashed: gives a file's size [bytes] and sha256."""
+
+    def entry(item: tuple[str, Path]) -> FileEntry:
+        return FileEntry(item[0], *hashed(item[1]))
 
     with ThreadPoolExecutor(HASHERS) as pool:
-        entries = tuple(pool.map(hashed, sorted(local.items())))
+        entries = tuple(pool.map(entry, sorted(local.items())))
     return Scanned(Manifest(kind, entries), local)
 
 

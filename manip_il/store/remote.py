@@ -30,6 +30,7 @@ _SFTP = re.compile(
 )
 
 Advance = Callable[[int], None]  # so many bytes more are done
+Intake = Callable[[Path], tuple[int, str]]  # a file -> its size [bytes] and sha256
 Progress = Callable[[int, str], AbstractContextManager[Advance]]  # total [bytes] and what it is of
 
 
@@ -89,6 +90,13 @@ class Remote(Protocol):
         """Write the bytes of one file from `offset` on to `target`, in one try.
 
         Raises `NotFoundError` if the file is gone: readers see another version by now. Several threads call it at once.
+        """
+        ...
+
+    def intake(self, before: Snapshot | None, size: int) -> Intake | None:
+        """Return what copies a file to the remote and hashes it in the same pass, before `publish` names it.
+
+        None where a file's hash must be known first, as the remote may have it already. size: of all files [bytes].
         """
         ...
 

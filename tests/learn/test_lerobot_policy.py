@@ -23,6 +23,7 @@ POLICIES = {
     "act": ("act", {}),
     "act, ensembled": ("act", {"temporal_ensemble_coeff": 0.01, "n_action_steps": 1}),
     "diffusion": ("diffusion", {}),
+    "diffusion, few steps": ("diffusion", {"noise_scheduler_type": "DDIM", "num_inference_steps": 3}),
 }
 
 
@@ -59,11 +60,14 @@ def lerobots_own(checkpoint: Path, episode: int) -> np.ndarray:
     return np.array(done, np.float64)
 
 
-def test_an_episode_is_lerobots_own_loop_to_the_bit_whatever_runs_beside_it(checkpoint):
-    alone = actions(LearnedPolicy.load(checkpoint), {7: 0})[7]
-    assert np.array_equal(alone, lerobots_own(checkpoint, 7))
-    beside = actions(LearnedPolicy.load(checkpoint), {5: 0, 6: 1, 7: 2, 8: 4})
-    assert np.array_equal(beside[7], alone)
+def test_an_episode_is_lerobots_own_loop_whatever_runs_beside_it(checkpoint, request):
+    alone, own = actions(LearnedPolicy.load(checkpoint), {7: 0})[7], lerobots_own(checkpoint, 7)
+    if "diffusion" in request.node.name:  # plans in blocks of rows, rounded otherwise than one row
+        np.testing.assert_allclose(alone, own, atol=1e-5)
+    else:
+        assert np.array_equal(alone, own)
+    beside = actions(LearnedPolicy.load(checkpoint), {5: 0, 6: 1, 7: 2, 8: 4, 15: 1, 23: 2, 31: 2})
+    assert np.array_equal(beside[7], alone)  # 15, 23 and 31 have its row of a block
     assert not np.array_equal(beside[8], alone)
 
 

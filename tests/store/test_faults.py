@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from manip_il.store import file_store
+from manip_il.store import disk, file_store
 from manip_il.store.errors import (
     AuthError,
     HashError,
@@ -185,6 +186,55 @@ def test_a_file_that_changes_while_it_is_pushed(place: str, tmp_path: Path, monk
     with pytest.raises(RemoteError, match="changed while it was being pushed"):
         remote.publish(scanned.local, scanned.manifest, None, lambda _: None)
     assert remote.read() is None
+
+
+def test_a_file_that_changes_while_a_first_push_copies_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, whole = make_run(tmp_path / "run", 1), file_store.copy_file
+    url, remote = impatient(f"file://{tmp_path}/store")
+
+    def copy(source: Path, target: str) -> str:
+        key = whole(source, target)
+        if source.name == "config.yaml":
+            source.write_text(f"# another text, {time.time_ns()}")
+        return key
+
+    monkeypatch.setattr(file_store, "copy_file", copy)
+    with pytest.raises(RemoteError, match="changed while it was being pushed"):
+        push(run, url, remote, unwatched)
+    assert remote.read() is None
+
+
+def test_a_first_push_to_a_folder_reads_every_file_once_and_a_later_one_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, whole, copied = make_run(tmp_path / "run", 1), file_store.copy_file, list[str]()
+    count = sum(1 for path in run.rglob("*") if path.is_file() and not path.is_symlink() and "last" not in path.parts)
+
+    def copy(source: Path, target: str) -> str:
+        if 0 <= fails_at <= len(copied):
+            raise KeyboardInterrupt
+        copied.append(source.name)
+        return whole(source, target)
+
+    monkeypatch.setattr(file_store, "copy_file", copy)
+    monkeypatch.setattr(disk, "hash_file", None)  # which would read it once more
+    fails_at = -1
+    _, published = push(run, *impatient(f"file://{tmp_path}/store"), unwatched)
+    assert published is not None
+    assert (len(copied), published.uploaded, published.kept) == (count, count, 0)
+
+    monkeypatch.undo()
+    monkeypatch.setattr(file_store, "copy_file", copy)
+    copied, fails_at = [], 2
+    with pytest.raises(KeyboardInterrupt):
+        push(run, *impatient(f"file://{tmp_path}/cut"), unwatched)
+    assert impatient(f"file://{tmp_path}/cut")[1].read() is None
+    before, fails_at = len(copied), -1
+    _, published = push(run, *impatient(f"file://{tmp_path}/cut"), unwatched)
+    assert published is not None
+    assert published.uploaded + published.kept == count
+    assert before >= 2
+    assert not set(copied[:before]) & set(copied[before:])
 
 
 def test_a_pull_goes_on_from_where_it_was_cut(tmp_path: Path) -> None:
