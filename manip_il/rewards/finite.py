@@ -106,12 +106,12 @@ class Trajectories:
 
     def states(self, policy: F64, count: int, rng: np.random.Generator) -> I64:
         """Return the states of `count` trajectories of a policy (H, S, A), (H, count)."""
-        actions, found = np.cumsum(policy, axis=2), np.empty((len(policy), count), np.int64)
+        horizon, _, choices = policy.shape
+        below, found = np.cumsum(policy, axis=2)[..., :-1], np.empty((horizon, count), np.int64)
         now = rng.choice(self._mdp.states, count, p=self._mdp.start)
-        for t, reach in enumerate(actions):
+        for t, (of_action, of_move) in enumerate(rng.random((horizon, 2, count))):
             found[t] = now
-            action = (reach[now] <= rng.random((count, 1))).sum(axis=1).clip(max=reach.shape[1] - 1)
-            row = now * reach.shape[1] + action
-            entry = np.searchsorted(self._reach, row + rng.random(count) * (1 - _NEAR), side="right")
+            action = (below[t, now] <= of_action[:, None]).sum(axis=1)
+            entry = np.searchsorted(self._reach, now * choices + action + of_move * (1 - _NEAR), side="right")
             now = self._to[entry.clip(max=len(self._to) - 1)]
         return found
