@@ -67,7 +67,7 @@ class QuickstartOptions(common.EnvOptions):
     disturbed_share: float = option_of(RunConfig, "disturbed_share")
     policy: PolicyGroup = field(default_factory=PolicyGroup)
     steps: int = option(3_000, "gradient steps per fit")
-    batch_size: int = option(512, "frames per step")
+    batch_size: int = option(256, "frames per step")
     validation_episodes: int = option_of(RunConfig, "validation_episodes", 100)
     test_episodes: int = option(200, "unseen test episodes, used for no choice")
     disturbed_episodes: int = option(100, "the first of them again, disturbed")
