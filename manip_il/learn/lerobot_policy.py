@@ -76,14 +76,13 @@ class EpisodePolicy:
     def select(self, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         """Return one action a row, (B, n). Episodes that are not among these have ended and are forgotten."""
         self.forget(self._memories.keys() - set(episodes))
-        rows = ({key: values[i : i + 1] for key, values in batch.items()} for i in range(len(episodes)))
         try:
             # mixed precision where the policy was trained so, as lerobot-eval has it
             with torch.autocast(self._device.type) if self.module.config.use_amp else contextlib.nullcontext():
                 if self._plans is not None:
-                    actions = self._together(self._plans, rows, episodes)
+                    actions = [self._together(self._plans, batch, episodes)]
                 else:
-                    actions = [self._one(row, episode) for row, episode in zip(rows, episodes, strict=True)]
+                    actions = [self._one(_row(batch, i), episode) for i, episode in enumerate(episodes)]
         except ManipError:
             raise
         except Exception as error:  # the code of any policy, with options and statistics from anywhere
@@ -103,18 +102,19 @@ class EpisodePolicy:
     def _one(self, row: Batch, episode: int) -> torch.Tensor:
         policy, step = self._remembered(episode)
         with _drawing(_seed(episode, step), self._device):
-            return self._after(policy.select_action(self._observed(row, episode)))
+            return self._after(policy.select_action(self._observed(row, [episode])))
 
-    def _together(self, plans: SharedPlans, rows: Iterable[Batch], episodes: Sequence[int]) -> list[torch.Tensor]:
+    def _together(self, plans: SharedPlans, batch: Batch, episodes: Sequence[int]) -> torch.Tensor:
         from manip_il.learn.shared_plans import Turn
 
+        observed = self._observed(batch, episodes)
         turns: list[Turn] = []
-        for row, episode in zip(rows, episodes, strict=True):
+        for i, episode in enumerate(episodes):
             policy, step = self._remembered(episode)
             generator = torch.Generator(self._device).manual_seed(_seed(episode, step))
-            turns.append(Turn(episode, generator, policy, self._observed(row, episode)))
+            turns.append(Turn(episode, generator, policy, _row(observed, i)))
         plans.make(turns)
-        return [self._after(turn.memory.select_action(dict(turn.observation))) for turn in turns]
+        return self._after(torch.cat([turn.memory.select_action(dict(turn.observation)) for turn in turns]))
 
     def _remembered(self, episode: int) -> tuple[PreTrainedPolicy, int]:
         """The policy with an episode's memory, and the number of this step."""
@@ -126,8 +126,13 @@ class EpisodePolicy:
         policy, steps = self._memories[episode]
         return policy, next(steps)
 
-    def _observed(self, row: Batch, episode: int) -> Batch:
-        return self._before({**row, "task": [self._instructions.get(episode, self._task)]})
+    def _observed(self, batch: Batch, episodes: Sequence[int]) -> Batch:
+        return self._before({**batch, "task": [self._instructions.get(one, self._task) for one in episodes]})
+
+
+def _row(batch: Batch, i: int) -> Batch:
+    """One row of what is there for every episode, (1, ...)."""
+    return {key: value[i : i + 1] if isinstance(value, torch.Tensor | list) else value for key, value in batch.items()}
 
 
 def load_policy(path: Path, settings: Mapping[str, Any], device: str, task: str, trust: bool = False) -> EpisodePolicy:
