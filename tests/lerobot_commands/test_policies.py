@@ -65,7 +65,7 @@ def test_lerobot_eval_finds_our_mlps_success_for_every_seed(
 )
 def test_lerobot_eval_needs_no_word_of_the_action_space(command, lerobots, trial, demos, tmp_path, space, policy):
     words = [f"--policy.{name}={value}" for name, value in policy.items()]
-    words += [f"--action_space={space}", "--batch_size=64", "--steps=80", f"--output_dir={tmp_path / 'run'}"]
+    words += [f"--action_space={space}", "--batch_size=64", "--steps=300", f"--output_dir={tmp_path / 'run'}"]
     assert main(["train", f"--dataset.root={demos}", *words]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
     evaluation = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 6)
@@ -103,7 +103,7 @@ def test_lerobot_trains_our_mlp_on_our_dataset(command, trial, demos, tmp_path):
         "lerobot-train", "--policy.discover_packages_path=manip_il.learn.mlp", "--policy.type=mlp",
         "--policy.width=64", "--policy.optimizer_lr=3e-3", "--policy.scheduler_warmup_steps=5",
         "--dataset.repo_id=someone/reach", f"--dataset.root={demos}", f"--output_dir={tmp_path / 'run'}",
-        "--steps=100", "--batch_size=32", "--num_workers=0",
+        "--steps=400", "--batch_size=32", "--num_workers=0",
     )  # fmt: skip
     reach = trial(EnvConfig("panda", "reach", horizon=40, tolerance=0.1), 8)
     episodes = reach.ours(tmp_path / "run/checkpoints/last/pretrained_model")
