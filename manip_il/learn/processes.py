@@ -18,6 +18,7 @@ from manip_il.errors import ManipError
 
 _RANK = "RANK"  # set where several processes were started by `accelerate launch` or `torchrun`
 _HOST = "127.0.0.1"
+_DYING = 2.0  # from a process's last connection to its exit code, at most [s]
 
 
 @contextlib.contextmanager
@@ -44,6 +45,8 @@ def sharing_batches(count: int, threads: int, work: Callable[[], object]) -> Ite
             for other in others:
                 other.join()
         except RuntimeError as error:  # gloo's, where the other end of a connection is gone
+            for other in others:
+                other.join(_DYING)
             if any(other.exitcode for other in others):
                 raise ManipError("a process that shares the batches died (out of memory?)") from error
             raise
