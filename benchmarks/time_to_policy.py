@@ -32,7 +32,7 @@ from manip_il.engine.engine import Engine, default_workers
 
 HERE = Path(__file__).parent
 GOALS = (0.99, 0.995)
-EPOCHS = 150  # of the library's cloning: its success stands still from there on
+EPOCHS = 150  # of the library's cloning
 
 
 def main() -> int:
@@ -41,6 +41,8 @@ def main() -> int:
     parser.add_argument("--peer", type=Path, help="interpreter with the imitation library; without it, no ratio")
     parser.add_argument("--quick", action="store_true", help="one small round: shows that it runs, measures nothing")
     options = parser.parse_args()
+    if options.peer is not None and not options.peer.is_file():
+        parser.error(f"--peer is {options.peer}, which is no file; expected the Python of an environment with imitation")
     print(describe_machine())
     limit = None
     if options.peer is not None:

@@ -189,7 +189,7 @@ def _shared(policy: PreTrainedPolicy) -> dict[int, Any]:
 
 
 def _plans_of(policy: PreTrainedPolicy) -> SharedPlans | None:
-    """What plans for many episodes at once, where the policy is one that takes long."""
+    """Return the maker of plans for many episodes at once; None for a policy that plans row by row."""
     if policy.config.type != "diffusion":
         return None
     from manip_il.learn.shared_plans import SharedPlans

@@ -37,7 +37,7 @@ class _Asked(Exception):
 
 
 class _Desk:
-    """In place of an episode's network: hands out the plan that lies there, else says what one was asked for."""
+    """Stands for an episode's network: hands out the plan that was made for it, else raises what it was asked."""
 
     plan: Tensor | None = None
 
@@ -88,7 +88,7 @@ class SharedPlans:
 
 
 def _question(turn: Turn) -> dict[str, Tensor]:
-    """What an episode's network would be asked, without a trace in its memory."""
+    """Return what an episode's network would be asked now; its memory stays as it is."""
     policy = turn.memory
     queues = {key: queue.copy() for key, queue in policy._queues.items()}
     try:
