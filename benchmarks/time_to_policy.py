@@ -42,7 +42,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="one small round: shows that it runs, measures nothing")
     options = parser.parse_args()
     if options.peer is not None and not options.peer.is_file():
-        parser.error(f"--peer is {options.peer}, which is no file; expected the Python of an environment with imitation")
+        parser.error(f"--peer is {options.peer}, which is no file; expected the Python of an environment")
     print(describe_machine())
     limit = None
     if options.peer is not None:
