@@ -2,7 +2,7 @@
 
 python benchmarks/control_speed.py [--quick]
 
-Ours is a recording rollout's step: read the state, label it, observe, advance. The limit is `mj_step` replaying the
+Ours is a recording rollout's step: observe, read the state, label it, advance. The limit is `mj_step` replaying the
 same controls from the same starts and nothing else. Episode by episode by turns in the same run; the median ratio
 over the repeats counts.
 """
@@ -63,8 +63,8 @@ def record(env: ManipEnv, expert: Expert) -> tuple[np.ndarray, float]:
     controls = np.empty((STEPS, env.scene.model.nu))
     started = time.perf_counter()
     for step in range(STEPS):
-        label = expert.label(env.get_state())
         env.observe()
+        label = expert.label(env.get_state(), env.world)
         env.advance(label.action)
         controls[step] = env.data.ctrl
     return controls, time.perf_counter() - started

@@ -91,7 +91,7 @@ def problem_of(expert: Expert, state: State) -> qpsolvers.Problem | None:
     plain = ik.daqp.solve
 
     def catch(*args: Any) -> Any:
-        caught.append(qpsolvers.Problem(*args[:4]))
+        caught.append(qpsolvers.Problem(*(one.copy() for one in args[:4])))
         return plain(*args)
 
     ik.daqp.solve = catch

@@ -36,23 +36,27 @@ class Expert:
         self._refusing = self._task if isinstance(self._task, Refusing) else None
         self._rungs = tuple(zip(range(len(rungs), 0, -1), rungs, strict=True))
 
-    def label(self, state: State) -> Label:
+    def label(self, state: State, world: object | None = None) -> Label:
         """Return the expert's action in `state`: joint targets [rad] and gripper command [m], (n,).
+
+        world: one of the same scene that is in this state, poses up to date: it is read, and nothing is restored.
 
         Where there is no sound action (object out of reach, inverse kinematics without a solution), `valid`
         is false, `reason` says why, and the action holds the arm still. Raises `MismatchError` for a state of
         another scene.
         """
-        world = self._world
-        world.restore(state.physics, state.variation)
+        if not (isinstance(world, World) and world.scene is self._scene):
+            world = self._world
+            world.restore(state.physics, state.variation)
         q = world.data.qpos[self._scene.arm_q]
-        if reason := self._unsound():
-            return self._hold(q, reason)
-        phase, rung = next((number, rung) for number, rung in self._rungs if rung.holds(world))
-        return self._towards(q, rung.target(world), phase)
+        if reason := self._unsound(world):
+            return self._hold(q, world.opening, reason)
+        for phase, rung in self._rungs:
+            if rung.holds(world):
+                return self._towards(q, world.opening, rung.target(world), phase)
+        raise AssertionError(f"{self._scene.name}: the last rung of a ladder always holds")
 
-    def _unsound(self) -> str:
-        world = self._world
+    def _unsound(self, world: World) -> str:
         hand = world.ee.position.tolist()
         for name in objects_in(self._task, world):
             position = world.pose(name).position.tolist()
@@ -64,16 +68,16 @@ class Expert:
                 return f"{name} out of reach"
         return self._refusing.unsound(world) if self._refusing else ""
 
-    def _towards(self, q: F64, target: Target, phase: int) -> Label:
+    def _towards(self, q: F64, opening: float, target: Target, phase: int) -> Label:
         ee, ee_rotation = self._ik.ee_pose(q)
         position = ee + _clip_norm(target.position - ee, target.max_step)
         rotation = _turn_towards(ee_rotation, target.rotation, target.max_turn)
         step = self._step(q, position, rotation, target)
         if step is None:
-            return self._hold(q, "inverse kinematics has no solution")
+            return self._hold(q, opening, "inverse kinematics has no solution")
         dq, residual = step
         if residual > NO_PROGRESS and math.dist(position.tolist(), ee.tolist()) > NEAR:
-            return self._hold(q, "no joint step brings the hand nearer")
+            return self._hold(q, opening, "no joint step brings the hand nearer")
         low, high = self._scene.actions.low, self._scene.actions.high
         action = self._scene.actions.join(q + dq, target.opening)
         return Label(np.minimum(np.maximum(action, low), high), phase, True, residual)
@@ -89,9 +93,9 @@ class Expert:
         second = ik.step(2 * position - reached, rotation @ turned.T @ rotation, most, target.lean)
         return first if second is None else (second[0], first[1])
 
-    def _hold(self, q: F64, reason: str) -> Label:
+    def _hold(self, q: F64, opening: float, reason: str) -> Label:
         actions = self._scene.actions
-        action = actions.join(q, self._world.opening)
+        action = actions.join(q, opening)
         return Label(np.minimum(np.maximum(action, actions.low), actions.high), 0, False, 1.0, reason)
 
 

@@ -39,6 +39,11 @@ class Environment(Protocol):
         """Share of the task that is done, 0 to 1."""
         ...
 
+    @property
+    def world(self) -> object | None:
+        """Physics in the present state, which a labeller of the same scene may read; None where there is none."""
+        ...
+
     def start(self, seed: int) -> None:
         """Begin the episode of a seed."""
         ...
@@ -63,8 +68,8 @@ class Environment(Protocol):
 class Labeller(Protocol):
     """Interface of the expert."""
 
-    def label(self, state: State) -> Label:
-        """Return the expert's action in `state`."""
+    def label(self, state: State, world: object | None = None) -> Label:
+        """Return the expert's action in `state`. world: one that is in it, so that nothing need be restored."""
         ...
 
 
@@ -78,7 +83,10 @@ class Driver(Protocol):
 
 @dataclass(slots=True)
 class Turn:
-    """One running episode at one step, as a driver sees it. `label` is None where the expert was not queried."""
+    """One running episode at one step, as a driver sees it. `label` is None where the expert was not queried.
+
+    world: in this state for as long as the turn lasts, where the environment has one.
+    """
 
     seed: int
     step: int
@@ -87,6 +95,7 @@ class Turn:
     labeller: Labeller | None = None
     label: Label | None = None
     progress: float = 0.0
+    world: object | None = None
 
     def query(self) -> Label:
         """Return the expert's label of this state and keep it. Raises `ManipError` where there is no expert."""
@@ -98,7 +107,7 @@ class Turn:
         """Return the expert's label of this state without keeping it."""
         if self.labeller is None:
             raise ManipError(f"episode {self.seed}: nobody to ask for a label at step {self.step}")
-        return self.labeller.label(self.state)
+        return self.labeller.label(self.state, self.world)
 
 
 @dataclass(frozen=True)
@@ -171,7 +180,8 @@ def _next_episode(env: Environment, seeds: Iterator[int]) -> _Slot | None:
 def _begin_step(slot: _Slot, rules: Rules, labeller: Labeller | None) -> None:
     env = slot.env
     env.begin_step()
-    slot.turn = Turn(slot.seed, slot.step, env.observe(), env.get_state(), labeller, progress=env.progress)
+    seen, state = env.observe(), env.get_state()
+    slot.turn = Turn(slot.seed, slot.step, seen, state, labeller, progress=env.progress, world=env.world)
     last = slot.step == rules.horizon - 1
     if labeller is not None and (rules.query == "every" or (rules.query == "last" and last)):
         slot.turn.query()

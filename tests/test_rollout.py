@@ -24,6 +24,8 @@ class Counter:
     def solved(self) -> bool:
         return self.x >= GOAL
 
+    world = None
+
     @property
     def reward(self) -> float:
         return float(self.solved)
@@ -87,7 +89,7 @@ class Ones:
     def __init__(self) -> None:
         self.queried: list[int] = []
 
-    def label(self, state: State) -> Label:
+    def label(self, state: State, world: object | None = None) -> Label:
         self.queried.append(state.step)
         return Label(np.array([1.0]), 1, True, 0.0)
 

@@ -84,8 +84,11 @@ class ParquetFiles:
 
 def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     """Return a writer with the settings that all our files have."""
+    repeating: Any = [
+        field.name for field in schema if not pa.types.is_nested(field.type)
+    ]  # vectors' numbers seldom do
     checksums = True  # else a changed bit is read as another number
-    return pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=True, write_page_checksum=checksums)
+    return pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=repeating, write_page_checksum=checksums)
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:

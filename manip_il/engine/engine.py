@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from types import TracebackType
 from typing import Literal
@@ -45,10 +46,7 @@ class Engine:
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
         if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
-            for episode in job.run(wanted):
-                if keep is not None:
-                    keep.store(episode.seed, keep.pack(episode))
-                yield episode
+            yield from job.run(wanted) if keep is None else _stored(job.run(wanted), keep)
             return
         if self._pool is None:
             self._pool = _open_pool(self._backend, self.workers)
@@ -115,6 +113,24 @@ class Engine:
                 self.given_up.append(seed)
             else:
                 waiting.appendleft(replace(task, seeds=(seed,)))  # next: whoever wants them in order waits for it
+
+
+def _stored(episodes: Iterable[Episode], keep: Keep) -> Iterator[Episode]:
+    """Yield episodes once they are stored; the disk takes each while the next one runs."""
+    with ThreadPoolExecutor(1, "store") as disk:
+        before: tuple[Episode, Future[None]] | None = None
+        for episode in episodes:
+            storing = episode, disk.submit(keep.store, episode.seed, keep.pack(episode))
+            if before is not None:
+                yield _settled(*before)
+            before = storing
+        if before is not None:
+            yield _settled(*before)
+
+
+def _settled(episode: Episode, stored: Future[None]) -> Episode:
+    stored.result()
+    return episode
 
 
 def _tasks(job: Job, seeds: Sequence[int], keep: Keep | None, workers: int) -> deque[Task]:

@@ -265,6 +265,11 @@ class BranchEnv:
         """Share of the task that is done."""
         return self._env.progress
 
+    @property
+    def world(self) -> object | None:
+        """Physics in the present state."""
+        return self._env.world
+
 
 def branch(env: BranchEnv, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:
     """Yield the expert's next steps from a state; the last one is `done`."""

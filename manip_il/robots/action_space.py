@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -69,7 +70,7 @@ class ActionSpace:
         action = np.asarray(action, dtype=np.float64)
         if action.shape != self.low.shape:
             raise MismatchError("action shape", "the policy", action.shape, "the robot", self.low.shape)
-        if not np.isfinite(action).all():
+        if not (math.isfinite(action.dot(action)) or np.isfinite(action).all()):  # the first may overflow, no more
             raise NotFiniteError(f"action at step {step} is not finite: {action}")
         return np.minimum(np.maximum(action, self.low), self.high)
 

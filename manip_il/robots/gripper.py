@@ -60,7 +60,7 @@ class Gripper:
         weights = 1 / (self._travel * len(self._travel))  # of the joints in the share of the way that is gone
         self._weights = tuple(zip(self.q.tolist(), weights.tolist(), strict=True))
         self._offset = float(weights @ self._closed)
-        self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()  # numpy's interp takes 3 us
+        self._points = self._sweep.shares.tolist(), self._sweep.openings.tolist()
         fingers = finger_geoms(model, config.fingers, prefix)
         self.geoms = frozenset(geom for finger in fingers for geom in finger)
         self.pads, self._holding = (
@@ -82,8 +82,8 @@ class Gripper:
 
     def command(self, opening: float) -> F64:
         """Return the actuators' commands for an opening [m], (g,)."""
-        share = np.interp(opening, self._sweep.openings, self._sweep.shares)
-        return self._closed + share * self._travel
+        shares, openings = self._points
+        return self._closed + _interpolated(opening, openings, shares) * self._travel
 
     @property
     def driven(self) -> tuple[F64, F64]:
@@ -110,6 +110,17 @@ class Gripper:
             any(mujoco.mj_geomDistance(model, data, pad, geom, TOUCH, None) < TOUCH for pad in pads for geom in geoms)
             for pads in self._holding
         )
+
+
+def _interpolated(x: float, xs: list[float], ys: list[float]) -> float:
+    """`numpy.interp` of one number, bit for bit, in a fifth of its time."""
+    if x <= xs[0]:
+        return ys[0]
+    if x >= xs[-1]:
+        return ys[-1]
+    last = bisect.bisect_right(xs, x)
+    slope = (ys[last] - ys[last - 1]) / (xs[last] - xs[last - 1])
+    return slope * (x - xs[last - 1]) + ys[last - 1]
 
 
 @cache

@@ -42,7 +42,7 @@ class ArmIK:
         self._frame.set_target(mink.SE3.identity())
         assert self._frame.transform_target_to_world is not None
         self._target = self._frame.transform_target_to_world.wxyz_xyz
-        self._program = _Program(model, costs.posture, home[: model.nv])
+        self._program = _Program(self._configuration, costs.posture, home[: model.nv])
         joints = [model.joint(name) for name in robot.joints]
         self.limits = np.array([one.range if one.limited[0] else [-np.inf, np.inf] for one in joints])  # (arm, 2) [rad]
         data = self._configuration.data  # views of which each says what the posture is now
@@ -85,7 +85,7 @@ class ArmIK:
         mujoco.mju_mat2Quat(self._target[:4], rotation.ravel())
         self._target[4:] = position
         self._frame.cost[3:] = self._costs.orientation if weight is None else weight
-        x = self._program.solve(self._configuration, self._frame)
+        x = self._program.solve(self._frame)
         if x is None:
             return None
         dq = x[self._address]
@@ -177,26 +177,29 @@ class _Program:
     depends on the path that led to the posture, and those of their limits. DAQP is called without qpsolvers.
     """
 
-    def __init__(self, model: mujoco.MjModel, cost: float, home: F64):
-        limit, nv = mink.ConfigurationLimit(model), model.nv
-        limited = np.eye(nv)[limit.indices.astype(int)]
-        self._limited, self._gain = limit.indices.astype(int), limit.gain
-        self._least, self._most = limit.lower[self._limited], limit.upper[self._limited]
-        self._matrix = np.vstack([limited, -limited])
+    def __init__(self, configuration: mink.Configuration, cost: float, home: F64):
+        limit, nv = mink.ConfigurationLimit(configuration.model), configuration.model.nv
+        self._configuration, self._q = configuration, configuration.data.qpos
+        at = limit.indices.astype(int)
+        self._matrix = np.vstack([np.eye(nv)[at], -np.eye(nv)[at]])
+        self._limited, self._signs, self._gain = np.tile(at, 2), np.repeat([-1.0, 1.0], len(at)), limit.gain
+        self._ends = np.concatenate([limit.upper[at], -limit.lower[at]])
         self._lower = np.full(len(self._matrix), -_UNBOUNDED)
         self._sense = np.zeros(len(self._matrix), dtype=np.intc)
         self._cost, self._home = cost, home
         self._rows, self._errors = np.vstack([np.zeros((6, nv)), cost * np.eye(nv)]), np.zeros(6 + nv)
+        self._transposed, self._homewards = self._rows.T, self._errors[6:]
+        self._hessian = np.zeros((nv, nv))
+        self._diagonal = self._hessian.reshape(-1)[:: nv + 1]
 
-    def solve(self, configuration: mink.Configuration, frame: mink.FrameTask) -> F64 | None:
+    def solve(self, frame: mink.FrameTask) -> F64 | None:
         """Return the joint displacement towards the frame's target, (nv,) [rad]; None where there is no solution."""
-        q = configuration.data.qpos
-        self._rows[:6], self._errors[:6], damping = frame.compute_qp_residual(configuration)
-        self._errors[6:] = self._cost * (self._home - q)
-        hessian = self._rows.T.dot(self._rows)  # of few numbers faster than `@`
-        hessian.flat[:: len(q) + 1] += _DAMPING + damping
-        at = q[self._limited]
-        upper = self._gain * np.concatenate([self._most - at, at - self._least])
-        gradient = -self._errors.dot(self._rows)
-        x, _, exit_flag, _ = daqp.solve(hessian, gradient, self._matrix, upper, self._lower, self._sense)
+        q, rows, errors = self._q, self._rows, self._errors
+        rows[:6], errors[:6], damping = frame.compute_qp_residual(self._configuration)
+        np.multiply(np.subtract(self._home, q, self._homewards), self._cost, self._homewards)
+        self._transposed.dot(rows, self._hessian)  # of few numbers faster than `@`
+        self._diagonal += _DAMPING + damping
+        upper = (self._ends + self._signs * q[self._limited]) * self._gain
+        gradient = -errors.dot(rows)
+        x, _, exit_flag, _ = daqp.solve(self._hessian, gradient, self._matrix, upper, self._lower, self._sense)
         return x if exit_flag > 0 else None

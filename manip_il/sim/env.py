@@ -221,6 +221,8 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
 
     def _measured(self) -> World:
         """The world with noise on joints and object positions, and on all that follows from them."""
+        if not self.drawn.values:
+            return self.world
         joints, position = self.drawn.number("joint_noise"), self.drawn.number("position_noise")
         if not joints and not position:
             return self.world

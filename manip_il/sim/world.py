@@ -104,7 +104,7 @@ class World:
         self._cache: dict[Any, Any] = {}  # until the world moves
         self._poses: dict[str, Pose] = {}  # until the data change their identity
         self._ee: Pose | None = None
-        self._extents: dict[str, tuple[float, ...]] = {}  # until the model changes
+        self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}  # until the model changes
 
     # Physics
 
@@ -120,7 +120,7 @@ class World:
         self._cache.clear()
         self._poses.clear()
         self._ee = None
-        self._extents.clear()
+        self._shapes.clear()
         self.variation = variation.copy()
         if variations.same_physics(variation, self.scene.nominal):
             self.model, self.data = self._plain
@@ -261,15 +261,18 @@ class World:
 
     def extents(self, name: str) -> tuple[float, ...]:
         """Return lengths of an object along its own axes x, y and z."""
-        if name not in self._extents:
-            geom = self.scene.objects[name].geom
-            kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
-            self._extents[name] = tuple(variations.extents(kind, size).tolist())
-        return self._extents[name]
+        return self._shape(name)[1]
 
     def kind(self, name: str) -> int:
         """Return MuJoCo's geom type of an object."""
-        return int(self.model.geom_type[self.scene.objects[name].geom])
+        return self._shape(name)[0]
+
+    def _shape(self, name: str) -> tuple[int, tuple[float, ...]]:
+        if name not in self._shapes:
+            geom = self.scene.objects[name].geom
+            kind, size = int(self.model.geom_type[geom]), self.model.geom_size[geom]
+            self._shapes[name] = kind, tuple(variations.extents(kind, size).tolist())
+        return self._shapes[name]
 
     def at_rest(self, name: str) -> bool:
         """Return whether an object hardly moves: under 3 cm and half a radian a second."""

@@ -37,6 +37,8 @@ ACTIONS = StockActions(STATE_NAMES, -_ONES, _ONES, np.array([1.0, 1.0, 1.0, 2.0]
 class StockEnv:
     """An environment of gymnasium-robotics whose state is saved and restored bit for bit. task: its name."""
 
+    world = None  # its expert restores states
+
     def __init__(self, task: str):
         self.task = get_stock(task)
         self.task_description = self.task.instruction

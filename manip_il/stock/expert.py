@@ -250,7 +250,7 @@ class StockExpert:
         self._env = StockEnv(task)
         self._ladder = LADDERS[task]
 
-    def label(self, state: State) -> Label:
+    def label(self, state: State, world: object | None = None) -> Label:
         """Return the expert's action in `state`, (4,). Raises `MismatchError` for another task's."""
         self._env.set_state(state)
         scene = Scene(self._env)

@@ -71,7 +71,7 @@ class PickPlace:
 
     def error(self, world: World) -> float:
         """Return the distance of the cube's centre from the goal [m]."""
-        return math.dist(world.pose(OBJECT).position, world.goal)
+        return math.dist(world.pose(OBJECT).position.tolist(), world.goal.tolist())
 
     def progress(self, world: World) -> float:
         """Return progress by the way that is left along the ladder's path."""

@@ -59,7 +59,7 @@ class ReachGoal:
 
     def error(self, world: World) -> float:
         """Return the distance of `ee` from the goal [m]."""
-        return math.dist(world.ee.position, world.goal)
+        return math.dist(world.ee.position.tolist(), world.goal.tolist())
 
     def progress(self, world: World) -> float:
         """Return progress by the distance that is left."""

@@ -80,7 +80,7 @@ class Teacher:
     def __init__(self, *action: float):
         self.action, self.queries = np.array(action), 0
 
-    def label(self, state: State) -> Label:
+    def label(self, state: State, world=None) -> Label:
         self.queries += 1
         return Label(self.action, 5, True, 0.0)
 

@@ -10,11 +10,12 @@ from functools import cache, lru_cache
 import numpy as np
 import pytest
 
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.engine.jobs import RolloutJob, run_job, run_steps
 from manip_il.expert import Expert
 from manip_il.mdp import Label, State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.env import EnvConfig
+from manip_il.sim.conditions import Condition
+from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import SCENES_KEPT, build_scene
 from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, Scene, World
@@ -78,6 +79,22 @@ def test_labels_do_not_depend_on_what_was_asked_before(robot: str, task: str, dr
     assert [shuffled[i] for i in range(len(states))] == forward
     for i in (3, len(states) // 2):
         assert written(Expert(build_scene(robot, task)).label(states[i])) == forward[i]
+
+
+KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), joint_noise=(0.01, 0.02))
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@every_scene
+def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task: str, driver: str):
+    """Also where it was knocked, has other sizes, and is observed with noise."""
+    knocked = KNOCKED.for_world(has_object=bool(get_task(task).objects), sees=False, sizes=None)
+    conditions = (*(sizes_of(task) if driver == "varied" else ()), *([knocked] if knocked else ()))
+    config, expert = EnvConfig(robot, task, horizon=30), expert_of(robot, task)
+    job = RolloutJob(config, "random" if driver == "random" else "expert", hold=3, conditions=conditions)
+    for step in run_steps(job, [ManipEnv.of(config, None, conditions)], stream_seeds("certificate", 2)):
+        assert step.label is not None
+        assert written(step.label) == written(expert.label(step.state))
 
 
 @every_scene
