@@ -79,6 +79,8 @@ def _cylinder(at: tuple[float, float, float], rotation: F64, radius: float, leng
 
 
 def _clutter(scene: Scene, data: mujoco.MjData, count: int, seed: int) -> list[Prop]:
+    if not count:
+        return []
     rng, taken = rng_for(seed, "clutter"), _furniture(scene, data)
     found: list[Prop] = []
     for _ in range(count):
