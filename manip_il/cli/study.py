@@ -95,7 +95,10 @@ class StudyOptions:
         say(f"next: {self._next(study)}")
 
     def _learn(self, plan: Plan) -> None:
-        """Run one after the other, seed by seed, so that a study that is stopped early has all arms."""
+        """Run one after the other, seed by seed, so that a study that is stopped early has all arms.
+
+        Raises `UsageError` once a run has no round that the study's rule selects, and not when all have run.
+        """
         runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             folder = self._folder(name, seed)
@@ -107,6 +110,8 @@ class StudyOptions:
                 others = [self._options(plan, other, seed) for other in plan.arms if other != name]
                 share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
             options.run()
+            source = self._source(plan, name, seed)
+            source.select(plan.rule, limit_of(plan.rule, [source]))
 
     def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
         own = begun(plan.arms[name], lambda arm: self._folder(arm, seed))
@@ -148,12 +153,11 @@ class StudyOptions:
         return trial
 
     def _sources(self, plan: Plan, name: str) -> list[Source]:
-        folders = {seed: self._folder(name, seed) for seed in range(plan.file.training_seeds)}
-        options, start = plan.arms[name], plan.starts[name] or name
-        histories = {
-            seed: charged(options, run_history(folder), self._folder(start, seed)) for seed, folder in folders.items()
-        }
-        return [Source(folder, seed, history=histories[seed]) for seed, folder in folders.items()]
+        return [self._source(plan, name, seed) for seed in range(plan.file.training_seeds)]
+
+    def _source(self, plan: Plan, name: str, seed: int) -> Source:
+        folder, start = self._folder(name, seed), self._folder(plan.starts[name] or name, seed)
+        return Source(folder, seed, history=charged(plan.arms[name], run_history(folder), start))
 
     def _folder(self, name: str, seed: int) -> Path:
         return self.output_dir / name / f"seed_{seed}"

@@ -18,7 +18,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-ROWS = 16
+ROWS = 25  # of the episodes that run in lockstep, whose numbers follow each other: each has a row to itself
 
 
 @dataclass

@@ -109,9 +109,9 @@ def _grasp(world: World, name: str) -> Grasp:
     ee, position, lie = world.ee, world.pose(name).position, lie_of(world, name)
     neighbours = world.neighbours(name)
     yaw, width, length = _nearest(lie, world, position, world.most_opening - _LEAST_ROOM, neighbours)
-    lean = 0.0 if world.leans else world.reach.lean(position)
-    angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     x, y, z = position.tolist()
+    lean = 0.0 if world.leans else world.reach.lean((x, y, z))
+    angle = _beyond_lean(world.off_down(yaw), ee.rotation, lean)
     ee_x, ee_y, ee_z = ee.position.tolist()
     dx, dy, dz = x - ee_x, y - ee_y, z - ee_z
     aside = world.middle(width + 2 * BESIDE_JAW)  # of the object before a hand of which one jaw alone moves [m]
@@ -174,17 +174,22 @@ def _nearest(
             for yaw, width, length in grasps
             for way in (world.turns(yaw, math.pi, position) if lie.folds else (0.0,))
         ]
-    narrowest = min(width for _, width, _ in grasps)
-    fitting = [grasp for grasp in grasps if grasp[1] <= max(widest, narrowest)]
-    yaw, width, length = min(
-        fitting,
-        key=lambda g: (
-            abs(g[0] - at)
-            + PREFER_ZERO * abs(g[0])
-            + WIDTH_AS_ANGLE * (g[1] - narrowest)
-            + CROWDED * _crowding(g[0] + ahead, widest, neighbours),
-            g[0],
-        ),
+    narrowest = min([width for _, width, _ in grasps])
+    widest_fitting = max(widest, narrowest)
+    _, yaw, width, length = min(
+        [
+            (
+                abs(yaw - at)
+                + PREFER_ZERO * abs(yaw)
+                + WIDTH_AS_ANGLE * (width - narrowest)
+                + CROWDED * _crowding(yaw + ahead, widest, neighbours),
+                yaw,
+                width,
+                length,
+            )
+            for yaw, width, length in grasps
+            if width <= widest_fitting
+        ]
     )
     return yaw + ahead, width, length
 

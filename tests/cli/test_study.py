@@ -120,6 +120,13 @@ def test_finished_runs_and_evaluations_are_not_made_again(here, runs, evaluated)
     assert evaluated[4:] == ["s/cloning/seed_2", "s/dagger/seed_2"]
 
 
+def test_a_run_that_never_gets_to_the_rules_amount_ends_the_study_at_once(here, runs, error):
+    (here / "x.yaml").write_text(FILE.replace("at: labels", "at: labels:900"))
+    assert study() == 2
+    assert "--at=labels:900: not every run got that far, one ended at 300 labels" in error()
+    assert len(runs) == 1
+
+
 @pytest.mark.parametrize(
     ("before", "after", "name"),
     [
