@@ -74,9 +74,12 @@ docker:  ## the image manip-il; TORCH_BACKEND=cpu for a small one without CUDA
 docker-test: setup  ## build the image, evaluate in it, compare with here
 	.ci/docker
 
-# One by one: two at a time would measure each other.
-bench: setup  ## every speed ratio
-	@set -e; for file in $(wildcard benchmarks/[!_]*.py); do echo "== $$file"; $(BIN)/python "$$file"; done
+# One by one: two at a time would measure each other. What learning is worth has scripts of its own, of up to hours.
+SPEEDS := $(wildcard benchmarks/*_speed.py) $(addprefix benchmarks/,image_loading.py training_throughput.py \
+	dagger_round.py ray_nodes.py scale.py)
+bench: setup  ## every speed ratio, in about 40 minutes; PEER=PYTHON, which has the imitation library
+	@set -e; for file in $(SPEEDS); do echo "== $$file"; $(BIN)/python "$$file"; done
+	@echo "== benchmarks/time_to_policy.py"; $(BIN)/python benchmarks/time_to_policy.py $(addprefix --peer=,$(PEER))
 
 lock: | $(filter .tools%,$(UV))  ## choose the versions anew
 	$(UV) pip compile --quiet --universal --generate-hashes --no-annotate --no-header \
