@@ -78,6 +78,7 @@ docker-test: setup  ## build the image, evaluate in it, compare with here
 SPEEDS := $(wildcard benchmarks/*_speed.py) $(addprefix benchmarks/,image_loading.py training_throughput.py \
 	dagger_round.py ray_nodes.py scale.py)
 bench: setup  ## every speed ratio, in about 40 minutes; PEER=PYTHON, which has the imitation library
+	@.ci/system sshd
 	@set -e; for file in $(SPEEDS); do echo "== $$file"; $(BIN)/python "$$file"; done
 	@echo "== benchmarks/time_to_policy.py"; $(BIN)/python benchmarks/time_to_policy.py $(addprefix --peer=,$(PEER))
 

@@ -6,15 +6,18 @@ Fetch's reach, the cheapest to simulate, on one worker. A recording grows tenfol
 `record --resume=true`; at every size each command runs whole, as a process of its own. Processor time, as it does not
 depend on what else the machine does. A new episode: what recording takes beyond a recording of one episode more, which
 reads all others back and writes the same dataset. Memory: the most that the process held. Resuming: wall time until a
-new episode is on disk.
+new episode is on disk. At the largest size: a new episode's wall time over that of the same one in an empty folder, by
+turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -25,7 +28,14 @@ from pathlib import Path
 
 from _machine import describe_machine
 
+from manip_il.data.journal import episode_path, list_seeds
+from manip_il.engine.engine import Engine
+from manip_il.engine.jobs import RolloutJob
+from manip_il.recording import collect
+from manip_il.sim.env import EnvConfig
+
 FIRST = 100
+TURNS = 3
 ENVIRONMENT = ("--robot.type=fetch", "--task.type=reach", "--workers=1")
 COMMANDS = ("record", "resume", "doctor", "info", "train", "push", "pull")
 ROWS = "rows.json"
@@ -84,6 +94,9 @@ def main() -> int:
                 print(rows[-1], flush=True)
                 (folder / ROWS).write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
             count *= 10
+        ratios = against_empty(folder, 5 if options.quick else 1_000)
+        print(f"at {rows[-1].episodes:,}, a new episode's time as a multiple of one in an empty folder: ", end="")
+        print(f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})")
         if options.plot is not None:
             draw(rows, options.plot)
     return 0
@@ -120,25 +133,53 @@ def others(root: Path) -> dict[str, Run]:
     return runs
 
 
+def against_empty(folder: Path, episodes: int) -> list[float]:
+    """Time of new episodes beside all journals that are there, over that of the same ones in an empty folder."""
+    journals, empty = folder / "demos.journals", folder / "empty"
+    job, after = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=10), max(list_seeds(journals)) + 1
+    ratios: list[float] = []
+    empty.mkdir()
+    collect_seconds(job, range(after, after + 5), empty)  # the first loads and compiles
+    for turn in range(TURNS):
+        seeds = range(after + turn * episodes, after + (turn + 1) * episodes)
+        order = (journals, empty) if turn % 2 else (empty, journals)
+        seconds = {place: collect_seconds(job, seeds, place) for place in order}
+        ratios.append(seconds[journals] / seconds[empty])
+    empty.rmdir()
+    return ratios
+
+
+def collect_seconds(job: RolloutJob, seeds: range, journals: Path) -> float:
+    """Seconds of simulating episodes and storing their journals, which go again."""
+    started = time.perf_counter()
+    for _ in collect(Engine(), job, seeds, journals):
+        pass
+    seconds = time.perf_counter() - started
+    for seed in seeds:
+        episode_path(journals, seed).unlink()
+    return seconds
+
+
 def draw(rows: list[Row], path: Path) -> None:
-    """Time and memory over the number of episodes, on logarithmic axes."""
+    """Time and memory over the number of episodes; in the legend how each grows over the last decade."""
     plt = import_module("matplotlib.pyplot")
-    figure, (time_axes, memory_axes) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, both = plt.subplots(1, 2, figsize=(11, 4.8), layout="constrained")
     sizes = [row.episodes for row in rows]
     times = {
         "one new episode": [row.new for row in rows],
-        "until a resumed one is on disk": [row.resumed for row in rows],
+        "resume, until a new one is on disk": [row.resumed for row in rows],
     }
     times |= {name: [row.runs[name].processor for row in rows] for name in COMMANDS[2:]}
-    for name, seconds in times.items():
-        time_axes.loglog(sizes, seconds, "o-", label=name)
-    for name in ("record", *COMMANDS[2:]):
-        memory_axes.semilogx(sizes, [row.runs[name].memory for row in rows], "o-", label=name)
-    time_axes.set(xlabel="episodes", ylabel="time [s]", title="Processor time of a command")
-    memory_axes.set(xlabel="episodes", ylabel="memory [MiB]", title="Most memory held", ylim=(0, None))
-    for axes in (time_axes, memory_axes):
+    held = {name: [row.runs[name].memory for row in rows] for name in COMMANDS}
+    for axes, drawn in zip(both, (times, held), strict=True):
+        for number, (name, values) in enumerate(drawn.items()):  # a command has the same colour on both sides
+            power = math.log10(values[-1] / values[-2]) if len(values) > 1 else 0.0
+            axes.plot(sizes, values, "o-", color=f"C{number}", label=f"{name}: n$^{{{max(power, 0.0):.2f}}}$")
+        axes.set(xscale="log", xlabel="episodes n")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15), frameon=False)
+    both[0].set(yscale="log", ylabel="time [s]", title="Processor time of a command")
+    both[1].set(ylabel="memory [MiB]", title="Most memory held", ylim=(0, None))
     figure.savefig(path, dpi=110)
 
 
