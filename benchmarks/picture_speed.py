@@ -17,8 +17,8 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
+from typing import Any
 
-import mujoco
 from _machine import describe_machine
 
 from manip_il.expert import Expert
@@ -28,6 +28,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, FILM, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
+from manip_il.sim.scene import camera_id
 
 SIZES = ((128, 128), (240, 320), (480, 640))
 STATES = 6  # of one expert episode, evenly apart
@@ -79,6 +80,8 @@ def visited(env: ManipEnv) -> list[State]:
 
 def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[float, float, float]:
     """Seconds a picture: ours, the physics model as it is, the scene without its robot."""
+    import mujoco  # after ours, which chooses its OpenGL
+
     robot, task = env.config.robot, env.config.task
     ours = seconds(env, states, lambda: render.pictures(robot, task, env.data, config))
     render.close()
@@ -88,13 +91,15 @@ def repeat(env: ManipEnv, states: list[State], config: CameraConfig) -> tuple[fl
     return ours, plain(env, states, config, env.scene.model), plain(env, states, config, no_robot)
 
 
-def plain(env: ManipEnv, states: list[State], config: CameraConfig, model: mujoco.MjModel) -> float:
+def plain(env: ManipEnv, states: list[State], config: CameraConfig, model: Any) -> float:
     """Seconds a picture of `mujoco.Renderer`."""
+    import mujoco
+
     with closing(mujoco.Renderer(model, config.height, config.width)) as renderer:
 
         def draw() -> None:
             mujoco.mj_camlight(env.scene.model, env.data)
-            renderer.update_scene(env.data, camera=config.names[0])
+            renderer.update_scene(env.data, camera=camera_id(env.scene.model, config.names[0]))
             renderer.render()
 
         return seconds(env, states, draw)
