@@ -1,4 +1,4 @@
-"""Plans of diffusion policies for many episodes in one call of the network: a sixth of the time a plan, or less.
+"""Plans of diffusion policies for many episodes in one call of the network: an eighth of the time a plan.
 
 In its last bits a row's plan depends on how many rows there are and which of them it is, not on what the others hold.
 So every call has `ROWS` rows, and an episode's number says which is its own: its plan is the same bits whatever runs
