@@ -102,16 +102,19 @@ class StudyOptions:
         runs = [(name, seed) for seed in range(plan.file.training_seeds) for name in plan.arms]
         for number, (name, seed) in enumerate(runs, start=1):
             folder = self._folder(name, seed)
-            if (folder / REPORT_FILE).is_file() and run_finished(folder):  # the report is what a run writes last
-                continue
-            say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
-            options = self._options(plan, name, seed)
-            if isinstance(options, DaggerOptions):
-                others = [self._options(plan, other, seed) for other in plan.arms if other != name]
-                share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
-            options.run()
+            # the report is what a run writes last
+            if not ((folder / REPORT_FILE).is_file() and run_finished(folder)):
+                say(f"run {number} of {len(runs)}: {name}, training seed {seed}")
+                self._run(plan, name, seed)
             source = self._source(plan, name, seed)
             source.select(plan.rule, limit_of(plan.rule, [source]))
+
+    def _run(self, plan: Plan, name: str, seed: int) -> None:
+        options = self._options(plan, name, seed)
+        if isinstance(options, DaggerOptions):
+            others = [self._options(plan, other, seed) for other in plan.arms if other != name]
+            share_start(options, [one for one in others if isinstance(one, DaggerOptions)])
+        options.run()
 
     def _options(self, plan: Plan, name: str, seed: int) -> ArmOptions:
         own = begun(plan.arms[name], lambda arm: self._folder(arm, seed))

@@ -124,6 +124,8 @@ def test_a_run_that_never_gets_to_the_rules_amount_ends_the_study_at_once(here, 
     (here / "x.yaml").write_text(FILE.replace("at: labels", "at: labels:900"))
     assert study() == 2
     assert "--at=labels:900: not every run got that far, one ended at 300 labels" in error()
+    assert study("--resume=true") == 2
+    assert "--at=labels:900: not every run got that far" in error()
     assert len(runs) == 1
 
 
