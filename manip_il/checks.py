@@ -7,12 +7,19 @@ take time to print.
 
 from __future__ import annotations
 
+import errno
 import functools
 import json
 import math
+import os
+import pickle
 import re
 import reprlib
+import resource
+import stat
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +31,13 @@ LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million epis
 LARGEST_YAML = 256 * 1024  # [bytes]: the parser takes a second for 100 kB
 DEEPEST_YAML = 50  # levels
 LARGEST_SEED = 2**63 - 1  # datasets store seeds as int64
+MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
+SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _LONGEST_WHY = 300  # of a parser's message [characters]
 _LONGEST_PRINTED = 300  # [characters]
+_REFUSED, _OUT_OF_MEMORY = 3, 4  # exit codes of a child process
 _PRINTED = reprlib.Repr()
 _PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
 _PRINTED.maxlevel = 2
@@ -127,10 +137,69 @@ def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, A
     return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
 
 
-def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
+def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
+    """Return the descriptor of a regular file; a pipe, device or socket of that name neither blocks nor is written to.
+
+    A file opened for writing is not reached through a link, which could lead to any other file. Raises `OSError` as
+    `os.open` does, with the reason "not a regular file" for another kind.
+    """
+    writes = flags & (os.O_WRONLY | os.O_RDWR)
+    late = flags & os.O_TRUNC  # only once it is known to be a regular file
+    wanted = (flags & ~late) | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_NOFOLLOW if writes else 0)
     try:
-        with path.open("rb") as file:
+        handle = os.open(path, wanted, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO) and os.path.lexists(path):
+            raise OSError(error.errno, "not a regular file", str(path)) from None
+        raise
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    if late:
+        os.ftruncate(handle, 0)
+    return handle
+
+
+def in_child(what: str, function: Callable[..., object], *arguments: object) -> None:
+    """Call `function(*arguments)` in a child process, which may take 4 GB of memory and 120 s.
+
+    Nothing but the text of its `ManipError` comes back, as what it opens may be from anyone. Raises that, and
+    `ManipError` if the child exceeds its limits or dies. what: the thing that is opened, for these messages.
+    """
+    call = pickle.dumps((MEMORY_IN_CHILD, function, arguments))
+    command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
+    try:
+        done = subprocess.run(command, input=call, capture_output=True, timeout=SECONDS_IN_CHILD, check=False)
+    except subprocess.TimeoutExpired:
+        raise ManipError(f"{what} took more than {SECONDS_IN_CHILD:g} s to open") from None
+    if done.returncode == _REFUSED:
+        raise ManipError(" ".join(done.stdout.decode(errors="replace").split()))
+    if done.returncode == _OUT_OF_MEMORY or b"bad_alloc" in done.stderr:
+        raise ManipError(f"{what} needs more than {MEMORY_IN_CHILD / 1024**3:g} GB of memory to open")
+    if done.returncode != 0:
+        raise ManipError(f"{what} cannot be opened: the process that read it ended with code {done.returncode}")
+
+
+def answer_parent() -> None:
+    """Run in the child process what `in_child` asks for."""
+    memory, function, arguments = pickle.load(sys.stdin.buffer)
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        function(*arguments)
+    except MemoryError:
+        os._exit(_OUT_OF_MEMORY)
+    except ManipError as error:
+        sys.stdout.write(str(error))
+        sys.stdout.flush()
+        os._exit(_REFUSED)
+    os._exit(0)
+
+
+def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
+    """Return a regular file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
+    try:
+        with open(open_regular(path), "rb") as file:
             data = file.read(largest + 1)
     except OSError as error:
         raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error

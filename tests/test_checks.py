@@ -1,6 +1,9 @@
 """What is read from outside has its declared type afterwards, or is refused in one short line."""
 
 import json
+import os
+import time
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -84,3 +87,32 @@ def test_a_huge_value_is_printed_short():
     assert len(checks.shorten([["a" * 1_000] * 1_000] * 1_000)) <= 300
     assert len(checks.shorten(10**4_000)) < 200
     assert checks.shorten(10**5_000) == "a huge int"
+
+
+def test_what_is_no_regular_file_is_neither_read_nor_written(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "mine").write_text("kept")
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    for path, flags in ((tmp_path / "pipe", os.O_RDONLY), (Path("/dev/zero"), os.O_RDONLY), (tmp_path, os.O_RDONLY)):
+        with pytest.raises(OSError, match="not a regular file"):
+            checks.open_regular(path, flags)
+    for name in ("link", "pipe"):
+        with pytest.raises(OSError, match="not a regular file"):
+            checks.open_regular(tmp_path / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    assert (tmp_path / "mine").read_text() == "kept"
+    os.close(checks.open_regular(tmp_path / "link"))  # reading through a link is as ever
+    with pytest.raises(ManipError, match="pipe: not a regular file"):
+        checks.read_bytes(tmp_path / "pipe", "a file", 10)
+
+
+def test_a_child_process_is_bounded_and_its_refusal_comes_home(monkeypatch: pytest.MonkeyPatch):
+    checks.in_child("a number", checks.whole, "n", 3, 0, 5)
+    with pytest.raises(ManipError, match="n is 7; expected a whole number from 0 to 5"):
+        checks.in_child("a number", checks.whole, "n", 7, 0, 5)
+    with pytest.raises(ManipError, match=r"x\.xml needs more than 4 GB of memory"):
+        checks.in_child("x.xml", bytearray, 2 * checks.MEMORY_IN_CHILD)
+    with pytest.raises(ManipError, match=r"x\.xml cannot be opened: the process that read it ended with code -6"):
+        checks.in_child("x.xml", os.abort)
+    monkeypatch.setattr(checks, "SECONDS_IN_CHILD", 0.5)
+    with pytest.raises(ManipError, match=r"x\.xml took more than 0\.5 s"):
+        checks.in_child("x.xml", time.sleep, 30)
