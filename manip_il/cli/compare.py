@@ -73,12 +73,10 @@ class CompareOptions:
         left, right, lines = match_seeds(read_candidate(self.left), read_candidate(self.right))
         both = (left, right)
         sources = [source for side in both for source in side.sources]
-        warn(lines)
-        warn(
-            f"{source.name} is not finished: the {len(source.history)} rounds that it has count"
-            for source in sources
-            if not source.finished
-        )
+        warn(*lines)
+        for source in sources:
+            if not source.finished:
+                warn(f"{source.name} is not finished: the {len(source.history)} rounds that it has count")
         limit = limit_of(rule, sources)
         trial = self._trial(sources, rule, limit)
         from manip_il.engine.engine import Engine
@@ -153,4 +151,4 @@ def _require_same(left: Source, right: Source) -> None:
     ours, theirs = left.evaluation, right.evaluation
     compare_results(ours, theirs, (left.name, right.name))
     require_same_episodes(left.name, ours, right.name, theirs)
-    warn(compare_fingerprints(left.name, ours.fingerprint, right.name, theirs.fingerprint))
+    warn(*compare_fingerprints(left.name, ours.fingerprint, right.name, theirs.fingerprint))

@@ -152,10 +152,10 @@ class ReplayOptions:
             path = self._find(result)
             cameras = check_policy(path, read_meta(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
-                warn([f"{path} is not the policy of {self.file}: its files differ"])
+                warn(f"{path} is not the policy of {self.file}: its files differ")
             job = replace(job, driver="policy", policy=path, trust=self.trust)
         here = env_fingerprint(env, cameras)
-        warn(compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
+        warn(*compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
         return job
 
     def _find(self, result: EvalResult) -> Path:
@@ -231,7 +231,7 @@ class MergeOptions:
         merged = merge_results(parts)
         (first, one), *others = parts.items()
         for name, other in others:
-            warn(compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
+            warn(*compare_fingerprints(first, dict(one.fingerprint), name, dict(other.fingerprint)))
         with open_output(self):
             merged.write(self.output_dir / FILE_NAME)
             report = eval_report(merged, command=command_line("merge", self), config=to_plain(self))

@@ -43,7 +43,7 @@ class ExportOptions:
         exported = write(path, policy_sha256(path))
         atomic_write(output, exported.data)
         if "robot" not in exported.metadata:
-            warn([f"{path} was written by another tool: the file does not say robot, task, control rate and names"])
+            warn(f"{path} was written by another tool: the file does not say robot, task, control rate and names")
         say(f"largest difference from {path} over random observations: {exported.difference:.1e}")
         for direction, tensors in (("in", exported.metadata["inputs"]), ("out", exported.metadata["outputs"])):
             for one in tensors:

@@ -131,7 +131,8 @@ def check_given(config: RunConfig) -> None:
 def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any]) -> None:
     """Warn where a dataset was made by other versions or another model than this machine has.
 
-    Raises `MismatchError` where its numbers mean something else. A robot that is not known here is not compared.
+    Raises `MismatchError` where its numbers mean something else. A dataset of a user's own arm or task, whose name
+    alone it holds, is not compared.
     """
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
@@ -140,14 +141,13 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     from manip_il.sim.env import EnvConfig
 
     if not is_known(spec.robot, spec.task):
-        warn([f"{root} is for {spec.robot} {spec.task}, which is not known here by name: scenes are not compared"])
         return
     env = EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
     check_same_spec(str(root), spec, "this program", env_spec(env))
     # Tolerance and horizon change nothing that is learnt, and a dataset does not hold them; nor are pictures compared.
     here = {key: value for key, value in env_fingerprint(env).items() if key != "config_sha256"}
     theirs = {key: value for key, value in fingerprint.items() if key not in ("config_sha256", "cameras_sha256")}
-    warn(compare_fingerprints(str(root), theirs, "this machine", here))
+    warn(*compare_fingerprints(str(root), theirs, "this machine", here))
 
 
 def check_policy(
@@ -169,7 +169,7 @@ def check_policy(
     if meta is not None:
         check_fits(meta, spec)
     check_interface(read_interface(path), spec)
-    warn(_differences(path, meta, env, cameras))
+    warn(*_differences(path, meta, env, cameras))
     policy = LearnedPolicy.load(path, task=spec.instruction, trust=trust)
     # One action now finds what else does not fit before a worker does.
     observation = _first_observation(env, cameras, draw)

@@ -71,7 +71,7 @@ class IrlOptions:
         for line in summary_lines(found):
             say(line)
         if line := open_line(found):
-            warn([line])
+            warn(line)
         say(f"report: {folder / PAGE}")
         robot = "" if info.robot == "panda" else f"--robot.type={info.robot} "
         say(f"next: manip-il eval --policy.type=expert {robot}--task.type=carry --task.reward={folder / FILE_NAME}")

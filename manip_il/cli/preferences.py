@@ -63,7 +63,7 @@ class PairsOptions:
         pairs = choose_pairs(supply, self.count, self.seed, rng, members)
         write_json(self.output, pairs.to_json())
         if supply.too_short:
-            warn([f"{supply.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them"])
+            warn(f"{supply.too_short:,} episodes are shorter than {self.clip} control steps: no clip is from them")
         say(f"{len(pairs):,} pairs from {len(pairs.sources)} datasets: {self.output}")
         say(f"next: manip-il preferences ask {self.output} --output=ask.html")
 
@@ -201,7 +201,7 @@ class PreferencesFitOptions:
         for line in summary_lines(found, answers):
             say(line)
         if answers.contradictory:
-            warn([f"{answers.contradictory:,} pairs are answered left and right: both answers count"])
+            warn(f"{answers.contradictory:,} pairs are answered left and right: both answers count")
         say(f"report: {page}")
         say(f"next: manip-il score DATASET --reward={folder} --output_dir=runs/scores")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
-def warn(lines: Iterable[str]) -> None:
+def warn(*lines: str) -> None:
     """Print warnings on standard error, one line each."""
     for line in lines:
         print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)

@@ -95,7 +95,7 @@ class PushOptions:
                     self.source, url, remote, show_bytes, journals=self.journals, dry_run=self.dry_run
                 )
         finally:
-            warn(remote.warnings)
+            warn(*remote.warnings)
         if published is None:
             _say_plan(plan, url)
             return
@@ -151,7 +151,7 @@ class PullOptions:
             remedy = "replace them with --overwrite=true, or name a new folder"
             raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
         finally:
-            warn(remote.warnings)
+            warn(*remote.warnings)
         manifest = pulled.manifest
         if self.dry_run:
             for entry in manifest.files:

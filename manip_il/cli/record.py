@@ -139,7 +139,7 @@ class RecordOptions(common.EnvOptions):
 
         count = self.dataset.num_episodes
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, self.seed)
-        warn(check_journals(journals, job))
+        warn(*check_journals(journals, job))
         save_options(journals, self)
         video = asdict(self.dataset.rgb_encoder) if job.cameras else {}
         recording = Recording(self._repo_id(), True, count, provenance(job), video)
@@ -181,7 +181,7 @@ class BuildOptions:
             result = build(self.journals, self.dataset, repo_id=self.repo_id, replace=self.overwrite)
         say(f"built {result.info.episodes:,} episodes, {result.info.frames:,} frames; {left_out(result.failed)}")
         say(f"dataset: {self.dataset}")
-        warn(result.damaged)
+        warn(*result.damaged)
         if result.damaged:
             raise ManipError(
                 f"{len(result.damaged)} journal{'s' if len(result.damaged) > 1 else ''} could not be read: the dataset "
@@ -232,7 +232,7 @@ class RenderOptions:
         from manip_il.engine.source import open_source
 
         source = open_source(self.source, self.robot.type)
-        warn(source.warnings)
+        warn(*source.warnings)
         with exclusive(self.target), progress(dataset_info(self.source).episodes, f"render {self.source}") as bar:
             info = render_dataset(
                 source,

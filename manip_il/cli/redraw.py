@@ -76,7 +76,7 @@ class RedrawOptions:
         from manip_il.engine.source import open_source
 
         source = open_source(self._dataset(), self.robot.type)
-        warn(source.warnings)
+        warn(*source.warnings)
         job = self._job(source)
         with exclusive(self.target):
             journals = self._journals()

@@ -53,7 +53,7 @@ class RelabelOptions:
 
         target, workers = self._target(), self.workers or default_workers()
         source = open_source(self.dataset, self.robot.type)
-        warn(source.warnings)
+        warn(*source.warnings)
         with exclusive(target), progress(dataset_info(self.dataset).episodes, f"relabel {self.dataset}") as bar:
             changes = relabel_dataset(
                 source,

@@ -278,7 +278,7 @@ def _look(roots: Sequence[Path]) -> dict[str, Any] | None:
     first, *others = [recorded_look(read_provenance(root), read_fingerprint(root)) for root in roots]
     for root, look in zip(roots[1:], others, strict=True):
         if look != first:
-            warn([f"light of the pictures differs: {roots[0]} has {first}, {root} has {look}; evaluated in the first"])
+            warn(f"light of the pictures differs: {roots[0]} has {first}, {root} has {look}; evaluated in the first")
     return first
 
 

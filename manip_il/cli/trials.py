@@ -280,7 +280,7 @@ def film_shots(shots: Sequence[Shot], stages: Stages, *, strips: bool = False) -
             made.append(shot.film(strip=strips))
             stages.step()
     except RenderError as error:
-        warn([f"the report shows paths in place of films: {error}"])
+        warn(f"the report shows paths in place of films: {error}")
         return Pictures(paths=tuple(shot.paths() for shot in shots), note=str(error))
     finally:
         stages.close()

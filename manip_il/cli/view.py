@@ -147,7 +147,7 @@ class ViewOptions:
         try:
             ManipEnv.of(env, cameras).reset(seed=0)
         except RenderError as error:
-            warn([f"shown without pictures: {error}"])
+            warn(f"shown without pictures: {error}")
             return None
         return cameras
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from manip_il.cli import progress as module
-from manip_il.cli.progress import progress, say, set_quiet
+from manip_il.cli.progress import progress, say, set_quiet, warn
 
 
 @pytest.fixture(autouse=True)
@@ -80,3 +80,10 @@ def test_a_terminal_gets_a_bar_and_a_pipe_beside_it_gets_the_output():
     assert done.stdout == b"result\n"
     assert b"2/2" in shown
     assert b"loss 0.5" in shown
+
+
+def test_each_warning_is_one_line(capsys):
+    warn("a joint has\nno range", "the other")
+    warn()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["manip-il: warning: a joint has no range", "manip-il: warning: the other"]
