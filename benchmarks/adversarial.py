@@ -31,7 +31,7 @@ from scipy.stats import trim_mean
 
 from manip_il.algorithms.airl import airl
 from manip_il.algorithms.gail import gail
-from manip_il.engine.vector_env import ActionRange, Lockstep
+from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.limits import threads

@@ -21,9 +21,9 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import RoundResult
 from manip_il.algorithms.run import DATASET, round_folder
 from manip_il.algorithms.table import run_algorithm
+from manip_il.collect.expert import Expert
+from manip_il.collect.workers import Engine, default_workers
 from manip_il.data.lerobot_read import read_table
-from manip_il.engine.engine import Engine, default_workers
-from manip_il.expert import Expert
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene

@@ -25,12 +25,12 @@ import numpy as np
 from _machine import describe_machine
 from numpy.typing import NDArray
 
-import manip_il.engine.jobs as jobs
-import manip_il.expert as expert
+import manip_il.collect.expert as expert
+import manip_il.collect.job as jobs
 import manip_il.learn.train as train
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
-from manip_il.engine.engine import Engine
+from manip_il.collect.workers import Engine
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.network import Statistics
 from manip_il.robots.ik import ArmIK

@@ -24,8 +24,9 @@ import mujoco
 import numpy as np
 from _machine import describe_machine
 
-from manip_il.engine.environments import env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.train import fit
@@ -65,7 +66,7 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
     """A policy cloned from 200 demonstrations: it solves nearly all, as what one evaluates in earnest does."""
     count, steps = (10, 50) if quick else (200, 4_000)
     config = EnvConfig(robot, TASK)
-    demos = list(run_job(RolloutJob(config, "expert", hold=5), stream_seeds("demonstrations", count)))
+    demos = list(RolloutJob(config, hold=5).run(stream_seeds("demonstrations", count)))
     table = {key: np.concatenate([episode.columns[key] for episode in demos]) for key in demos[0].columns}
     table["episode_index"] = np.repeat(np.arange(len(demos)), [len(episode) for episode in demos])
     return fit(table, FitConfig(steps=steps), folder, spec=env_spec(config))
@@ -73,9 +74,9 @@ def fitted(robot: str, folder: Path, quick: bool) -> Path:
 
 def against_physics(robot: str, policy: Path, episodes: int) -> tuple[float, float]:
     """Control steps a second on one core, ours and raw, over the same episodes."""
-    job = RolloutJob(EnvConfig(robot, TASK), "policy", policy=policy, label="last")
+    job = RolloutJob(EnvConfig(robot, TASK), PolicyDriver((policy,)), label="last")
     started = time.perf_counter()
-    found = list(run_job(job, stream_seeds("test", episodes)))
+    found = list(job.run(stream_seeds("test", episodes)))
     ours = time.perf_counter() - started
     steps = sum(map(len, found))
     return steps / ours, steps / sum(replay_seconds(job.env, episode) for episode in found)

@@ -19,8 +19,9 @@ import numpy as np
 import qpsolvers
 from _machine import describe_machine
 
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.expert import Expert
+from manip_il.collect.drivers import driver_of
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.robots import ik
 from manip_il.robots.robot import ROBOTS
@@ -79,8 +80,8 @@ def visited(robot: str, episodes: int, task: str = "pick_place") -> list[State]:
     states: list[State] = []
     horizon = {"expert": TASKS[task].limits.horizon, "random": 50}
     for driver in ("expert", "random"):
-        job = RolloutJob(EnvConfig(robot, task, horizon=horizon[driver]), driver, hold=5)
-        for episode in run_job(job, stream_seeds("certificate", episodes)):
+        job = RolloutJob(EnvConfig(robot, task, horizon=horizon[driver]), driver_of(driver), hold=5)
+        for episode in job.run(stream_seeds("certificate", episodes)):
             states += [State.from_vector(row) for row in episode.columns["sim_state"]]
     return states
 

@@ -22,9 +22,9 @@ from _machine import describe_machine
 
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.learning_run import LearningRun
+from manip_il.algorithms.vector_env import RobotEpisode
 from manip_il.cli.main import main as command
-from manip_il.engine.engine import Engine
-from manip_il.engine.vector_env import RobotEpisode
+from manip_il.collect.workers import Engine
 from manip_il.learn.discriminators import GailDiscriminator
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv

@@ -21,7 +21,7 @@ from typing import Any
 
 from _machine import describe_machine
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.mdp import State
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds

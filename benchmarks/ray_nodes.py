@@ -22,12 +22,11 @@ import ray
 from _machine import describe_machine
 from ray.cluster_utils import Cluster
 
-from manip_il.data.journal import JournalKeep
-from manip_il.engine.cluster import pack_message
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.pool import Task, run_task
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.ray_pool import packed
+from manip_il.collect.workers import Engine, run_seeds
+from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
@@ -40,7 +39,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="few episodes: shows that it runs, measures little")
     quick = parser.parse_args().quick
     episodes, turns = (4, 1) if quick else (60, TURNS)
-    job = RolloutJob(EnvConfig("panda"), "expert")
+    job = RolloutJob(EnvConfig("panda"))
     print(describe_machine())
     print(f"over the wire: {wire(job):,.0f} bytes an episode of panda pick_place")
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
@@ -67,7 +66,7 @@ def recorder(engine: Engine, job: RolloutJob) -> Callable[[int], float]:
 
     def record(count: int) -> float:
         with tempfile.TemporaryDirectory() as folder:
-            keep = JournalKeep(Path(folder), env_spec(job.env), env_fingerprint(job.env))
+            keep = Journal(Path(folder), env_spec(job.env), env_fingerprint(job.env))
             started = time.perf_counter()
             done = sum(1 for _ in engine.run(job, stream_seeds("certificate", count), keep))
             assert done == count == len(list(Path(folder).glob("*.mcap")))
@@ -87,12 +86,11 @@ def measured(ways: dict[str, Callable[[int], float]], episodes: int, turns: int)
 
 
 def wire(job: RolloutJob) -> float:
-    """Bytes of an episode's messages."""
+    """Bytes of an episode on its way home."""
     with tempfile.TemporaryDirectory() as folder:
-        keep = JournalKeep(Path(folder), env_spec(job.env), env_fingerprint(job.env))
+        keep = Journal(Path(folder), env_spec(job.env), env_fingerprint(job.env))
         seeds = tuple(stream_seeds("certificate", 8))
-        messages = list(run_task(lambda: Task(job, seeds, keep), store=False))
-    return sum(len(pack_message(message)) for message in messages) / len(seeds)
+        return len(packed(run_seeds(job, seeds, keep, store=False))) / len(seeds)
 
 
 def spread(above: list[float], below: list[float]) -> str:

@@ -27,12 +27,12 @@ from _machine import describe_machine
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa draws on the core that asks, here and in the limit
 
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.record import collect, provenance
+from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_episode
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob
-from manip_il.recording import collect, provenance
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
@@ -51,15 +51,15 @@ def main() -> int:
     print(describe_machine())
     print("recording                       control steps/s  limit, control steps/s  share (median, all repeats)")
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD)
+        job = RolloutJob(EnvConfig(robot), hold=HOLD)
         report(f"{robot}, one core", *one_core(job, 2 if quick else 40, 2 if quick else 5))
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD, cameras=CAMERAS)
+        job = RolloutJob(EnvConfig(robot), hold=HOLD, cameras=CAMERAS)
         report(f"{robot}, two cameras, one core", *one_core(job, 1 if quick else 8, 2 if quick else 3))
         report(f"{robot}, encoding beside it", *beside(job, 1 if quick else 8, 2 if quick else 3))
     print("two workers against one       recording              bare physics: the machine's limit")
     for robot in ROBOTS:
-        job = RolloutJob(EnvConfig(robot), "expert", beta=1.0, hold=HOLD)
+        job = RolloutJob(EnvConfig(robot), hold=HOLD)
         two_workers(robot, job, 8 if quick else 80, 2 if quick else 3)
     return 0
 

@@ -27,11 +27,12 @@ from scipy.stats import binomtest
 
 from manip_il.algorithms.inverse import CARRY, carried_stretch, read_carried
 from manip_il.cli.main import main as manip_il
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import list_episodes, read_episode
 from manip_il.data.lerobot_read import read_spec
 from manip_il.data.schema import ENVIRONMENT_STATE
-from manip_il.engine.environments import env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
 from manip_il.seeding import rng_for, stream_base, stream_seeds
@@ -76,15 +77,15 @@ def main() -> int:
             raise SystemExit("the clone could not be fitted")
         clone = Path(folder) / "clone" / "checkpoints" / "last" / "pretrained_model"
         for arm in ARMS:
-            own = drive(RolloutJob(_env(arm, truth), "expert", hold=1), truth, layouts, many=arm == ARMS[0])
+            own = drive(RolloutJob(_env(arm, truth), hold=1), truth, layouts, many=arm == ARMS[0])
             missed |= _print(arm, "true weights", own, own)
             cloned: list[Driven] = []
             if arm == ARMS[0]:
-                job = RolloutJob(_env(arm, truth), "policy", policy=clone, hold=1)
+                job = RolloutJob(_env(arm, truth), PolicyDriver((clone,)), hold=1)
                 cloned = drive(job, truth, layouts, many=True)
                 _print(arm, "cloning", cloned, own)
             for method, reward in rewards.items():
-                job = RolloutJob(_env(arm, reward), "expert", hold=1)
+                job = RolloutJob(_env(arm, reward), hold=1)
                 found = drive(job, truth, layouts, many=arm == ARMS[0])
                 missed |= _print(arm, method, found, own)
                 missed |= bool(cloned) and _compare(found, cloned)
@@ -126,7 +127,7 @@ def drive(job: RolloutJob, truth: Reward, layouts: int, *, many: bool) -> list[D
     names = env_spec(job.env).environment_state_names
     found: list[Driven] = []
     for seed in _seeds(job.env, layouts, many=many):
-        episode = next(run_job(job, [seed]))
+        episode = next(job.run([seed]))
         found.append(Driven(seed, _cost(job.env, episode, names, truth)))
     return found
 

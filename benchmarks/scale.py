@@ -28,10 +28,10 @@ from pathlib import Path
 
 from _machine import describe_machine
 
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.record import collect
+from manip_il.collect.workers import Engine
 from manip_il.data.journal import episode_path, list_seeds
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
-from manip_il.recording import collect
 from manip_il.sim.env import EnvConfig
 
 FIRST = 100
@@ -136,7 +136,7 @@ def others(root: Path) -> dict[str, Run]:
 def against_empty(folder: Path, episodes: int) -> list[float]:
     """Time of new episodes beside all journals that are there, over that of the same ones in an empty folder."""
     journals, empty = folder / "demos.journals", folder / "empty"
-    job, after = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=10), max(list_seeds(journals)) + 1
+    job, after = RolloutJob(EnvConfig("fetch", "reach"), hold=10), max(list_seeds(journals)) + 1
     ratios: list[float] = []
     empty.mkdir()
     collect_seconds(job, range(after, after + 5), empty)  # the first loads and compiles

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import FILM
 from manip_il.sim.env import ManipEnv

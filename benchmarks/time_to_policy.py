@@ -28,7 +28,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.table import run_algorithm
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.parsing import from_yaml
-from manip_il.engine.engine import Engine, default_workers
+from manip_il.collect.workers import Engine, default_workers
 
 HERE = Path(__file__).parent
 GOALS = (0.99, 0.995)

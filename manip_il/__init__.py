@@ -11,17 +11,13 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from manip_il.child_processes import obey_parent
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from importlib.abc import Loader
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
-obey_parent()  # before all other imports: they take a second, in which the process that started this one may be killed
-
-from manip_il.sim.gl import choose_backend  # noqa: E402
+from manip_il.sim.gl import choose_backend
 
 choose_backend()
 

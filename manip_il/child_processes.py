@@ -1,76 +1,92 @@
-"""Child processes that end with the process that started them, also where that was killed.
+"""Pools of worker processes on this machine. They end with the process that started them, also if that was killed.
 
-Linux sends them SIGKILL in that moment (`PR_SET_PDEATHSIG`), whatever they are doing; elsewhere, and where a thread
-other than the main one started them, they find the end of a pipe, as soon as Python runs another thread.
+Workers are forked from a server that has imported what they need and nothing else: they share neither OpenGL nor
+threads, and the import of torch, seconds of work, is paid once.
 """
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
-import sys
 import threading
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from multiprocessing import forkserver, resource_tracker
 
-_VARIABLE = "MANIP_IL_PARENT"  # process id; for the children that are started meanwhile
-_PDEATHSIG = 1  # PR_SET_PDEATHSIG
-_forking = 0  # process id, where the main thread is forking
+from manip_il.errors import ManipError
+
+_CONTEXT = multiprocessing.get_context("forkserver")
 
 
-@contextlib.contextmanager
-def bound_to_this_process() -> Generator[None]:
-    """Start Python processes inside that end with this one, from the moment that they import `manip_il`."""
-    if threading.current_thread() is not threading.main_thread():  # Linux would kill them when this thread ends
-        yield
-        return
-    os.environ[_VARIABLE] = str(os.getpid())
+def start_server(preload: Sequence[str] = ()) -> None:
+    """Start the server that workers are forked from, in the background; once a process.
+
+    preload: modules that it imports. It has the environment variables of this moment, but one thread for arithmetic.
+    """
+    _CONTEXT.set_forkserver_preload(list(preload))
+    threads = os.environ.get("OMP_NUM_THREADS")
+    resource_tracker.ensure_running()  # first, as its own start would undo the mask
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process alone
+    os.environ["OMP_NUM_THREADS"] = "1"  # read when torch is imported; one core each
     try:
-        yield
+        forkserver.ensure_running()
     finally:
-        del os.environ[_VARIABLE]
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
 
 
-def obey_parent() -> None:
-    """End with the parent where it started this process in `bound_to_this_process`; processes forked here do too."""
-    parent = os.environ.pop(_VARIABLE, None)
-    if parent is not None:
-        _end_with(int(parent))
-        os.register_at_fork(before=_before_fork, after_in_child=_after_fork)
+def open_pool(workers: int, preload: Sequence[str] = ()) -> ProcessPoolExecutor:
+    """Return a pool of so many processes, which are started as they are needed."""
+    start_server(preload)
+    return ProcessPoolExecutor(workers, mp_context=_CONTEXT, initializer=end_with_parent)
 
 
-def watch_parent() -> None:
-    """End this process, a child of `multiprocessing`, at the end of the pipe from the one that started it."""
+def kill_pool(pool: ProcessPoolExecutor) -> None:
+    """End a pool's processes, whatever they are doing."""
+    for process in list((pool._processes or {}).values()):  # pyright: ignore[reportPrivateUsage]  # public from 3.14 on
+        process.kill()
+    pool.shutdown(cancel_futures=True)
+
+
+def end_with_parent() -> None:
+    """End this process, a child of `multiprocessing`, when the one that started it ends."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def initialize_worker() -> None:
-    """Begin a pool's process: it ignores Ctrl-C, which the process that started it handles, and ends with that one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    watch_parent()
-
-
-def _end_with(parent: int) -> None:
-    if not sys.platform.startswith("linux"):
-        return
-    ctypes.CDLL(None).prctl(_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was gone already
-        os._exit(1)
-
-
-def _before_fork() -> None:
-    global _forking
-    _forking = os.getpid() if threading.current_thread() is threading.main_thread() else 0
-
-
-def _after_fork() -> None:
-    if _forking:
-        _end_with(_forking)
 
 
 def _wait_for_parent() -> None:
     if (parent := multiprocessing.parent_process()) is not None:
         parent.join()
         os._exit(1)
+
+
+def map_in_order[T, R](function: Callable[[T], R], items: Iterable[T], workers: int) -> Generator[tuple[T, R]]:
+    """Yield each item with its result, in order; at most `workers` + 1 of them wait in memory.
+
+    One worker is this process. Items and results are pickled for others. Raises `ManipError` if a worker dies.
+    """
+    if workers == 1:
+        yield from ((item, function(item)) for item in items)
+        return
+    waiting: deque[tuple[T, Future[R]]] = deque()
+    pool = open_pool(workers)
+    try:
+        for item in items:
+            waiting.append((item, pool.submit(function, item)))
+            if len(waiting) > workers:
+                yield _first(waiting)
+        while waiting:
+            yield _first(waiting)
+    except BrokenExecutor as error:
+        raise ManipError("a worker died (out of memory?); fewer --workers need less") from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _first[T, R](waiting: deque[tuple[T, Future[R]]]) -> tuple[T, R]:
+    item, result = waiting.popleft()
+    return item, result.result()

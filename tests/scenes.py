@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.scene import build_scene

@@ -1,4 +1,4 @@
-"""Whatever a child process is doing, it ends with the process that started it."""
+"""A worker, whatever it is doing, ends with the process that started it, and Ctrl-C is not for it."""
 
 from __future__ import annotations
 
@@ -8,70 +8,47 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from manip_il import child_processes
-from manip_il.child_processes import bound_to_this_process
+from manip_il.child_processes import map_in_order
+from manip_il.errors import ManipError
 
 from .faults.child import living
 
 PATIENCE = 120.0  # [s]
 BUSY = """
-import os, re, sys, time
+import os, time
 
-def say(folder):
-    with open(f"{folder}/{os.getpid()}.tmp", "w") as file:
-        pass
-    os.rename(f"{folder}/{os.getpid()}.tmp", f"{folder}/{os.getpid()}")
-
-def search(folder):
-    say(folder)
-    re.match("(a+)+$", 64 * "a" + "b")  # for years, in C, with no other thread getting its turn
+def count(folder):
+    open(f"{folder}/{os.getpid()}", "w").close()
+    while True:
+        sum(range(1_000_000))
 """
-IMPORTING = "import manip_il, busy\nbusy.search({folder!r})\n"
-FORK_SERVER = """
-import multiprocessing, sys
-from manip_il.child_processes import bound_to_this_process
-context = multiprocessing.get_context("forkserver")
-context.set_forkserver_preload([sys.argv[2]])
+PROGRAM = """
+import sys, time
+from manip_il.child_processes import open_pool
 if __name__ == "__main__":
     import busy
-    with bound_to_this_process():
-        context.Process(target=busy.search, args=(sys.argv[1],)).start()
-    import time; time.sleep(3600)
-"""
-POOL = """
-import multiprocessing, sys
-from concurrent.futures import ProcessPoolExecutor
-from manip_il.child_processes import bound_to_this_process, initialize_worker
-if __name__ == "__main__":
-    import busy
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=initialize_worker)
-    with bound_to_this_process():
-        pool.submit(busy.search, sys.argv[1])
-    import time; time.sleep(3600)
+    open_pool(1).submit(busy.count, sys.argv[1])
+    time.sleep(3600)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("code", "preload"),
-    [(FORK_SERVER, "manip_il"), (FORK_SERVER, "importing"), (POOL, "")],
-    ids=["forked while it works", "fork server while it imports", "pool"],
-)
-def test_a_child_that_never_comes_up_for_air_ends_with_its_parent(code, preload, tmp_path):
+def test_a_busy_worker_ignores_ctrl_c_and_ends_with_its_parent(tmp_path):
     seen = tmp_path / "seen"
     seen.mkdir()
     (tmp_path / "busy.py").write_text(BUSY)
-    (tmp_path / "importing.py").write_text(IMPORTING.format(folder=str(seen)))
-    (tmp_path / "program.py").write_text(code)
+    (tmp_path / "program.py").write_text(PROGRAM)
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    words = [sys.executable, str(tmp_path / "program.py"), str(seen), preload]
+    words = [sys.executable, str(tmp_path / "program.py"), str(seen)]
     parent = subprocess.Popen(words, env=environment, start_new_session=True)
     try:
-        [child] = wait_for(lambda: [int(path.name) for path in seen.iterdir() if path.name.isdecimal()])
+        [child] = wait_for(lambda: [int(path.name) for path in seen.iterdir()])
+        os.kill(child, signal.SIGINT)
+        time.sleep(0.5)
+        assert child in living(parent.pid)
         parent.send_signal(signal.SIGKILL)
         parent.wait()
         wait_for(lambda: child not in living(parent.pid))
@@ -80,30 +57,13 @@ def test_a_child_that_never_comes_up_for_air_ends_with_its_parent(code, preload,
             os.killpg(parent.pid, signal.SIGKILL)
 
 
-def test_only_what_is_started_inside_is_bound():
-    def environment() -> dict[str, str]:
-        with bound_to_this_process():
-            return dict(os.environ)
-
-    before = dict(os.environ)
-    assert environment().keys() - before.keys() == {"MANIP_IL_PARENT"}
-    assert dict(os.environ) == before
-    with ThreadPoolExecutor(1) as pool:  # whose children would be killed when the thread ends
-        assert pool.submit(environment).result() == before
-
-
-def test_a_child_whose_parent_is_gone_already_ends(tmp_path):
-    code = "import manip_il; open('here', 'w')"
-    environment = os.environ | {"MANIP_IL_PARENT": "1"}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, check=False, timeout=PATIENCE)
-    assert run.returncode == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_another_system_has_the_pipe_alone(monkeypatch):
-    monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setattr(child_processes.os, "_exit", None)
-    child_processes._end_with(1)
+@pytest.mark.slow
+def test_results_come_in_the_order_of_the_items_and_a_death_is_told():
+    assert (
+        list(map_in_order(abs, [-3, 2, -1], 2)) == list(map_in_order(abs, [-3, 2, -1], 1)) == [(-3, 3), (2, 2), (-1, 1)]
+    )
+    with pytest.raises(ManipError, match="a worker died"):
+        list(map_in_order(os._exit, [1], 2))
 
 
 def wait_for(what):

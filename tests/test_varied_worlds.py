@@ -11,6 +11,11 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.cli.trials import varied
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.render import render_states
+from manip_il.collect.source import open_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.build import build, merge_datasets
@@ -19,12 +24,7 @@ from manip_il.data.journal import read_episode, write_episode
 from manip_il.data.lerobot_read import read_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.render import render_states
-from manip_il.engine.source import open_source
 from manip_il.errors import MismatchError
-from manip_il.expert import Expert
 from manip_il.mdp import Episode, State
 from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig
@@ -111,8 +111,8 @@ WORLDS = [("", KINDS), ("", ("object",)), ("", ("dynamics",)), ("", ("view", "dy
 def world(request) -> tuple[EnvConfig, list[Episode]]:
     shape, kinds = request.param
     config = EnvConfig("panda", "pick_place", horizon=12, object=shape)
-    job = RolloutJob(config, "expert", conditions=(condition(config, *kinds),) if kinds else ())
-    return config, list(run_job(job, [3, 4]))
+    job = RolloutJob(config, conditions=(condition(config, *kinds),) if kinds else ())
+    return config, list(job.run([3, 4]))
 
 
 def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
@@ -137,7 +137,7 @@ def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(
 ):
     config, episodes = world
     about = {"fingerprint": env_fingerprint(config)}
-    plain = list(run_job(RolloutJob(config, "expert"), [5]))
+    plain = list(RolloutJob(config).run([5]))
     for name, ones in (("varied", episodes), ("plain", plain)):
         write_dataset(ones, tmp_path / name, env_spec(config), repo_id=f"local/{name}", **about)
     merge_datasets([tmp_path / "varied", tmp_path / "plain"], tmp_path / "both", repo_id="local/both")
@@ -148,7 +148,7 @@ def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(
 
 def test_a_dataset_from_before_is_read_and_has_the_looks_that_its_provenance_says(tmp_path: Path):
     varied, root = Condition("dim", brightness=(0.5, 0.7)), tmp_path / "older"
-    [episode] = run_job(RolloutJob(REACH, "expert", conditions=(varied,)), [1])
+    [episode] = RolloutJob(REACH, conditions=(varied,)).run([1])
     states = np.delete(episode.columns[schema.SIM_STATE].astype(np.float64), range(-4 - WORLD_SIZE, -4), axis=1)
     states[:, -4] -= WORLD_SIZE
     spec = replace(env_spec(REACH), sim_state_size=states.shape[1])
@@ -163,9 +163,9 @@ def test_a_dataset_from_before_is_read_and_has_the_looks_that_its_provenance_say
 
 
 def test_the_doctor_tells_what_was_drawn_and_what_is_no_draw(tmp_path: Path, capsys):
-    job = RolloutJob(REACH, "expert", conditions=(Condition("soft", actuator_gain=(0.7, 0.7), posture=(0.1, 0.1)),))
+    job = RolloutJob(REACH, conditions=(Condition("soft", actuator_gain=(0.7, 0.7), posture=(0.1, 0.1)),))
     root, about = tmp_path / "soft", {"fingerprint": env_fingerprint(REACH)}
-    write_dataset(run_job(job, [1, 2]), root, env_spec(REACH), repo_id="local/soft", **about)
+    write_dataset(job.run([1, 2]), root, env_spec(REACH), repo_id="local/soft", **about)
     assert main(["doctor", str(root)]) == 0
     assert "its episodes draw actuator_gain 0.7, posture 0.1\n" in capsys.readouterr().out
     [path] = root.glob(layout.EPISODES_FILES)

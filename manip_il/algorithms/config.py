@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # help of `manip-il dagger` reads the options, without numpy
     import numpy as np
     from numpy.typing import NDArray
 
-    from manip_il.engine.drivers import QueryRule
+    from manip_il.collect.query import Query
     from manip_il.sim.conditions import Condition
 
     F64 = NDArray[np.float64]
@@ -116,8 +116,8 @@ class Sampling:
             return None
         import numpy as np
 
+        from manip_il.collect.query import action_gap
         from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-        from manip_il.engine.drivers import action_gap
         from manip_il.mdp import Actor
 
         gap = action_gap(table[ACTION], table[EXECUTED_ACTION], scale)
@@ -167,7 +167,7 @@ class RunConfig:
         "per_state",
         "what the expert gives when it is queried: one action, a drive to the end, or a branch (docs/dagger.md)",
     )
-    query_rule: QueryRule | None = None
+    query_rule: Query | None = None
     branch_steps: int | None = option(None, "control steps of a branch; by default as many as the policy plans")
     ensemble: int = option(1, "policies fitted a round, of which the first drives; for --query=ensemble:BOUND")
     sampling: Sampling = field(default_factory=Sampling)
@@ -212,20 +212,18 @@ class RunConfig:
         self._check_queries()
 
     def _check_queries(self) -> None:
-        from manip_il.engine.drivers import QueryRule
-
-        rule = self.query_rule or QueryRule()
+        rule, kind = self.query_rule, self.query_rule.kind if self.query_rule else "every"
         if self.label == "takeover" and self.beta != _LEARNER_ALONE:
             raise UsageError(f"label is 'takeover', so the learner rolls in alone; beta is '{self.beta}', leave it out")
-        if self.label == "takeover" and self.query_rule is not None and self.query_rule.kind == "every":
+        if self.label == "takeover" and rule is not None and kind == "every":
             raise UsageError("label is 'takeover' and query 'every': the expert would drive from the first step on")
-        if rule.kind == "ensemble" and self.ensemble < 2:
+        if kind == "ensemble" and self.ensemble < 2:
             raise UsageError(f"query is '{rule}', but there is one policy; give ensemble=2 or more")
         if self.start is not None and self.ensemble > 1:
             raise UsageError(
                 f"ensemble is {self.ensemble}, but --policy.path is one policy to begin with; leave it out"
             )
-        if rule.kind != "ensemble" and self.ensemble > 1:
+        if kind != "ensemble" and self.ensemble > 1:
             raise UsageError(f"ensemble is {self.ensemble}, but no query uses it; give query=ensemble:BOUND too")
 
     @property
@@ -243,16 +241,16 @@ class RunConfig:
         return self.branch_steps or sum(plan_of(self.fit))
 
     @property
-    def query(self) -> QueryRule:
+    def query(self) -> Query:
         """The rule by which the expert is queried, by default one of the label mode.
 
         `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
         """
-        from manip_il.engine.drivers import QueryRule
+        from manip_il.collect.query import Every, One, Probability
 
         if self.query_rule is not None or self.label == "per_state":
-            return self.query_rule or QueryRule()
-        return QueryRule("one") if self.label == "takeover" else QueryRule("probability", 1 / self.steps_of_branch)
+            return self.query_rule or Every()
+        return One() if self.label == "takeover" else Probability(1 / self.steps_of_branch)
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +25,7 @@ def dart(run: Run, c: RunConfig) -> Iterator[RoundResult]:
     policy = run.fit(data)
     yield run.validate(policy)
     for i in range(1, c.rounds + 1):
-        noise = partial(fitted_noise, policy.path, run.held_out(), trust=c.fit.trust)
+        noise = fitted_noise(policy.path, run.held_out(), trust=c.fit.trust)
         data.append(run.rollouts(i, noisy_expert(noise)))
         policy = run.fit(data)
         yield run.validate(policy)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig
+from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
 from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
-from manip_il.engine.environments import env_actions, env_fingerprint, env_spec
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import LEROBOT, FitConfig
 from manip_il.seeding import stream_base

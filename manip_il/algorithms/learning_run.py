@@ -25,13 +25,14 @@ from manip_il import checks
 from manip_il.algorithms.iterations import STAGES, Iteration, Stage, best_validation, validated, validations
 from manip_il.algorithms.learning_config import LONGER, LearningConfig
 from manip_il.algorithms.run import BEST, Watch
+from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import env_fingerprint, env_spec, policy_sha256
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import dataset_sha256
 from manip_il.data.lerobot_read import read_spec
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256
-from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -220,7 +221,7 @@ class LearningRun:
     def _validate(self, number: int, policy: Path) -> EvalResult:
         """Evaluate a policy on the validation's seeds, unless that has been done; keep it where it is the best."""
         if (found := self._validation(number)) is None:
-            job = RolloutJob(self.config.env, "policy", policy=policy, label="last", hold=HOLD)
+            job = RolloutJob(self.config.env, PolicyDriver((policy,)), HOLD, label="last")
             seeds = stream_seeds("validation", self.config.validation_episodes, self.config.seed)
             with self._timed("validate"):
                 found = evaluate(self._engine, job, seeds, f"iteration {number}", self._watch.on_episode)

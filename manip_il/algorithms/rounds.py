@@ -2,42 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # algorithms are read for help and mistakes, too, before anything heavy is imported
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.drivers import Driver
     from manip_il.evaluation.results import EvalResult
 
 Noise = tuple[tuple[float, ...], ...]  # covariance (n, n) of actions
 
 
-@dataclass(frozen=True)
-class Drive:
-    """The driver of a rollout job. beta: the expert's share of the steps. noise: made when it is needed."""
-
-    driver: Literal["noisy_expert", "policy", "mixture"]
-    beta: float = 1.0
-    policies: tuple[Path | None, ...] = (None,)  # the first drives
-    noise: Callable[[], Noise] = tuple
-
-    def complete(self, job: RolloutJob) -> RolloutJob:
-        """Return the job with its driver."""
-        policy, *others = self.policies
-        ensemble = tuple(path for path in others if path)
-        return replace(job, driver=self.driver, beta=self.beta, policy=policy, ensemble=ensemble, noise=self.noise())
-
-
-def noisy_expert(noise: Callable[[], Noise]) -> Drive:
+def noisy_expert(noise: Noise) -> Driver:
     """Execute the expert's labels with Gaussian noise of a covariance (Laskey et al. 2017)."""
-    return Drive("noisy_expert", noise=noise)
+    from manip_il.collect.drivers import NoisyExpertDriver
+
+    return NoisyExpertDriver(noise)
 
 
-def mixture(policy: Fitted, beta: float) -> Drive:
+def mixture(policy: Fitted, beta: float) -> Driver:
     """Execute the expert's label with probability beta in each step, else the learner's action (Ross et al. 2011)."""
-    return Drive("mixture" if beta > 0 else "policy", beta, policy.members)
+    from manip_il.collect.drivers import PolicyDriver
+
+    return PolicyDriver(policy.members, beta, policy.trust)
 
 
 @dataclass(frozen=True)
@@ -60,10 +48,14 @@ class Rollouts:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A round's policy. members: the `pretrained_model` folders of an ensemble, of which the first drives."""
+    """A round's policy. members: the `pretrained_model` folders of an ensemble, of which the first drives.
+
+    trust: whether models that they name may be loaded.
+    """
 
     round: int
     members: tuple[Path, ...]
+    trust: bool = False
 
     @property
     def path(self) -> Path:

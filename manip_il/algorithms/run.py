@@ -26,22 +26,11 @@ from typing import Any
 
 from manip_il.algorithms.config import RunConfig, check_labels
 from manip_il.algorithms.fitting import fit_round, round_fit
-from manip_il.algorithms.rounds import Drive, Fitted, Rollouts, RoundResult, best_round
-from manip_il.data import schema
-from manip_il.data.atomic import new_folder
-from manip_il.data.build import Recording, dataset_sha256, merge_datasets
-from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
-from manip_il.engine.drivers import QueryRule
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
-from manip_il.engine.redraw import RedrawJob
-from manip_il.errors import MismatchError, NothingToLearnError
-from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
-from manip_il.evaluation.runner import evaluate
-from manip_il.learn.checkpoint import PRETRAINED_MODEL
-from manip_il.mdp import Episode
-from manip_il.recording import (
+from manip_il.algorithms.rounds import Fitted, Rollouts, RoundResult, best_round
+from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.query import Every, Query, Safety
+from manip_il.collect.record import (
     MAX_TRIES,
     Collected,
     check_journals,
@@ -51,6 +40,18 @@ from manip_il.recording import (
     record,
     redraw,
 )
+from manip_il.collect.redraw import RedrawJob
+from manip_il.collect.workers import Engine
+from manip_il.data import schema
+from manip_il.data.atomic import new_folder
+from manip_il.data.build import Recording, dataset_sha256, merge_datasets
+from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
+from manip_il.errors import MismatchError, NothingToLearnError
+from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
+from manip_il.evaluation.runner import evaluate
+from manip_il.learn.checkpoint import PRETRAINED_MODEL
+from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL
 from manip_il.sim.events import standard_in
@@ -108,33 +109,32 @@ class Run:
             self._held_out_steps = sum(read_header(path).frames for path in list_episodes(journals))
         return root
 
-    def rollouts(self, round_: int, drive: Drive, query: QueryRule | None = None, disturbed: float = 0.0) -> Rollouts:
+    def rollouts(self, round_: int, driver: Driver, query: Query | None = None, disturbed: float = 0.0) -> Rollouts:
         """Record a round's episodes, successful or not, with the expert's labels as `config.label` has them.
 
         query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
         `STANDARD` as well.
         """
-        config, rule = self.config, query or QueryRule()
+        config, rule = self.config, query or Every()
         count, per_state = config.episodes_per_round, config.label == "per_state"
         self._watch.on_stage("collect", round_, count)
         with self._timed("collect"):
             if not self._is_recorded(round_):
                 steps = config.steps_of_branch if config.label == "branch" else 1
-                job = replace(drive.complete(self._job(round_)), trust=config.fit.trust)
-                job = replace(job, label=config.label, query=rule, branch_steps=steps)
+                job = replace(self._job(round_), driver=driver, label=config.label, query=rule, branch_steps=steps)
                 job = replace(job, patience=config.patience if job.labels_all else None)
-                gated, name = not per_state or rule.kind != "every", self._repo_id(round_)
+                gated, name = not job.labels_all, self._repo_id(round_)
                 left = self._left(round_)
                 recording = Recording(name, provenance=provenance(job), only_labelled=gated, labels=left)
                 self._record(job, self._collect(job, count, round(disturbed * count)), recording)
-            return self._keep(round_, drive.beta, per_state and rule.kind in ("every", "safety"))
+            return self._keep(round_, driver.beta, per_state and isinstance(rule, Every | Safety))
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
         """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
         config, before, round_ = self.config, self._fitted, data[-1].round
         if config.start is not None and (round_ == 0 or all(one.dataset is None for one in data)):
             with self._timed("fit"):
-                self._fitted = Fitted(round_, (self._take(config.start, round_),))
+                self._fitted = Fitted(round_, (self._take(config.start, round_),), config.fit.trust)
             return self._fitted
         roots = [self._learnt_from(one) for one in data if one.dataset is not None]
         starts = before.members if before and config.refit == "warm" else (None,) * config.ensemble
@@ -145,7 +145,7 @@ class Run:
                 self._watch.on_stage(name, round_, round_fit(config, start).total_steps)
                 into = self._folder(round_) / (f"{POLICY}_{member}" if member else POLICY)
                 members.append(fit_round(config, roots, into, start, self._watch.on_log, member))
-        self._fitted = Fitted(round_, tuple(members))
+        self._fitted = Fitted(round_, tuple(members), config.fit.trust)
         return self._fitted
 
     def _learnt_from(self, rollouts: Rollouts) -> Path:
@@ -220,7 +220,7 @@ class Run:
         """The expert's rollouts."""
         config = self.config
         cameras = None if config.redraw else config.cameras  # states are enough
-        job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold, round=round_, cameras=cameras)
+        job = RolloutJob(config.env, ExpertDriver(), config.hold, round=round_, cameras=cameras)
         return replace(job, conditions=config.conditions)
 
     def _left(self, round_: int) -> int | None:
@@ -291,8 +291,10 @@ class Run:
 
     def _evaluate(self, policy: Fitted, path: Path) -> EvalResult:
         config = self.config
-        job = RolloutJob(config.env, "policy", policy=policy.path, label="last", hold=config.hold)  # solved is solved
-        job = replace(job, trust=config.fit.trust, conditions=config.conditions)
+        driver = PolicyDriver((policy.path,), trust=config.fit.trust)
+        job = RolloutJob(
+            config.env, driver, config.hold, label="last", conditions=config.conditions
+        )  # solved is solved
         seeds = stream_seeds("validation", config.validation_episodes, config.seed)
         suite, name = next((one.name for one in job.conditions), NOMINAL.name), f"DAgger round {policy.round}"
         result = evaluate(self._engine, job, seeds, name, self._watch.on_episode, suite=suite)

@@ -16,7 +16,7 @@ from manip_il.errors import UnknownName, UsageError
 if TYPE_CHECKING:  # the table is read for help and mistakes, too, before anything heavy is imported
     from manip_il.algorithms.config import RunConfig
     from manip_il.algorithms.run import Run, Watch
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from manip_il.algorithms.learning_config import LearningConfig
     from manip_il.algorithms.learning_run import LearningRun
     from manip_il.algorithms.run import Watch
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
 
 
@@ -51,8 +51,8 @@ class AdversarialOptions(LearningOptions):
 
     def environment(self) -> EnvConfig:
         """Return the environment of the demonstrations, which must be known here and one and the same."""
+        from manip_il.collect.environments import is_known
         from manip_il.data.lerobot_read import read_fingerprint, read_spec
-        from manip_il.engine.simulations import is_known
         from manip_il.learn.sources import check_same_sources
         from manip_il.sim.config import EnvConfig
 

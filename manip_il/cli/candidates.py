@@ -22,7 +22,7 @@ from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.rounds import END, History, Round, Rule, budget, history, select_round
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
 
 _SEED_FOLDER = re.compile(r"seed_(\d+)")

@@ -59,7 +59,7 @@ class CertifyOptions:
         env = self.env.config(self.robot.type, self.task.type, meta, self.task.object, self.task.reward)
         if policy is not None:
             check_policy(policy, meta, env, draw=self.engine == "local", trust=self.trust)
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
         from manip_il.evaluation.certificate import FILE_NAME, summary_lines
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.seeding import stream_seeds

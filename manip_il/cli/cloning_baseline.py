@@ -11,15 +11,15 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.fitting import fit_table, round_fit
 from manip_il.algorithms.run import round_folder
 from manip_il.cli.progress import Stages
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.record import MAX_TRIES, collect_successes, provenance, record
+from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
 from manip_il.data.journal import list_episodes, read_header
 from manip_il.data.lerobot_read import read_table
 from manip_il.data.schema import LABEL_VALID
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
 from manip_il.learn.columns import LEARNING_COLUMNS
-from manip_il.recording import MAX_TRIES, collect_successes, provenance, record
 from manip_il.seeding import stream_seeds
 
 
@@ -49,7 +49,7 @@ def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, en
     journals.mkdir(parents=True, exist_ok=True)
     for path in list_episodes(round_0 / "journals"):
         write_file(journals / path.name, path.read_bytes())
-    job = RolloutJob(config.env, "expert", beta=1.0, hold=config.hold)
+    job = RolloutJob(config.env, hold=config.hold)
     count = config.demonstrations
     stages.start("cloning with as many labels, record", count)
     while True:

@@ -79,7 +79,7 @@ class CompareOptions:
                 warn(f"{source.name} is not finished: the {len(source.history)} rounds that it has count")
         limit = limit_of(rule, sources)
         trial = self._trial(sources, rule, limit)
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
         from manip_il.evaluation.compare_report import compare_report, comparison_table
         from manip_il.evaluation.tables import print_table
 

@@ -33,7 +33,7 @@ from manip_il.option import option, option_of
 from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import LearningCurve
     from manip_il.sim.config import CameraConfig
@@ -123,7 +123,7 @@ class DaggerOptions(common.EnvOptions):
         """Run, or go on with, all rounds."""
         config = self.config()
         with open_output(self, FREE, may_grow="rounds") as folder:
-            from manip_il.engine.engine import Engine
+            from manip_il.collect.workers import Engine
 
             kept = f"every finished episode and round, in {folder}"
             with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:
@@ -147,7 +147,7 @@ class DaggerOptions(common.EnvOptions):
 
     def _config(self) -> RunConfig:
         """Return the same before the policy's own configuration is checked, which takes seconds to import."""
-        from manip_il.engine.drivers import QueryRule  # which imports numpy
+        from manip_il.collect.query import parse_query  # which imports numpy
 
         policy, start = round_policy(self.policy)
         observation, cameras = self._pictures(start)
@@ -161,7 +161,7 @@ class DaggerOptions(common.EnvOptions):
             "datasets": tuple(self.dataset.root),
             "start": start,
             "beta": BetaSchedule.parse(self.beta),
-            "query_rule": None if self.query is None else QueryRule.parse(self.query),
+            "query_rule": None if self.query is None else parse_query(self.query),
         }
         own = {one.name: getattr(self, one.name) for one in fields(RunConfig) if one.name not in made}
         config = RunConfig(**made, **own)
@@ -175,7 +175,7 @@ class DaggerOptions(common.EnvOptions):
         cameras = self.image.config(self.cameras or CAMERAS if sees else self.cameras)
         if start is None:
             return self.observation, cameras
-        from manip_il.engine.environments import policy_cameras
+        from manip_il.collect.environments import policy_cameras
         from manip_il.learn.pretrained import observation_of, read_interface
 
         observation = self.observation or observation_of(read_interface(start).columns)
@@ -189,7 +189,7 @@ class DaggerOptions(common.EnvOptions):
 
 def run_rounds(config: RunConfig, folder: Path, engine: Engine, stages: Stages) -> list[RoundResult]:
     """Run all rounds in `folder` with progress, a printed line and a line of `metrics.jsonl` a round."""
-    from manip_il.engine.environments import env_fingerprint
+    from manip_il.collect.environments import env_fingerprint
 
     fingerprint = env_fingerprint(config.env, config.cameras)
     atomic_write(folder / FINGERPRINT_FILE, json.dumps(fingerprint, indent=1) + "\n")

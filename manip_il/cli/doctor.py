@@ -84,8 +84,7 @@ def check_robot(dataset: Dataset) -> Iterator[Finding]:
         spec, fingerprint = read_spec(dataset), read_fingerprint(dataset.root)
     except (OSError, ValueError, TypeError, RecursionError, ManipError):
         return  # named by the check of the spec
-    from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.engine.simulations import is_known
+    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.sim.env import EnvConfig
     from manip_il.sim.variation import OLDER
 

@@ -17,7 +17,7 @@ from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
 EPISODES_FILE = "episodes.jsonl"
@@ -70,12 +70,12 @@ class EpisodeJournal:
 
 
 def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
-    from manip_il.engine.environments import env_fingerprint, policy_sha256
-    from manip_il.engine.jobs import observed_cameras
+    from manip_il.collect.environments import env_fingerprint, policy_sha256
+    from manip_il.collect.job import observed_cameras
     from manip_il.evaluation.results import EvalSettings
 
     return {
-        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver,
+        "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
         "fingerprint": env_fingerprint(job.env, observed_cameras(job)),
         "settings": EvalSettings.of(job, suite).to_json(),
     }
@@ -138,22 +138,23 @@ class ReplayOptions:
 
     def _job(self, result: EvalResult) -> RolloutJob:
         """Return the rollouts of the evaluation; warn where policy or program have changed since."""
+        from manip_il.collect.drivers import PolicyDriver, driver_of
+        from manip_il.collect.environments import env_fingerprint, policy_sha256
+        from manip_il.collect.job import RolloutJob
         from manip_il.data.fingerprint import compare_fingerprints
-        from manip_il.engine.environments import env_fingerprint, policy_sha256
-        from manip_il.engine.jobs import RolloutJob
         from manip_il.learn.checkpoint import read_meta
 
         env = result.settings.env(result.robot, result.task)
         conditions, hold = result.settings.conditions, result.settings.hold
-        job = RolloutJob(env, "expert", hold=hold, label="last", conditions=conditions)
+        job = RolloutJob(env, hold=hold, label="last", conditions=conditions)
         if result.policy in NO_FILES and not result.policy_sha256 and self.policy.path is None:
-            cameras, job = None, replace(job, driver=result.policy)
+            cameras, job = None, replace(job, driver=driver_of(result.policy))
         else:
             path = self._find(result)
             cameras = check_policy(path, read_meta(path), env, trust=self.trust)
             if result.policy_sha256 not in ("", policy_sha256(path)):
                 warn(f"{path} is not the policy of {self.file}: its files differ")
-            job = replace(job, driver="policy", policy=path, trust=self.trust)
+            job = replace(job, driver=PolicyDriver((path,), trust=self.trust))
         here = env_fingerprint(env, cameras)
         warn(*compare_fingerprints(str(self.file), dict(result.fingerprint), "this machine", here))
         return job

@@ -20,8 +20,8 @@ from manip_il.option import option
 from manip_il.stock.table import ROBOT
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
+    from manip_il.collect.workers import Engine
     from manip_il.evaluation.results import EpisodeResult, EvalResult
 
 EPISODES, MOST_EPISODES = 100, 10_000
@@ -96,7 +96,7 @@ class EvalOptions:
 
     def run(self) -> None:
         """Run the episodes, write `eval.json` and `report.html`, print the table."""
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
         from manip_il.evaluation.results import FILE_NAME
 
         seeds = self._seeds()
@@ -129,10 +129,10 @@ class EvalOptions:
         return stream_seeds(self.eval.stream, self.eval.first + count, self.seed)[self.eval.first :]
 
     def _job(self, engine: Engine, episodes: int) -> RolloutJob:
-        from manip_il.engine.jobs import RolloutJob
+        from manip_il.collect.drivers import PolicyDriver, driver_of
+        from manip_il.collect.job import RolloutJob
 
         path = None if self.policy.path is None else find_policy(self.policy.path)
-        self._check_memory(path, episodes)
         if episodes > 1:
             engine.warm_up(learned=path is not None)  # while the policy is checked here
         meta = cameras = None
@@ -146,8 +146,9 @@ class EvalOptions:
             if cameras is not None:
                 say(observation_text(cameras, path))
         conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
-        job = RolloutJob(env, self.policy.type or "policy", policy=path, label="last", conditions=conditions)
-        return replace(job, hold=episode_hold(env, self.eval.hold), batch=self.eval.batch_size, trust=self.trust)
+        driver = PolicyDriver((path,), trust=self.trust) if path is not None else driver_of(self.policy.type)
+        job = RolloutJob(env, driver, episode_hold(env, self.eval.hold), label="last", conditions=conditions)
+        return replace(job, batch=self.eval.batch_size)
 
     def _check_space(self, path: Path) -> None:
         """Raise `MismatchError` for a checkpoint of another action space than the one asked for."""
@@ -158,22 +159,6 @@ class EvalOptions:
 
         if (space := read_interface(path).space) != self.action_space:
             raise MismatchError("action space", str(path), space, "--action_space", self.action_space)
-
-    def _check_memory(self, policy: Path | None, episodes: int) -> None:
-        """Raise where memory is too small, before anything large is loaded; a Ray cluster checks for itself."""
-        from manip_il.engine.engine import default_workers
-        from manip_il.engine.local import check_memory
-
-        if self.engine != "local":
-            return
-        workers = min(self.workers or default_workers(), episodes)
-        if policy is None:
-            check_memory(workers, cameras=False, learned=False)
-            return
-        from manip_il.engine.environments import policy_cameras
-
-        weights = sum(path.stat().st_size for path in policy.glob("*.safetensors"))
-        check_memory(workers, cameras=policy_cameras(policy) is not None, weights=weights)
 
     def _evaluate(
         self, job: RolloutJob, seeds: range, engine: Engine, journal: EpisodeJournal, stages: Stages

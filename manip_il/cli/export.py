@@ -36,7 +36,7 @@ class ExportOptions:
         """Export, compare, write."""
         output = self.output or Path(f"policy{SUFFIXES[self.format]}")
         path = self._find(output)
-        from manip_il.engine.environments import policy_sha256
+        from manip_il.collect.environments import policy_sha256
         from manip_il.learn.export import export_onnx, export_torchscript
 
         write = export_onnx if self.format == "onnx" else export_torchscript

@@ -30,7 +30,7 @@ _FEWEST_COLOURS = 16  # in a picture of a scene; the emptiest ones hold hundreds
 class HealthOptions:
     """Draw one frame of the default scene, and check what else an evaluation needs.
 
-    Prints renderer, PyTorch, memory and cores. If something is missing, says what and exits with 1.
+    Prints renderer, PyTorch and cores. If something is missing, says what and exits with 1.
     """
 
     example: ClassVar[str] = "manip-il health"
@@ -41,13 +41,9 @@ class HealthOptions:
         check_temporary_folder()
         check_shared_memory()
         drawing = _draw()
-        from manip_il.engine.engine import default_workers
-        from manip_il.engine.local import available_memory
+        from manip_il.collect.workers import default_workers
 
-        # Little free memory is no fault: an evaluation may be running that uses the rest.
-        free = available_memory()
-        memory = "memory unknown" if free is None else f"{free / 1e9:.1f} GB of memory free"
-        say(f"healthy: {drawing}; {describe_torch()}; {memory}; cores {default_workers()}")
+        say(f"healthy: {drawing}; {describe_torch()}; cores {default_workers()}")
 
 
 def check_backend(backend: str | None) -> None:

@@ -105,8 +105,8 @@ def check_given(config: RunConfig) -> None:
 
     Raises what `check_policy` raises.
     """
+    from manip_il.collect.environments import env_spec
     from manip_il.data.lerobot_read import read_fingerprint, read_spec
-    from manip_il.engine.environments import env_spec
     from manip_il.learn.checkpoint import read_meta
     from manip_il.learn.pretrained import read_config, require_trust
     from manip_il.learn.sources import check_same_sources
@@ -134,10 +134,9 @@ def check_dataset(root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any
     Raises `MismatchError` where its numbers mean something else. A dataset of a user's own arm or task, whose name
     alone it holds, is not compared.
     """
+    from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.schema import check_same_spec
-    from manip_il.engine.environments import env_fingerprint, env_spec
-    from manip_il.engine.simulations import is_known
     from manip_il.sim.env import EnvConfig
 
     if not is_known(spec.robot, spec.task):
@@ -159,7 +158,7 @@ def check_policy(
     `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
     `LearnedPolicy.load` raises.
     """
-    from manip_il.engine.environments import env_spec, policy_cameras
+    from manip_il.collect.environments import env_spec, policy_cameras
     from manip_il.learn.checkpoint import check_fits
     from manip_il.learn.policy import LearnedPolicy
     from manip_il.learn.pretrained import check_interface, read_interface
@@ -179,8 +178,8 @@ def check_policy(
 
 
 def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, cameras: CameraConfig | None) -> list[str]:
+    from manip_il.collect.environments import env_fingerprint
     from manip_il.data.fingerprint import compare_fingerprints
-    from manip_il.engine.environments import env_fingerprint
 
     if meta is None:
         lines = [f"{path} was written by another tool and does not say which robot and task it is for"]
@@ -196,9 +195,9 @@ def _differences(path: Path, meta: CheckpointMeta | None, env: EnvConfig, camera
 def _first_observation(env: EnvConfig, cameras: CameraConfig | None, draw: bool) -> Observation:
     import numpy as np
 
-    from manip_il.engine.simulations import simulation_of
+    from manip_il.collect.environments import make_env
 
-    world = simulation_of(env.robot).make(env, cameras if draw else None)
+    world = make_env(env, cameras if draw else None)
     world.start(0)
     observation = world.observe()
     if cameras is None or draw:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_run import LearningRun
     from manip_il.algorithms.run import Watch
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
 
 METRICS_FILE = "metrics.jsonl"
@@ -64,7 +64,7 @@ class LearningOptions:
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
 
         config = self.learning_config()
         with open_output(self, FREE) as folder:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from manip_il.algorithms.iterations import Iteration
     from manip_il.algorithms.learning_config import LearningConfig
     from manip_il.algorithms.run import Watch
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.sim.config import EnvConfig
 
 
@@ -46,8 +46,7 @@ class PpoOptions(LearningOptions):
 
     def environment(self) -> EnvConfig:
         """Return the environment of the reward, which must be the policy's; raises `MismatchError` where it is not."""
-        from manip_il.engine.environments import env_spec
-        from manip_il.engine.simulations import is_known
+        from manip_il.collect.environments import env_spec, is_known
         from manip_il.sim.config import EnvConfig
 
         assert self.reward is not None

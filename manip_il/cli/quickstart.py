@@ -24,7 +24,7 @@ from manip_il.learn.fit_config import MLP, MLPOptions
 from manip_il.option import option, option_of
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.evaluation.report import RunReport
     from manip_il.evaluation.report_data import Kind, PolicyRow
     from manip_il.evaluation.results import EvalResult
@@ -91,7 +91,7 @@ class QuickstartOptions(common.EnvOptions):
         started = time.monotonic()
         config = self._dagger().config()
         with open_output(self, FREE) as folder:
-            from manip_il.engine.engine import Engine
+            from manip_il.collect.workers import Engine
 
             kept = f"every finished episode, round and evaluation, in {folder}"
             with Stages(kept) as stages, Engine(self.workers, self.engine) as engine:

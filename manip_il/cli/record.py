@@ -26,8 +26,8 @@ from manip_il.option import option, option_of
 from manip_il.sim.config import CAMERAS, Look, scene_name
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
+    from manip_il.collect.workers import Engine
 
 HOLD = 10  # control steps that a demonstration goes on for after success
 
@@ -92,9 +92,9 @@ class RecordOptions(common.EnvOptions):
             from manip_il.data.video import try_encoder
 
             try_encoder(VideoConfig(**asdict(self.dataset.rgb_encoder)), cameras.size, env.control_hz)
-        from manip_il.engine.engine import Engine
-        from manip_il.engine.environments import env_spec
-        from manip_il.engine.jobs import RolloutJob
+        from manip_il.collect.environments import env_spec
+        from manip_il.collect.job import RolloutJob
+        from manip_il.collect.workers import Engine
 
         env_spec(env, cameras)  # refuses what no scene can be made of, before anything is written
         engine = Engine(self.workers, self.engine)
@@ -106,7 +106,7 @@ class RecordOptions(common.EnvOptions):
                 say(f"{root} holds its {self.dataset.num_episodes} episodes already")
             else:
                 conditions = varied(self.vary, env, sees=bool(cameras))
-                job = RolloutJob(env, "expert", beta=1.0, hold=HOLD, cameras=cameras, conditions=conditions)
+                job = RolloutJob(env, hold=HOLD, cameras=cameras, conditions=conditions)
                 self._record(engine, job, root, journals)
         say(f"next: manip-il train --dataset.root={root} --output_dir=runs/{root.name}")
 
@@ -132,9 +132,9 @@ class RecordOptions(common.EnvOptions):
         return dataset_info(root).episodes == self.dataset.num_episodes
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
+        from manip_il.collect.record import MAX_TRIES, check_journals, collect_successes, provenance, record
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
-        from manip_il.recording import MAX_TRIES, check_journals, collect_successes, provenance, record
         from manip_il.seeding import stream_seeds
 
         count = self.dataset.num_episodes
@@ -225,11 +225,11 @@ class RenderOptions:
         cameras = self.image.config(self.cameras, self.look)
         if cameras is None:
             raise UsageError("--cameras names none; expected any of front, side, wrist")
+        from manip_il.collect.render import render_dataset
+        from manip_il.collect.source import open_source
+        from manip_il.collect.workers import default_workers
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
-        from manip_il.engine.engine import default_workers
-        from manip_il.engine.render import render_dataset
-        from manip_il.engine.source import open_source
 
         source = open_source(self.source, self.robot.type)
         warn(*source.warnings)

@@ -18,8 +18,8 @@ from manip_il.option import option
 from manip_il.sim.config import CAMERAS
 
 if TYPE_CHECKING:
-    from manip_il.engine.redraw import RedrawJob
-    from manip_il.engine.source import Source
+    from manip_il.collect.redraw import RedrawJob
+    from manip_il.collect.source import Source
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
 
@@ -73,7 +73,7 @@ class RedrawOptions:
 
     def make(self) -> None:
         """Draw all frames, and say nothing of what comes next."""
-        from manip_il.engine.source import open_source
+        from manip_il.collect.source import open_source
 
         source = open_source(self._dataset(), self.robot.type)
         warn(*source.warnings)
@@ -100,7 +100,7 @@ class RedrawOptions:
         return self.target.with_name(f"{self.target.name}.journals")
 
     def _job(self, source: Source) -> RedrawJob:
-        from manip_il.engine.redraw import RedrawJob
+        from manip_il.collect.redraw import RedrawJob
 
         cameras = self.image.config(self.cameras)
         assert cameras is not None
@@ -117,8 +117,8 @@ class RedrawOptions:
         )
 
     def _redraw(self, source: Source, job: RedrawJob) -> None:
-        from manip_il.engine.engine import Engine
-        from manip_il.recording import redraw
+        from manip_il.collect.record import redraw
+        from manip_il.collect.workers import Engine
 
         asked = self.frames * self.branch_steps
         with progress(asked, f"redraw {source.root}") as bar, Engine(self.workers, self.engine) as engine:

@@ -16,7 +16,7 @@ from manip_il.errors import UsageError
 from manip_il.option import option
 
 if TYPE_CHECKING:
-    from manip_il.engine.relabel import Changes
+    from manip_il.collect.relabel import Changes
 
 
 @dataclass
@@ -45,11 +45,11 @@ class RelabelOptions:
 
     def run(self) -> None:
         """Label every state; TARGET appears when all are labelled."""
+        from manip_il.collect.relabel import relabel_dataset
+        from manip_il.collect.source import open_source
+        from manip_il.collect.workers import default_workers
         from manip_il.data.build import local_id
         from manip_il.data.lerobot_read import dataset_info
-        from manip_il.engine.engine import default_workers
-        from manip_il.engine.relabel import relabel_dataset
-        from manip_il.engine.source import open_source
 
         target, workers = self._target(), self.workers or default_workers()
         source = open_source(self.dataset, self.robot.type)

@@ -104,7 +104,7 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
         from manip_il.evaluation.robot_check.check import FILE_NAME, check_robot
         from manip_il.evaluation.robot_check.page import check_report
 

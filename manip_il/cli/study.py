@@ -33,7 +33,7 @@ from manip_il.option import option
 from manip_il.seeding import stream_seeds
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
+    from manip_il.collect.workers import Engine
     from manip_il.evaluation.results import EvalResult
     from manip_il.sim.config import EnvConfig
 
@@ -123,7 +123,7 @@ class StudyOptions:
         return replace(own, engine=self.engine) if isinstance(own, DaggerOptions) else own
 
     def _test(self, plan: Plan, experts: Mapping[str, Mapping[str, Trial]]) -> Study:
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
 
         sources = {name: self._sources(plan, name) for name in plan.arms}
         everything = [source for arm in sources.values() for source in arm]

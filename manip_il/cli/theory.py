@@ -75,7 +75,7 @@ class TheoryOptions:
 
     def _shift(self, run: Path) -> Shift:
         from manip_il.cli.candidates import common_env, read_candidate  # here, as it needs numpy
-        from manip_il.engine.engine import Engine
+        from manip_il.collect.workers import Engine
         from manip_il.evaluation.certify import certify, count_episodes
         from manip_il.theory.shift import find_rounds, measure_shift
 

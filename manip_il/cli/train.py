@@ -161,7 +161,7 @@ class TrainOptions:
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:
         """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
-        from manip_il.engine.source import open_source
+        from manip_il.collect.source import open_source
 
         source, target = self.dataset.root[0], self.output_dir / "redrawn"
         open_source(source)  # refuses one without states before anything is removed

@@ -16,8 +16,8 @@ from manip_il.option import option
 from manip_il.stock.table import ROBOT, STOCK
 
 if TYPE_CHECKING:
-    from manip_il.engine.engine import Engine
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
+    from manip_il.collect.workers import Engine
     from manip_il.evaluation.report_data import Film, Paths, Strip
     from manip_il.evaluation.results import EvalResult
     from manip_il.mdp import Episode
@@ -59,26 +59,27 @@ class Trial:
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path], trust: bool = False) -> Trial:
         """Make one of a suite's conditions, without those of cameras where none of the policies uses any."""
-        from manip_il.engine.environments import policy_cameras
+        from manip_il.collect.environments import policy_cameras
 
         sees = any(policy_cameras(policy) is not None for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env.task, env.object, sees=sees), trust)
 
     def job(self, policy: Path | None) -> RolloutJob:
         """Return the rollouts of one policy; None: of the expert."""
-        from manip_il.engine.jobs import RolloutJob
+        from manip_il.collect.drivers import ExpertDriver, PolicyDriver
+        from manip_il.collect.job import RolloutJob
         from manip_il.evaluation.runner import HOLD
 
-        job = RolloutJob(self.env, "expert" if policy is None else "policy", policy=policy, conditions=self.conditions)
-        return replace(job, hold=episode_hold(self.env, HOLD), label="last", trust=self.trust)
+        driver = ExpertDriver() if policy is None else PolicyDriver((policy,), trust=self.trust)
+        return RolloutJob(self.env, driver, episode_hold(self.env, HOLD), label="last", conditions=self.conditions)
 
     def file(self, folder: Path, policy: Path | None) -> Path:
         """Return the file of a policy's or the expert's evaluation, named after its files, environment and episodes.
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
+        from manip_il.collect.environments import env_fingerprint, policy_sha256
         from manip_il.data.fingerprint import canonical_json
-        from manip_il.engine.environments import env_fingerprint, policy_sha256
         from manip_il.evaluation.results import EvalSettings
 
         settings = EvalSettings.of(self.job(policy), self.suite).to_json()
@@ -256,7 +257,7 @@ class Shot:
 
     def paths(self) -> Paths:
         """Return the paths of hand and object."""
-        from manip_il.engine.environments import env_spec
+        from manip_il.collect.environments import env_spec
         from manip_il.evaluation.film import paths
 
         return replace(paths(self.episode, env_spec(self.job.env), self.title, self.caption), success=self.success)

@@ -17,7 +17,7 @@ from manip_il.option import option
 from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
     from manip_il.evaluation.watch import Screen
     from manip_il.sim.config import CameraConfig, EnvConfig
     from manip_il.sim.env import ManipEnv
@@ -80,14 +80,14 @@ class ViewOptions:
 
     def run(self) -> None:
         """Run episodes and show them."""
-        from manip_il.engine.jobs import observed_cameras, run_steps
+        from manip_il.collect.job import observed_cameras, run_steps
         from manip_il.evaluation.watch import outcome
         from manip_il.sim.env import ManipEnv
 
         job = self._job()
         env = ManipEnv.of(job.env, observed_cameras(job), job.conditions)
         with contextlib.closing(self._screen(env)) as screen:
-            for step in run_steps(job, [env], self._seeds(), screen.driver):
+            for step in run_steps(job, [env], self._seeds(), screen.act):
                 if not screen.add(step):
                     break
                 if step.done:
@@ -114,7 +114,8 @@ class ViewOptions:
 
     def _job(self) -> RolloutJob:
         """Return the episodes to show; without pictures where no policy looks at any and a window is open."""
-        from manip_il.engine.jobs import RolloutJob
+        from manip_il.collect.drivers import PolicyDriver, driver_of
+        from manip_il.collect.job import RolloutJob
         from manip_il.learn.checkpoint import read_meta
         from manip_il.mdp import LONGEST_EPISODE
 
@@ -127,10 +128,10 @@ class ViewOptions:
         if cameras is None and not self._in_a_window:
             cameras = self._cameras(env)
         conditions = suite_conditions(self.suite, env.task, env.object, sees=cameras is not None)
-        driver = "policy" if path else "random" if self.policy.type == "random" else "expert"
+        driver = PolicyDriver((path,), trust=self.trust) if path else driver_of(self.policy.type)
         if self.policy.type == "sliders" and not self.env.horizon:
             env = replace(env, horizon=LONGEST_EPISODE)  # nobody is as fast as the expert
-        return RolloutJob(env, driver, policy=path, hold=HOLD, conditions=conditions, cameras=cameras, trust=self.trust)
+        return RolloutJob(env, driver, HOLD, conditions=conditions, cameras=cameras)
 
     @property
     def _in_a_window(self) -> bool:

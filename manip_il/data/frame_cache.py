@@ -13,19 +13,17 @@ import json
 import logging
 import os
 import shutil
-import signal
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, as_completed
 from functools import partial
 from io import FileIO
-from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from manip_il.child_processes import bound_to_this_process, initialize_worker
+from manip_il.child_processes import open_pool
 from manip_il.data.atomic import PARTIAL, WriteError, descriptor, new_folder, try_lock
 from manip_il.data.frame_source import FrameSource, Part, find_frames
 from manip_il.errors import ManipError, UsageError
@@ -205,10 +203,9 @@ def _written(write: Callable[[Part], int], source: FrameSource, workers: int | N
     if workers == 1:
         yield from map(write, source.parts)
         return
-    pool = ProcessPoolExecutor(min(workers, len(source.parts)), get_context("spawn"), initializer=initialize_worker)
+    pool = open_pool(min(workers, len(source.parts)))
     try:
-        with _interrupts_held(), bound_to_this_process():  # starts the processes
-            futures = [pool.submit(write, part) for part in source.parts]
+        futures = [pool.submit(write, part) for part in source.parts]
         for future in as_completed(futures):
             yield future.result()
     except BrokenExecutor as error:
@@ -229,14 +226,3 @@ def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int
                 content, place = content[written:], place + written
             frames += len(pictures)
     return frames
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Generator[None]:
-    """Block Ctrl-C in the processes that are started inside."""
-    resource_tracker.ensure_running()  # here, as its own start would undo the mask
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

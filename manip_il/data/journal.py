@@ -26,13 +26,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data import schema
+from manip_il.data import foxglove, schema
 from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.episodes import Header, final_columns, take_final
-from manip_il.data.schema import IMAGES, RobotTaskSpec
-from manip_il.errors import ManipError, OlderSchemaError
-from manip_il.mcap import foxglove
-from manip_il.mcap.records import (
+from manip_il.data.mcap_records import (
     MIB,
     Budget,
     Record,
@@ -42,6 +39,8 @@ from manip_il.mcap.records import (
     to_attachment,
     unpack,
 )
+from manip_il.data.schema import IMAGES, RobotTaskSpec
+from manip_il.errors import ManipError, OlderSchemaError
 from manip_il.mdp import Episode
 
 _FORMAT = "2"
@@ -60,7 +59,7 @@ _NPY_HEADERS: dict[tuple[int, int], Callable[[io.BytesIO], Any]] = {
 
 
 @dataclass(frozen=True)
-class JournalKeep:
+class Journal:
     """Writes the journal of every episode that an engine runs."""
 
     folder: Path
@@ -87,7 +86,7 @@ def write_episode(folder: Path, episode: Episode, spec: RobotTaskSpec, fingerpri
     An earlier file of the same seed is replaced. Raises `ManipError` for a column that numpy can only pickle, and
     where the disk is full or may not be written.
     """
-    keep = JournalKeep(folder, spec, fingerprint)
+    keep = Journal(folder, spec, fingerprint)
     keep.store(episode.seed, keep.pack(episode))
     return episode_path(folder, episode.seed)
 

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import env_fingerprint
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.query import One
+from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.engine.drivers import QueryRule
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint
-from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Group, Row, Settings
 from manip_il.mdp import F32, F64, Actor, Episode
@@ -89,7 +90,7 @@ class _Run:
     def starts(self) -> Row:
         """Episodes as they begin."""
         cases: list[Case] = []
-        for episode in self._episodes(RolloutJob(self._env, "expert", hold=0), self._seeds):
+        for episode in self._episodes(RolloutJob(self._env, hold=0), self._seeds):
             case = self._case(episode, 0)
             cases.append(case)
             if case.steps is not None:
@@ -105,7 +106,7 @@ class _Run:
 
     def noisy(self) -> Row:
         """From where episodes begin, with noise on every action."""
-        job = RolloutJob(self._env, "expert", hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
+        job = RolloutJob(self._env, hold=0, conditions=(Condition("noise", action_noise=(NOISE, NOISE)),))
         cases = [self._case(episode, 0) for episode in self._episodes(job, self._seeds)]
         return self._row("start", "noise", f"{NOISE:.0%} noise on every action", cases)
 
@@ -114,7 +115,7 @@ class _Run:
         moments = self._moments[kind]
         steps = {seed: moment.step for seed, moment in moments.items()}
         longer = replace(self._env, horizon=max(steps.values()) + self._env.horizon)
-        job = RolloutJob(longer, "expert", hold=0, conditions=(Perturbation(kind, steps),))
+        job = RolloutJob(longer, hold=0, conditions=(Perturbation(kind, steps),))
         cases: list[Case] = []
         for episode in self._episodes(job, list(moments)):
             moment = moments[episode.seed]
@@ -126,8 +127,8 @@ class _Run:
 
     def taken_over(self, policy: Path, trust: bool) -> Row:
         """States that a learner visits: at a drawn step of a horizon the expert takes over."""
-        once = QueryRule("one")
-        job = RolloutJob(self._env, "policy", policy=policy, hold=0, label="takeover", query=once, trust=trust)
+        driver = PolicyDriver((policy,), trust=trust)
+        job = RolloutJob(self._env, driver, hold=0, label="takeover", query=One())
         cases: list[Case] = []
         for episode in self._episodes(job, self._seeds):
             taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)

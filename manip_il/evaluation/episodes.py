@@ -17,7 +17,7 @@ from manip_il.mdp import LONGEST_EPISODE
 from manip_il.sim.conditions import NOMINAL, Condition
 
 if TYPE_CHECKING:
-    from manip_il.engine.jobs import RolloutJob
+    from manip_il.collect.job import RolloutJob
     from manip_il.sim.env import EnvConfig
 
 Place = tuple[float, float, float]  # x away from the robot, y to its left, z above the table's top [m]

@@ -17,10 +17,10 @@ from PIL import Image
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.render import render_states
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.engine.render import render_states
 from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Film, Paths
 from manip_il.mdp import Episode
@@ -34,7 +34,7 @@ Frames = Sequence[NDArray[np.uint8]]
 
 def run_states(job: RolloutJob, seed: int) -> Episode:
     """Return the episode of one seed, the same as in an evaluation of `job`, with its states."""
-    return next(run_job(replace(job, label="last"), [seed]))
+    return next(replace(job, label="last").run([seed]))
 
 
 def film(

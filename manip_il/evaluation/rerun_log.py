@@ -9,8 +9,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
+from manip_il.collect.environments import env_spec
 from manip_il.data import schema
-from manip_il.engine.environments import env_spec
 from manip_il.errors import ManipError
 from manip_il.evaluation.rerun_world import ROOT, WorldLog
 from manip_il.evaluation.watch import outcome
@@ -35,7 +35,7 @@ class RerunLog:
     Raises `ManipError` without rerun, `OSError` where the file cannot be written.
     """
 
-    driver = None  # nobody drives by it
+    act = None  # nobody drives by it
 
     def __init__(self, env: EnvConfig, output: Path | None = None):
         self._rerun: Any = _import_rerun()

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from manip_il.collect.environments import env_fingerprint, env_spec, policy_sha256, positions
+from manip_il.collect.job import RolloutJob, observed_cameras
+from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256, positions
-from manip_il.engine.jobs import RolloutJob, observed_cameras
 from manip_il.errors import UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion

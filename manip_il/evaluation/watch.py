@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.engine.environments import env_spec
+from manip_il.collect.environments import env_spec
+from manip_il.collect.rollout import Act, Turn
 from manip_il.mdp import Actor, Transition
-from manip_il.rollout import Driver, Turn
 from manip_il.sim.env import ManipEnv
 from manip_il.sim.window import Window
 
@@ -21,7 +21,7 @@ class Screen(Protocol):
     """Interface of what shows episodes as they happen."""
 
     @property
-    def driver(self) -> Driver | None:
+    def act(self) -> Act | None:
         """Driver of what it shows, where somebody drives by it."""
         ...
 
@@ -43,7 +43,7 @@ class WindowScreen:
     def __init__(self, env: ManipEnv, *, sliders: bool = False):
         self._env, self._phases = env, env_spec(env.config).phases
         self._window = Window(env.config, sliders=sliders)
-        self.driver = SlidersDriver(self._window, env) if sliders else None
+        self.act = slider_actions(self._window, env) if sliders else None
 
     def add(self, step: Transition) -> bool:
         """Show the world after a step, in real time; returns False once the window is closed."""
@@ -59,19 +59,20 @@ class WindowScreen:
         self._window.close()
 
 
-class SlidersDriver:
-    """Executes what the control sliders of a window say."""
+def slider_actions(window: Window, env: ManipEnv) -> Act:
+    """Return a driver that executes what the control sliders of a window say, joint targets and gripper command (n,).
 
-    def __init__(self, window: Window, env: ManipEnv):
-        self._window, self._env = window, env
+    An episode begins with those that it starts from.
+    """
 
-    def act(self, turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        """Return joint targets and gripper command (n,); an episode begins with those that it starts from."""
-        scene, before = self._env.scene, self._env.data.ctrl
+    def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        scene, before = env.scene, env.data.ctrl
         [turn] = turns
-        commands = before if turn.step == 0 else self._window.commands
+        commands = before if turn.step == 0 else window.commands
         opening = scene.gripper.commanded(commands[scene.gripper.ctrl], before[scene.gripper.ctrl])
         return [(scene.actions.join(commands[scene.arm_ctrl], opening), Actor.LEARNER)]
+
+    return act
 
 
 def outcome(step: Transition) -> str:

@@ -13,7 +13,7 @@ from multiprocessing import get_context
 import torch
 from accelerate.state import AcceleratorState
 
-from manip_il.child_processes import bound_to_this_process, initialize_worker
+from manip_il.child_processes import end_with_parent
 from manip_il.errors import ManipError
 
 _RANK = "RANK"  # set where several processes were started by `accelerate launch` or `torchrun`
@@ -38,9 +38,8 @@ def sharing_batches(count: int, threads: int, work: Callable[[], object]) -> Ite
     with _environment(places[0] | port), warnings.catch_warnings():
         _ignore_strides()
         try:
-            with bound_to_this_process():
-                for other in others:
-                    other.start()
+            for other in others:
+                other.start()
             yield
             for other in others:
                 other.join()
@@ -88,7 +87,8 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 def _serve(variables: Mapping[str, str], work: Callable[[], object]) -> None:
     os.environ.update(variables)
-    initialize_worker()
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     _ignore_strides()
     with open(os.devnull, "w", encoding="utf-8") as nothing, contextlib.redirect_stdout(nothing):

@@ -15,7 +15,6 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
-from manip_il.child_processes import bound_to_this_process
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.errors import UnknownName, UsageError, shorten_ffmpeg_warning
 from manip_il.learn.pretrained import OBSERVATIONS
@@ -100,8 +99,7 @@ class ManipILEnv(EnvConfig):
         mode = AutoresetMode.SAME_STEP  # LeRobot reads an episode's last `info` in the step that ends it
         if use_async_envs and n_envs > 1:
             _preload()
-            with bound_to_this_process():
-                envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
+            envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
         else:
             envs = SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
         return {self.type: {0: envs}}

@@ -18,13 +18,13 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from manip_il import checks
+from manip_il.data import foxglove
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
 from manip_il.data.lerobot_read import dataset_info, read_frames, read_instructions, read_table
 from manip_il.data.parquet_files import UNREADABLE, find_shards
 from manip_il.errors import ManipError
-from manip_il.mcap import foxglove
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values
 from manip_il.mcap.path import parse_path
 from manip_il.mcap.read import decode_picture

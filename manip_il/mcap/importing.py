@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data.atomic import new_folder
+from manip_il.data.foxglove import NANOSECONDS, log_time
 from manip_il.data.schema import MOST_FRAMES
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.mcap.foxglove import NANOSECONDS, log_time
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Method, Source, Values
 from manip_il.mcap.read import Topics, read_pictures, read_topics
 

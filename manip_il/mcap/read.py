@@ -18,10 +18,10 @@ from mcap.records import Channel, Schema
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
+from manip_il.data.mcap_records import MIB, Budget, read_messages
 from manip_il.data.pictures import open_picture
 from manip_il.errors import ManipError, nearest
 from manip_il.mcap.mapping import Values
-from manip_il.mcap.records import MIB, Budget, read_messages
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -15,10 +15,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from manip_il.collect.render import render_states
+from manip_il.collect.source import Source, open_source
 from manip_il.data import schema
 from manip_il.data.lerobot_read import read_table
-from manip_il.engine.render import render_states
-from manip_il.engine.source import Source, open_source
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import FORMAT, VERSION

@@ -1,7 +1,7 @@
 """Stock benchmark environments: `FetchReach-v4` and siblings of gymnasium-robotics, as they are.
 
-- `--robot.type=fetch_stock --task.type=FetchPush-v4` chooses one. A robot in `SIMULATIONS` (engine/simulations.py) has
-  a simulation of its own, which makes environments, experts and descriptions; every other robot has our scenes.
+- `--robot.type=fetch_stock --task.type=FetchPush-v4` chooses one. `collect/environments.py`
+  chooses between these and our scenes.
 - Unmodified: the environment's own model, 25 Hz, 50 steps, action and reward; other settings are refused, and so are
   cameras, disturbances and suites of conditions. The return of an episode is its sum of rewards, in `eval.json`.
 - `action`: [dx, dy, dz, fingers] in [-1, 1], 1 being 5 cm. `agent_pos`: where the gripper is and how far open, so that

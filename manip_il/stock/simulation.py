@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import UsageError
 from manip_il.mdp import State
 from manip_il.robots.action_space import ActionSpace
@@ -17,7 +16,7 @@ from manip_il.sim.conditions import Condition
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.stock.environment import ACTIONS, StockEnv
 from manip_il.stock.expert import StockExpert
-from manip_il.stock.table import ACTION_MEANING, PHASES, ROBOT, STATE_NAMES, get_stock
+from manip_il.stock.table import ROBOT
 
 
 class StockSimulation:
@@ -29,7 +28,7 @@ class StockSimulation:
         self, config: EnvConfig, cameras: CameraConfig | None = None, conditions: Sequence[Condition] = ()
     ) -> StockEnv:
         """Make an environment. Raises `UsageError` for cameras, or conditions that change it."""
-        _require_no_cameras(cameras)
+        require_no_cameras(cameras)
         if changed := [one.name for one in conditions if one.ranges]:
             raise UsageError(
                 f"{ROBOT} is unmodified and takes no {', '.join(changed)}; use --suite=nominal, for manip-il dagger "
@@ -45,21 +44,9 @@ class StockSimulation:
         """Return the actions, (4,)."""
         return ACTIONS
 
-    def spec(self, config: EnvConfig, cameras: CameraConfig | None = None) -> RobotTaskSpec:
-        """Return names, sizes and rate. Raises `UsageError` for cameras."""
-        _require_no_cameras(cameras)
-        task = get_stock(config.task)
-        return RobotTaskSpec(
-            robot=ROBOT,
-            task=task.name,
-            fps=config.control_hz,
-            joint_names=STATE_NAMES,
-            environment_state_names=task.observed,
-            sim_state_size=_env(task.name).state_size,
-            instruction=task.instruction,
-            action_meaning=ACTION_MEANING,
-            phases=PHASES,
-        )
+    def state_size(self, config: EnvConfig) -> int:
+        """Return how many numbers a `sim_state` has."""
+        return _env(config.task).state_size
 
     def model_bytes(self, config: EnvConfig) -> bytes:
         """Return the environment's compiled model."""
@@ -76,7 +63,8 @@ class StockSimulation:
         return found | ({"object": env.object} if env.task.has_object else {})
 
 
-def _require_no_cameras(cameras: CameraConfig | None) -> None:
+def require_no_cameras(cameras: CameraConfig | None) -> None:
+    """Raise `UsageError` for cameras."""
     if cameras is not None:
         raise UsageError(f"{ROBOT} has no cameras here ({', '.join(cameras.names)}); leave out --cameras")
 

@@ -18,11 +18,12 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.stats import rankdata
 
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.environments import env_actions, env_spec
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.lerobot_read import read_tables
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_actions, env_spec
-from manip_il.engine.jobs import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.columns import EPISODE_INDEX
@@ -165,10 +166,10 @@ def measure_shift(
     """
     names = env_spec(env).environment_state_names
     seeds = stream_seeds("theory", episodes)
-    expert = _run(engine, RolloutJob(env, "expert", hold=0), seeds, on_episode)
+    expert = _run(engine, RolloutJob(env, hold=0), seeds, on_episode)
     fresh, found = _visited(expert, names), list[RoundShift]()
     for one in rounds:
-        learner = _run(engine, RolloutJob(env, "policy", policy=one.policy, hold=0), seeds, on_episode)
+        learner = _run(engine, RolloutJob(env, PolicyDriver((one.policy,)), hold=0), seeds, on_episode)
         states, data = _visited(learner, names), _stored(one, names)
         found.append(
             RoundShift(

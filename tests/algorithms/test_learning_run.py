@@ -18,13 +18,13 @@ from manip_il.algorithms.iterations import Iteration, best_validation, validatio
 from manip_il.algorithms.learning_config import LearningConfig
 from manip_il.algorithms.learning_run import LearningRun
 from manip_il.cli.main import main
-from manip_il.engine.engine import Engine
+from manip_il.collect.workers import Engine
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.adversarial_config import DiscriminatorConfig, PPOConfig
 from manip_il.learn.policy import LearnedPolicy
 from manip_il.sim.env import EnvConfig
 
-from ..engine.clones import clone
+from ..collect.clones import clone
 from .trees import files
 
 pytestmark = pytest.mark.slow  # every test here waits for whole runs

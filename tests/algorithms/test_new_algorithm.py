@@ -11,8 +11,8 @@ import pytest
 from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import Rollouts, RoundResult, mixture
 from manip_il.algorithms.run import Run, Watch
+from manip_il.collect.workers import Engine
 from manip_il.data.lerobot_read import dataset_info
-from manip_il.engine.engine import Engine
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig

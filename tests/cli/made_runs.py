@@ -11,9 +11,9 @@ import numpy as np
 from manip_il.cli.common_options import EnvGroup, TaskGroup
 from manip_il.cli.dagger import DaggerOptions
 from manip_il.cli.outputs import append_jsonl, save_options
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
-from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.runner import HOLD
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta

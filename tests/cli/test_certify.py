@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.environments import env_fingerprint
+from manip_il.collect.environments import env_fingerprint
 from manip_il.sim.env import EnvConfig, ManipEnv
 
 from .made_runs import make_policy

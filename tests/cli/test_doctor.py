@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import build
 from manip_il.data.journal import write_episode
-from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.sim.env import EnvConfig
 
 from ..damage import edit_json

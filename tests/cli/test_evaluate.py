@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data.schema import STATE
-from manip_il.engine.environments import env_fingerprint, env_spec
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import META_FILE, CheckpointMeta
 from manip_il.sim.config import CameraConfig, Look

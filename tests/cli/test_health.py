@@ -105,10 +105,3 @@ def test_what_cannot_be_written_is_said(place, stand_in, says, monkeypatch, erro
     monkeypatch.setattr(place, stand_in)
     assert main(["health"]) == 1
     assert says in error()
-
-
-def test_little_free_memory_is_told_but_no_fault(undrawn, monkeypatch, capsys):
-    """Beside a large evaluation little is free, and the container is well."""
-    monkeypatch.setattr("manip_il.engine.local.available_memory", lambda: 10**8)
-    assert main(["health"]) == 0
-    assert "0.1 GB of memory free" in capsys.readouterr().out

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from manip_il.cli.main import main
-from manip_il.engine.environments import env_spec
+from manip_il.collect.environments import env_spec
 from manip_il.learn.preference.modeling_preference import write_reward
 from manip_il.learn.preference.network import RewardNetwork, RewardShape, ways_of
 from manip_il.sim.env import EnvConfig
 
-from ..engine.clones import clone
+from ..collect.clones import clone
 
 ENV = EnvConfig("fetch", "reach")
 

@@ -11,11 +11,11 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.cli.outputs import atomic_write
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_read import dataset_info, read_episodes, read_provenance, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig
@@ -108,7 +108,7 @@ ENV = EnvConfig("panda", "reach", horizon=6, success_steps=1)
 
 @pytest.fixture
 def demos(here) -> Path:
-    episodes = run_job(RolloutJob(ENV, "expert"), range(3))
+    episodes = RolloutJob(ENV).run(range(3))
     write_dataset(episodes, Path("demos"), env_spec(ENV), repo_id="local/demos", fingerprint=env_fingerprint(ENV))
     return Path("demos")
 

@@ -15,8 +15,9 @@ from manip_il.cli.main import load, main
 from manip_il.cli.options import options_of
 from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.study_file import read_plan
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.lerobot_config import LeRobotFit
 
@@ -74,7 +75,7 @@ def test_what_a_checkpoint_names_is_refused_by_every_command(hostile, named, pol
 
 @pytest.mark.slow
 def test_a_worker_trusts_only_what_its_job_does(hostile):
-    job = RolloutJob(ENV, "policy", policy=hostile, label="last", batch=1)
+    job = RolloutJob(ENV, PolicyDriver((hostile,)), label="last", batch=1)
     with Engine(2) as engine, pytest.raises(ManipError, match=r"evil/x.*--trust=true"):
         list(engine.run(job, [0, 1]))
 

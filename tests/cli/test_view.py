@@ -12,10 +12,10 @@ import pytest
 from rerun.experimental import RrdReader
 
 from manip_il.cli.main import main
+from manip_il.collect.job import RolloutJob, run_steps
 from manip_il.data import schema
-from manip_il.engine.jobs import RolloutJob, run_job, run_steps
 from manip_il.evaluation.rerun_log import FRAME
-from manip_il.evaluation.watch import SlidersDriver
+from manip_il.evaluation.watch import slider_actions
 from manip_il.mdp import Episode
 from manip_il.sim.config import CAMERAS, EnvConfig
 
@@ -47,7 +47,7 @@ def column(path: Path, entity: str, component: str) -> list[Any]:
 
 def simulated(task: str) -> Iterator[Episode]:
     """The same episodes, without anybody watching."""
-    return run_job(RolloutJob(EnvConfig("panda", task), "expert", hold=10), [3_000_000, 3_000_001])
+    return RolloutJob(EnvConfig("panda", task), hold=10).run([3_000_000, 3_000_001])
 
 
 def test_a_file_holds_every_step_as_it_was_simulated(tmp_path, no_opengl, capsys):
@@ -107,11 +107,11 @@ def test_the_sliders_of_the_window_drive_from_where_an_episode_starts():
 
     env, window = started(task="reach"), Window()
     scene, start = env.scene, env.data.ctrl.copy()
-    job = RolloutJob(EnvConfig("panda", "reach", horizon=30), "expert")
+    job = RolloutJob(EnvConfig("panda", "reach", horizon=30))
     window.commands = start + 0.1
     window.commands[scene.gripper.ctrl] = start[scene.gripper.ctrl]
     window.commands[scene.gripper.ctrl[0]] = 0.03  # one finger: the other one follows
-    steps = list(run_steps(job, [env], [3_000_000], SlidersDriver(window, env)))
+    steps = list(run_steps(job, [env], [3_000_000], slider_actions(window, env)))
     begun = steps[0].executed_action[scene.actions.arm]
     assert not np.isclose(begun, window.commands[scene.arm_ctrl]).any()
     np.testing.assert_allclose(steps[-1].executed_action[scene.actions.arm], window.commands[scene.arm_ctrl])

@@ -22,8 +22,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
 from manip_il.data import schema as s
+from manip_il.data.foxglove import SCALARS
 from manip_il.errors import ManipError
-from manip_il.mcap.foxglove import SCALARS
 from manip_il.mdp import Episode
 
 from ..synthetic import MakeEpisode

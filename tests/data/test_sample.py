@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
+from manip_il.collect.expert import Expert
 from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_table
 from manip_il.doctor.examine import examine_folder
-from manip_il.expert import Expert
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 
@@ -32,7 +32,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from manip_il.data.lerobot_read import read_table
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 

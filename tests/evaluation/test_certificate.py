@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.engine.drivers import drawn_step
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.expert import Expert
+from manip_il.collect.query import drawn_step
+from manip_il.collect.workers import Engine
 from manip_il.errors import ManipError, UsageError
 from manip_il.evaluation.certificate import Case, Certificate, Row, Settings, pooled, summary_lines
 from manip_il.evaluation.certify import certify, count_episodes, draw_moment
 from manip_il.evaluation.intervals import wilson_interval
-from manip_il.expert import Expert
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.events import NOTICEABLE, Perturbation
 from manip_il.sim.scene import build_scene
 
-from ..engine.clones import clone
+from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
 
 HORIZON = 50

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from manip_il.collect.environments import env_spec
+from manip_il.collect.job import RolloutJob
 from manip_il.data import schema
-from manip_il.engine.environments import env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4, film, filmed_steps, make_film, paths, pictures_of, run_states
 from manip_il.evaluation.maps import draw_paths
 from manip_il.sim.env import EnvConfig
 from manip_il.tasks import NAMES
 
-JOB = RolloutJob(EnvConfig(), "expert", label="last")
+JOB = RolloutJob(EnvConfig(), label="last")
 SEED = 4_000_000
 
 
@@ -31,7 +31,7 @@ def frames(count: int, height: int = 48, width: int = 64) -> list[np.ndarray]:
 
 
 def test_a_seed_run_again_is_the_episode_that_an_evaluation_saw(episode):
-    evaluated = {other.seed: other for other in run_job(JOB, range(SEED, SEED + 3))}[SEED]
+    evaluated = {other.seed: other for other in JOB.run(range(SEED, SEED + 3))}[SEED]
     assert np.array_equal(evaluated.columns[schema.SIM_STATE], episode.columns[schema.SIM_STATE])
 
 
@@ -87,14 +87,14 @@ def test_paths_end_with_the_object_at_the_goal(episode):
 
 
 def test_paths_of_a_task_without_an_object_follow_the_hand():
-    job = RolloutJob(EnvConfig(task="reach"), "expert")
+    job = RolloutJob(EnvConfig(task="reach"))
     drawn = paths(run_states(job, SEED), env_spec(job.env), "expert")
     assert np.array_equal(drawn.hand, drawn.obj)
 
 
 @pytest.mark.parametrize("task", NAMES)
 def test_paths_are_drawn_of_every_task_with_a_goal_or_without(task):
-    job = RolloutJob(EnvConfig(task=task, horizon=20), "expert")
+    job = RolloutJob(EnvConfig(task=task, horizon=20))
     drawn = paths(run_states(job, SEED), env_spec(job.env), "expert")
     assert np.array_equal(drawn.hand, drawn.obj) == (task == "reach")
     marked = ("reach", "lift", "pick_place", "push", "carry")

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from manip_il.cli.trials import suite_conditions
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_spec
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.drivers import PolicyDriver, RandomDriver
+from manip_il.collect.environments import env_spec
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.errors import UsageError
 from manip_il.evaluation import runner
 from manip_il.evaluation.results import EpisodeResult
@@ -20,7 +21,7 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition, draw
 from manip_il.sim.env import EnvConfig, ManipEnv
 
-from ..engine.clones import clone
+from ..collect.clones import clone
 from ..learn.tiny_policies import write_checkpoint
 
 SEEDS = stream_seeds("certificate", 12)
@@ -41,7 +42,7 @@ def mlp(tmp_path_factory):
 
 
 def job_of(policy, **changes) -> RolloutJob:
-    return RolloutJob(ENV, "policy", policy=policy, label="last", **changes)
+    return RolloutJob(ENV, PolicyDriver((policy,)), label="last", **changes)
 
 
 @pytest.mark.slow
@@ -81,10 +82,8 @@ def test_what_was_drawn_is_stored_and_is_what_the_environment_had(act):
 
 
 def test_places_are_the_true_ones_of_first_and_last_state():
-    job = RolloutJob(
-        EnvConfig("fetch"), "expert", label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),)
-    )
-    [episode] = run_job(job, SEEDS[:1])
+    job = RolloutJob(EnvConfig("fetch"), label="last", conditions=(Condition("n", position_noise=(0.05, 0.05)),))
+    [episode] = job.run(SEEDS[:1])
     result = episode_result(job, episode)
     env = ManipEnv(config=EnvConfig("fetch"))
     env.start(SEEDS[0])
@@ -97,7 +96,7 @@ def test_places_are_the_true_ones_of_first_and_last_state():
 
 
 def test_a_task_without_an_object_has_no_place_of_one(act):
-    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), "expert", label="last")
+    job = RolloutJob(EnvConfig("fetch", "reach", horizon=8), label="last")
     [one] = evaluate(Engine(1), job, SEEDS[:1], "expert").episodes
     assert set(one.detail["start"]) == {"hand"}
 
@@ -125,7 +124,7 @@ def coins(monkeypatch):
     return make
 
 
-COIN = RolloutJob(ENV, "random", label="last")
+COIN = RolloutJob(ENV, RandomDriver(), label="last")
 
 
 def result(seed: int, success: bool) -> EpisodeResult:

@@ -41,8 +41,6 @@ def _is_alive_in(pid: str, session: int) -> bool:
 
 def _fork_what_would_be_spawned(path: bytes, words: Sequence[Any], handles: Sequence[int]) -> int:
     """`multiprocessing.util.spawnv_passfds` for a `python -c CODE` whose imports are done: seconds are saved."""
-    from manip_il.child_processes import obey_parent
-
     pid = os.fork()
     if pid:
         return pid
@@ -51,7 +49,6 @@ def _fork_what_would_be_spawned(path: bytes, words: Sequence[Any], handles: Sequ
         for handle in (*sorted(handles), os.sysconf("SC_OPEN_MAX")):
             os.closerange(low, handle)
             low = handle + 1
-        obey_parent()
         exec(words[-1], {})
     finally:
         os._exit(0)

@@ -7,25 +7,25 @@ import shutil
 import numpy as np
 import pytest
 
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.data.build import build
-from manip_il.data.journal import JournalKeep, list_episodes
+from manip_il.data.journal import Journal, list_episodes
 from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder
-from manip_il.engine.engine import Engine
-from manip_il.engine.environments import env_fingerprint, env_spec
-from manip_il.engine.jobs import RolloutJob
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
 CUTS = 20
-JOB = RolloutJob(EnvConfig("fetch", "reach"), "expert", hold=1)
+JOB = RolloutJob(EnvConfig("fetch", "reach"), hold=1)
 SEEDS = stream_seeds("demonstrations", 3)
 
 
 @pytest.fixture(scope="module")
 def journals(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded") / "demos.journals"
-    list(Engine().run(JOB, SEEDS, JournalKeep(folder, env_spec(JOB.env), env_fingerprint(JOB.env))))
+    list(Engine().run(JOB, SEEDS, Journal(folder, env_spec(JOB.env), env_fingerprint(JOB.env))))
     return folder
 
 

@@ -15,7 +15,7 @@ from manip_il.cli.outputs import check_same_options
 from manip_il.cli.parsing import dump_yaml, parse
 from manip_il.cli.study_file import check_same_file, keep_file, read_plan
 from manip_il.cli.trials import suite_conditions
-from manip_il.engine.jobs import RolloutJob
+from manip_il.collect.job import RolloutJob
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 from manip_il.evaluation.rounds import Rule
 from manip_il.store.cards import command as command_of_card
@@ -101,7 +101,7 @@ def make_kept(folder: Path) -> None:
 
 
 def _kept(folder: Path):
-    return EpisodeJournal.open(folder, RolloutJob(ENV, "expert", label="last"), "nominal")
+    return EpisodeJournal.open(folder, RolloutJob(ENV, label="last"), "nominal")
 
 
 def _read_kept(folder: Path) -> None:

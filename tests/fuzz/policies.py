@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from manip_il.cli.inputs import check_policy, find_policy
-from manip_il.engine.environments import env_fingerprint, env_spec, policy_sha256
+from manip_il.collect.environments import env_fingerprint, env_spec, policy_sha256
 from manip_il.learn.checkpoint import read_meta
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.pretrained import read_interface

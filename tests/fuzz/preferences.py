@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from manip_il.engine.environments import env_spec
+from manip_il.collect.environments import env_spec
 from manip_il.learn.preference.modeling_preference import write_reward
 from manip_il.learn.preference.network import RewardNetwork, RewardShape, joints_of, ways_of
 from manip_il.learn.reward import LearnedReward

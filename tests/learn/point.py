@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manip_il.engine.vector_env import ActionRange, Lockstep
+from manip_il.algorithms.vector_env import ActionRange, Lockstep
 from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.learn.network import MLPNetwork, Shape, Statistics
 from manip_il.learn.ppo import Learner, lent_generators

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.learn.lerobot_config import policy_class, policy_config, policy_types
 from manip_il.learn.policy import LearnedPolicy
@@ -68,12 +69,16 @@ def test_a_step_that_loads_by_name_runs_only_where_it_is_trusted(act, ran):
 def test_a_worker_trusts_only_what_its_job_does(act, ran):
     add_step(act, EVIL)
     edit_config(act, input_features={"observation.state": {"type": "STATE", "shape": [8]}})
-    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), "policy", policy=act, label="last")
+    job = RolloutJob(EnvConfig("panda", "reach", horizon=8), PolicyDriver((act,)), label="last")
     with pytest.raises(ManipError, match="--trust=true"):
-        list(run_job(pickle.loads(pickle.dumps(job)), [0]))
+        list(pickle.loads(pickle.dumps(job)).run([0]))
     assert ran == []
     with pytest.raises(ManipError) as caught:  # sizes that do not belong together are found after all is allowed
-        list(run_job(pickle.loads(pickle.dumps(dataclasses.replace(job, trust=True))), [0]))
+        list(
+            pickle.loads(
+                pickle.dumps(dataclasses.replace(job, driver=dataclasses.replace(job.driver, trust=True)))
+            ).run([0])
+        )
     assert "--trust" not in str(caught.value)
 
 

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.evaluation.results import EpisodeResult
 from manip_il.evaluation.runner import episode_result
 from manip_il.mdp import Episode
@@ -86,7 +87,7 @@ class Trial:
         self, policy: Path, on_episode: Callable[[Episode], None] = lambda episode: None
     ) -> tuple[EpisodeResult, ...]:
         """By this project's own evaluation."""
-        job = RolloutJob(self.env, "policy", policy, cameras=self.cameras)
+        job = RolloutJob(self.env, PolicyDriver((policy,)), cameras=self.cameras)
         found: dict[int, EpisodeResult] = {}
         with Engine(workers=1) as engine:
             for episode in engine.run(job, self.seeds):

@@ -14,10 +14,10 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import Writer
 
+from manip_il.data import foxglove
 from manip_il.data import schema as s
+from manip_il.data.mcap_records import Budget, chunk_records
 from manip_il.errors import ManipError
-from manip_il.mcap import foxglove
-from manip_il.mcap.records import Budget, chunk_records
 from manip_il.mdp import Episode
 
 from .use import decoded

@@ -17,18 +17,17 @@ import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.records import Attachment, McapRecord, Metadata
 
-from manip_il.data import journal
+from manip_il.collect.record import _read_or_set_aside
+from manip_il.data import journal, mcap_records
 from manip_il.data import schema as s
+from manip_il.data.foxglove import IMAGE_TOPICS
+from manip_il.data.mcap_records import LARGEST_CHUNK, LARGEST_NOTE
 from manip_il.doctor.leftovers import count_readable
 from manip_il.errors import ManipError
 from manip_il.mcap import read as mcap_read
-from manip_il.mcap import records as mcap_records
-from manip_il.mcap.foxglove import IMAGE_TOPICS
 from manip_il.mcap.importing import read_import
 from manip_il.mcap.mapping import Mapping
-from manip_il.mcap.records import LARGEST_CHUNK, LARGEST_NOTE
 from manip_il.mdp import Episode
-from manip_il.recording import _read_or_set_aside
 
 from ..pictures import numbered_episodes, with_cameras
 from ..synthetic import MakeEpisode

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
+from manip_il.data.foxglove import NANOSECONDS
 from manip_il.data.journal import write_episode
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
-from manip_il.mcap.foxglove import NANOSECONDS
 from manip_il.mcap.importing import features_of, frame_times, frames_of, list_files, pick, read_import
 from manip_il.mcap.mapping import Method
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.job import RolloutJob
 from manip_il.errors import ManipError
 from manip_il.robots.gripper import sweep
 from manip_il.robots.ik import ArmIK
@@ -113,7 +113,7 @@ def test_a_mistake_is_one_line(mistake: str, tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["reach", "pick_place"])
 def test_the_expert_drives_an_arm_of_a_short_yaml(path: Path, task: str):
-    episodes = list(run_job(RolloutJob(EnvConfig(str(path), task), "expert"), SEEDS))
+    episodes = list(RolloutJob(EnvConfig(str(path), task)).run(SEEDS))
     assert all(episode.success for episode in episodes)
 
 
@@ -135,5 +135,5 @@ def test_an_example_says_little_and_is_found_whole(example: Path):
 @pytest.mark.parametrize("name", ["ur5e", "xarm7"])
 def test_the_expert_stacks_with_fingers_on_a_linkage(name: str):
     example = next(path for path in EXAMPLES if path.stem == name)
-    episodes = list(run_job(RolloutJob(EnvConfig(str(example), "stack"), "expert"), SEEDS))
+    episodes = list(RolloutJob(EnvConfig(str(example), "stack")).run(SEEDS))
     assert all(episode.success for episode in episodes)

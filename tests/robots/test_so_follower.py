@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.collect.environments import env_actions, env_spec
 from manip_il.data.schema import ACTION, LEROBOT_TYPES, SERVOS, STATE, features
-from manip_il.engine.environments import env_actions, env_spec
 from manip_il.errors import ManipError
 from manip_il.lerobot_plugin import ManipILEnv
 from manip_il.robots.robot import ROBOTS, get_robot

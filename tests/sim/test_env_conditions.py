@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
 

@@ -6,8 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from manip_il.engine.environments import env_actions, env_spec, positions
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver, RandomDriver
+from manip_il.collect.environments import env_actions, env_spec, positions
+from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
@@ -75,7 +76,7 @@ def test_a_state_of_another_task_is_refused():
 
 @every_stock
 def test_an_episode_is_50_steps_at_a_cost_of_1_outside_of_5_cm(task: str):
-    [episode] = run_job(RolloutJob(config(task), "expert"), stream_seeds("training", 1))
+    [episode] = RolloutJob(config(task)).run(stream_seeds("training", 1))
     solved, rewards = episode.columns["next.success"].ravel(), episode.columns["next.reward"].ravel()
     assert len(episode) == HORIZON
     assert np.array_equal(rewards, np.where(solved, 0.0, -1.0))
@@ -128,24 +129,26 @@ def test_other_settings_are_refused(settings: dict, words: str):
 def test_cameras_and_disturbances_are_refused():
     own = config("FetchReach-v4")
     with pytest.raises(UsageError, match="no cameras"):
-        next(run_job(RolloutJob(own, "expert", cameras=CameraConfig(("front",))), [0]))
+        next(RolloutJob(own, cameras=CameraConfig(("front",))).run([0]))
     with pytest.raises(UsageError, match="takes no standard"):
-        next(run_job(RolloutJob(own, "expert", conditions=(STANDARD,)), [0]))
-    assert next(run_job(RolloutJob(own, "expert", conditions=(Condition(),)), [0])).success
+        next(RolloutJob(own, conditions=(STANDARD,)).run([0]))
+    assert next(RolloutJob(own, conditions=(Condition(),)).run([0])).success
 
 
 def test_a_drawn_action_is_within_the_bounds():
-    [episode] = run_job(RolloutJob(config("FetchReach-v4"), "random"), [3])
+    [episode] = RolloutJob(config("FetchReach-v4"), RandomDriver()).run([3])
     executed = episode.columns["executed_action"]
     assert np.abs(executed).max() <= 1
     assert executed.std() > 0.4
 
 
-@pytest.mark.parametrize("driver", ["expert", "noisy_expert"])
-def test_branches_begin_in_the_states_of_the_path(driver: str):
-    noise = tuple(map(tuple, 0.01 * np.eye(4)))
-    job = RolloutJob(config("FetchReach-v4"), driver, noise=noise, label="branch", branch_steps=3, hold=3)
-    [episode] = run_job(job, [1])
+NOISE = tuple(map(tuple, 0.01 * np.eye(4)))
+
+
+@pytest.mark.parametrize("driver", [ExpertDriver(), NoisyExpertDriver(NOISE)])
+def test_branches_begin_in_the_states_of_the_path(driver: Driver):
+    job = RolloutJob(config("FetchReach-v4"), driver, label="branch", branch_steps=3, hold=3)
+    [episode] = job.run([1])
     done = np.flatnonzero(episode.columns["next.done"].ravel())
     path = done[0] + 1
     states = episode.columns["sim_state"]
@@ -165,6 +168,6 @@ def test_actions_that_are_no_joint_targets_are_learnt_as_they_are():
     [("FetchReach-v4", -2, 0), ("FetchPush-v4", -12, 2), ("FetchPickAndPlace-v4", -10, 0)],
 )
 def test_the_expert_is_fast(task: str, least: float, failures: int):
-    episodes = list(run_job(RolloutJob(config(task), "expert", label="last"), stream_seeds("training", 40)))
+    episodes = list(RolloutJob(config(task), label="last").run(stream_seeds("training", 40)))
     assert sum(not episode.success_at_end for episode in episodes) <= failures
     assert np.mean([episode.columns["next.reward"].sum() for episode in episodes]) > least

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.engine.redraw import _Redrawer
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
+from manip_il.collect.redraw import _Redrawer
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, EnvConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.tasks.drawer import CABINET, OBJECT
 from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS

@@ -14,12 +14,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from manip_il.collect import environments
+from manip_il.collect.environments import env_fingerprint, env_spec, positions
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
-from manip_il.engine import environments, simulations
-from manip_il.engine.environments import env_fingerprint, env_spec, positions
-from manip_il.engine.jobs import RolloutJob, run_job
 from manip_il.errors import UnknownName, UsageError
-from manip_il.expert import Expert
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -102,7 +102,7 @@ def test_every_rung_of_the_ladder_occurs(task: str):
     seen = set[str]()
     for driver, conditions, horizon in (("expert", (), 0), ("expert", (STANDARD,), 120), ("random", (), 45)):
         job = RolloutJob(EnvConfig("panda", task, horizon=horizon), driver, hold=2, conditions=conditions)
-        for episode in run_job(job, SEEDS):
+        for episode in job.run(SEEDS):
             seen |= {phases(TASKS[task])[phase] for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())}
     missing = {rung.name for rung in TASKS[task].rungs} - seen
     assert missing <= RARE.get(task, set())
@@ -208,7 +208,7 @@ def test_the_fingerprint_changes_with_the_model(robot: str, task: str, change: s
     before = env_fingerprint(config)
     model = copy.copy(scene.model)
     CHANGES[change](model)
-    monkeypatch.setattr(simulations, "build_scene", lambda *_: replace(scene, model=model))
+    monkeypatch.setattr(environments, "build_scene", lambda *_: replace(scene, model=model))
     after = environments._fingerprint.__wrapped__(config)  # pyright: ignore[reportFunctionMemberAccess]
     assert {key for key in before if before[key] != after[key]} == {"model_sha256"}
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.engine.jobs import RolloutJob, run_job
+from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
@@ -145,5 +145,5 @@ def test_starts_lie_and_stand_where_the_shape_has_it_and_at_any_yaw(shape: str, 
 )
 @pytest.mark.parametrize("task", ["pick_place", "lift"])
 def test_the_expert_brings_any_shape_to_its_goal(task: str, shape: str):
-    job = RolloutJob(EnvConfig(task=task, object=shape), "expert", hold=0)
-    assert all(episode.success for episode in run_job(job, stream_seeds("certificate", 3)))
+    job = RolloutJob(EnvConfig(task=task, object=shape), hold=0)
+    assert all(episode.success for episode in job.run(stream_seeds("certificate", 3)))

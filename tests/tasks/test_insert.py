@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
 from manip_il.robots.rotations import hand_down
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import ManipEnv

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manip_il.engine.environments import env_fingerprint
+from manip_il.collect.environments import env_fingerprint
 from manip_il.errors import UsageError
 from manip_il.sim.config import EnvConfig
 from manip_il.tasks.reward import FEATURES, TASTES, Reward

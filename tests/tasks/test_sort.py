@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from manip_il.engine.jobs import RolloutJob, run_job
-from manip_il.expert import Expert
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
 from manip_il.mdp import State
 from manip_il.sim.config import EnvConfig
 from manip_il.sim.env import ManipEnv, environment_state_names
@@ -60,7 +60,7 @@ def test_a_restored_state_says_the_same_in_words_and_numbers():
 @every_large_robot
 def test_an_episodes_text_is_that_of_its_state(robot: str):
     world = started(robot, "sort").world
-    for episode in run_job(RolloutJob(EnvConfig(robot, "sort", horizon=6), "expert"), STARTS[:3]):
+    for episode in RolloutJob(EnvConfig(robot, "sort", horizon=6)).run(STARTS[:3]):
         state = State.from_vector(episode.columns["sim_state"][-1])
         world.restore(state.physics, state.variation)
         assert episode.instruction == instruction_in(TASKS["sort"], world)

@@ -6,17 +6,16 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from manip_il.child_processes import bound_to_this_process, initialize_worker
+from manip_il.child_processes import open_pool
+from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
-from manip_il.engine.engine import Engine
 from manip_il.errors import RenderError, UsageError
 from manip_il.evaluation.episodes import EpisodeResult
 from manip_il.evaluation.robot_check.episodes import ExpertFacts, expert_facts
@@ -132,15 +131,11 @@ def _reach_under_way(robot: Robot) -> Generator[None]:
     if kept_reach(robot) is not None:
         yield
         return
-    with bound_to_this_process(), _pool() as pool:
+    with open_pool(_PROCESSES) as pool:
         parts = [pool.submit(errors_at, robot, part, _PROCESSES) for part in range(_PROCESSES)]
         yield
         with contextlib.suppress(BrokenExecutor):  # one was killed: then it is worked out here
             keep_reach(robot, joined(robot, [part.result() for part in parts]))
-
-
-def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(_PROCESSES, get_context("spawn"), initializer=initialize_worker)
 
 
 def _pictures(name: str) -> tuple[tuple[Look, ...], str]:

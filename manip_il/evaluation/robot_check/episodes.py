@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from manip_il.engine.engine import Engine
-from manip_il.engine.jobs import RolloutJob
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.workers import Engine
 from manip_il.evaluation.episodes import EpisodeResult
 from manip_il.evaluation.intervals import Proportion
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -31,6 +31,6 @@ def expert_facts(
     on_result: Callable[[EpisodeResult], object],
 ) -> ExpertFacts:
     """Run the expert on seeds under a condition."""
-    job = RolloutJob(EnvConfig(robot, task), "expert", hold=HOLD, label="last", conditions=(condition,))
+    job = RolloutJob(EnvConfig(robot, task), hold=HOLD, label="last", conditions=(condition,))
     result = evaluate(engine, job, seeds, "expert", on_result, suite=condition.name)
     return ExpertFacts(result.success, result.failures)

@@ -1,0 +1,191 @@
+"""Who drives a rollout: the expert, an expert with noise, a policy, a mixture of policy and expert, or chance.
+
+A driver is a small picklable object that a job carries to its worker. There `start` makes it act: it returns a function
+from the turns of a step to each turn's action (n,) and who chose it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.collect.rollout import Act, Turn
+from manip_il.mdp import Actor, Policy, ReadsInstructions
+from manip_il.robots.action_space import ActionSpace
+from manip_il.seeding import rng_for
+
+F32, F64 = NDArray[np.float32], NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Circumstances of a driver or a query rule.
+
+    actions: of the robot. horizon: control steps of an episode. policies: those that the driver names, loaded.
+    """
+
+    actions: ActionSpace
+    horizon: int
+    policies: Sequence[Any] = ()
+
+
+class Driver:
+    """Base of all drivers. They must pickle.
+
+    beta: the expert's share of the steps. policies: checkpoints that it needs, `pretrained_model` folders; the first
+    one drives.
+    """
+
+    kind: ClassVar[str]
+    beta: float = 0.0
+    policies: tuple[Path, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name in datasets."""
+        return self.kind
+
+    def start(self, setting: Setting) -> Act:
+        """Return the driver at work, for the episodes of one process."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class ExpertDriver(Driver):
+    """Executes the expert's label."""
+
+    kind = "expert"
+    beta = 1.0
+
+    @override
+    def start(self, setting: Setting) -> Act:
+        """Return the driver at work."""
+        return expert_actions
+
+
+@dataclass(frozen=True)
+class NoisyExpertDriver(Driver):
+    """Executes the label with Gaussian noise: DART (Laskey et al. 2017). covariance: (n, n), of actions."""
+
+    covariance: tuple[tuple[float, ...], ...]
+    kind = "noisy_expert"
+    beta = 1.0
+
+    @override
+    def start(self, setting: Setting) -> Act:
+        """Return the driver at work; every episode has its own generator."""
+        covariance, rngs = np.asarray(self.covariance), Generators("dart")
+        mean = np.zeros(len(covariance))
+
+        def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+            noise = [rngs[turn.seed].multivariate_normal(mean, covariance) for turn in turns]
+            return [(turn.query().action + one, Actor.NOISY_EXPERT) for turn, one in zip(turns, noise, strict=True)]
+
+        return act
+
+
+@dataclass(frozen=True)
+class RandomDriver(Driver):
+    """Joint targets drawn evenly within the longest step of the measured joints, any gripper opening."""
+
+    kind = "random"
+
+    @override
+    def start(self, setting: Setting) -> Act:
+        """Return the driver at work; every episode has its own generator."""
+        draw, rngs = setting.actions.random_near, Generators("random policy")
+
+        def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+            return [(draw(turn.observation.state, rngs[turn.seed]), Actor.LEARNER) for turn in turns]
+
+        return act
+
+
+@dataclass(frozen=True)
+class PolicyDriver(Driver):
+    """Executes a policy's action, and with probability beta the expert's: pi_i = beta pi* + (1 - beta) pi_hat.
+
+    policies: the first drives, the others answer with it where a query wants their disagreement. trust: whether models
+    that the checkpoints name may be loaded. (Ross et al. 2011)
+    """
+
+    kind = "policy"
+    policies: tuple[Path, ...] = ()
+    beta: float = 0.0
+    trust: bool = False
+
+    @property
+    @override
+    def name(self) -> str:
+        """Name in datasets."""
+        return "mixture" if self.beta > 0 else "policy"
+
+    @override
+    def start(self, setting: Setting) -> Act:
+        """Return the driver at work."""
+        learner = learner_actions(setting.policies[0])
+        return mixture(learner, self.beta) if self.beta > 0 else learner
+
+
+def driver_of(name: str | None) -> Driver:
+    """Return the driver without a policy that is called `expert` or `random`; the expert for None."""
+    return RandomDriver() if name == "random" else ExpertDriver()
+
+
+def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+    """Return the expert's label (n,) of every turn."""
+    return [(turn.query().action, Actor.EXPERT) for turn in turns]
+
+
+def learner_actions(policy: Policy) -> Act:
+    """Return a driver that executes a policy's actions, one call a step for all episodes."""
+    return lambda turns: [(action, Actor.LEARNER) for action in policy_actions(policy, turns)]
+
+
+def mixture(learner: Act, beta: float) -> Act:
+    """Return a driver whose every step is the expert's with probability beta, by each episode's own generator."""
+    rngs = Generators("mixture")
+
+    def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+        actions = learner(turns)
+        for i, turn in enumerate(turns):
+            if rngs[turn.seed].uniform() < beta:
+                actions[i] = (turn.query().action, Actor.EXPERT)
+        return actions
+
+    return act
+
+
+def policy_actions(policy: Policy, turns: Sequence[Turn]) -> F64:
+    """Return a policy's action in every turn, (B, n); one with a memory begins anew where an episode does."""
+    if started := [turn.seed for turn in turns if turn.step == 0]:
+        policy.reset(started)
+        if isinstance(policy, ReadsInstructions):
+            policy.instruct({turn.seed: turn.observation.instruction for turn in turns if turn.step == 0})
+    return policy.act(*observations(turns, policy.cameras), [turn.seed for turn in turns])
+
+
+def observations(turns: Sequence[Turn], cameras: Sequence[str]) -> tuple[F32, F32, dict[str, NDArray[np.uint8]]]:
+    """Return the turns' observations as a policy takes them: (B, n), (B, k), camera -> (B, H, W, 3)."""
+    seen = [turn.observation for turn in turns]
+    return (
+        np.stack([one.state for one in seen]),
+        np.stack([one.environment_state for one in seen]),
+        {camera: np.stack([one.images[camera] for one in seen]) for camera in cameras},
+    )
+
+
+class Generators(dict[int, np.random.Generator]):
+    """A random generator for every episode, by its seed."""
+
+    def __init__(self, stream: str):
+        super().__init__()
+        self._stream = stream
+
+    def __missing__(self, seed: int) -> np.random.Generator:
+        return self.setdefault(seed, rng_for(seed, self._stream))

@@ -1,0 +1,169 @@
+"""One rollout job: all that a worker must know to turn seeds into episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver, Setting
+from manip_il.collect.environments import env_actions, env_spec, make_env, make_expert, policy_cameras, shares_models
+from manip_il.collect.query import Every, LabelMode, Query, branches, cut_at_takeover, gate_of, labelled
+from manip_il.collect.rollout import Act, Environment, Labeller, Rules, rollout
+from manip_il.data.episodes import group_rollouts, to_episode
+from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.pretrained import check_interface
+from manip_il.mdp import Episode, Transition
+from manip_il.sim.conditions import Condition, draw
+from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.scene import SCENES_KEPT
+from manip_il.sim.shape import draws_shape
+
+if TYPE_CHECKING:  # torch only where a learner drives
+    from manip_il.learn.policy import LearnedPolicy
+
+LOCKSTEP = 25  # environments that share one call of the policy
+OWN_MODELS = 8  # at most so many where each needs a model of its own, which is 26 MB for the Panda
+
+
+@dataclass(frozen=True)
+class RolloutJob:
+    """Driver and environment of rollouts, their length, and what is kept of them.
+
+    hold: end an episode this many steps after success; None: at the horizon. patience: end it after this many steps
+    without progress. label: what the expert gives in the states that `query` selects. branch_steps: of a branch.
+    conditions: what episodes differ in from the nominal world, in turn by their seeds. batch: episodes that share one
+    call of the policy, at most; it changes no outcome. cameras: what is pictured in every step and kept; None for
+    nothing. A policy that looks at cameras gets their pictures all the same.
+    """
+
+    env: EnvConfig
+    driver: Driver = ExpertDriver()  # noqa: RUF009  # frozen
+    hold: int | None = None
+    patience: int | None = None
+    label: LabelMode = "per_state"
+    query: Query = field(default_factory=Every)
+    branch_steps: int = 1
+    conditions: tuple[Condition, ...] = ()
+    batch: int = LOCKSTEP
+    round: int = 0
+    cameras: CameraConfig | None = None
+
+    def __post_init__(self) -> None:
+        if self.label == "takeover" and self.driver.name != "policy":
+            raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver.name!r}")
+        if self.batch < 1:
+            raise UsageError(f"batch is {self.batch}; expected at least 1")
+        if self.branch_steps < 1:
+            raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
+
+    @property
+    def policy(self) -> Path | None:
+        """The checkpoint that drives, its `pretrained_model` folder."""
+        return next(iter(self.driver.policies), None)
+
+    @property
+    def learned(self) -> bool:
+        """Whether a policy drives."""
+        return self.policy is not None
+
+    @property
+    def files(self) -> Path | None:
+        """A folder that workers on other machines need a copy of."""
+        return self.policy
+
+    def with_files(self, files: Path) -> RolloutJob:
+        """Return the same where its folder has been copied to."""
+        assert isinstance(self.driver, PolicyDriver)
+        return replace(self, driver=replace(self.driver, policies=(files, *self.driver.policies[1:])))
+
+    @property
+    def labels_all(self) -> bool:
+        """Whether every state gets its label, whoever drives."""
+        return self.label == "per_state" and isinstance(self.query, Every)
+
+    def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
+        """Yield one episode a seed, in the order in which they end."""
+        if not seeds:
+            return
+        cameras = observed_cameras(self)
+        envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(lockstep(self), len(seeds)))]
+        steps = run_steps(self, envs, seeds)
+        if self.cameras is None and cameras is not None:
+            steps = map(_without_pictures, steps)
+        branch_env = make_env(self.env, self.cameras) if self.label == "branch" else None
+        for frames in group_rollouts(steps):
+            drawn = draw(self.conditions, frames[0].seed, self.env.object).values
+            yield replace(_to_episode(self, frames, _expert(self.env), branch_env), drawn=drawn)
+
+
+def run_steps(
+    job: RolloutJob, envs: Sequence[Environment], seeds: Iterable[int], act: Act | None = None
+) -> Iterator[Transition]:
+    """Yield every step of a job's episodes as it happens in these environments. act: in place of the job's driver."""
+    policies = tuple(_load(job, path, envs[0]) for path in job.driver.policies)
+    setting = Setting(env_actions(job.env), job.env.horizon, policies)
+    takeover = job.label == "takeover"
+    horizon = (2 if takeover else 1) * job.env.horizon  # one for the learner, and one for the expert
+    rules = Rules(horizon, job.hold, job.patience, takeover)
+    gate = gate_of(job.label, job.query, setting)
+    return rollout(envs, seeds, act or job.driver.start(setting), rules, _expert(job.env), gate)
+
+
+def lockstep(job: RolloutJob) -> int:
+    """Return how many environments of a job run in lockstep in one process."""
+    if job.policy is None:
+        return 1  # alone, an environment has the processor's cache
+    varies = draws_shape(job.env.object) or any(one.changes_model() for one in job.conditions)
+    return job.batch if shares_models(job.env) and not varies else min(job.batch, OWN_MODELS)
+
+
+def observed_cameras(job: RolloutJob) -> CameraConfig | None:
+    """Return the cameras of a job's environments: those that are recorded, else those that its policy looks at.
+
+    Raises `MismatchError` if the policy would not find its pictures among the recorded ones.
+    """
+    wanted = policy_cameras(job.policy) if job.policy is not None else None
+    if wanted is None or job.cameras is None:
+        return job.cameras or wanted
+    if not set(wanted.names) <= set(job.cameras.names):
+        raise MismatchError("cameras", str(job.policy), wanted.names, "the recording", job.cameras.names)
+    if wanted.size != job.cameras.size:
+        raise MismatchError("size of pictures", str(job.policy), wanted.size, "the recording", job.cameras.size)
+    return job.cameras
+
+
+def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
+    from manip_il.learn.policy import LearnedPolicy
+
+    trust = isinstance(job.driver, PolicyDriver) and job.driver.trust
+    policy = LearnedPolicy.load(path, task=env.task_description, trust=trust)
+    check_interface(policy.interface, env_spec(job.env, observed_cameras(job)))
+    return policy
+
+
+def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: Environment | None) -> Episode:
+    """An episode's frames as columns, with what the expert gives as `job.label` has it."""
+    beta = job.driver.beta
+    if job.label == "last":
+        return to_episode(frames, job.round, beta, labelled=False)
+    if job.label == "takeover":
+        return to_episode(cut_at_takeover(frames, job.env.horizon), job.round, beta)
+    frames = labelled(frames, job.query, expert)
+    if branch_env is None:
+        return to_episode(frames, job.round, beta)
+    path = [replace(frame, label=None) for frame in frames]
+    found = branches(branch_env, expert, frames, job.branch_steps)
+    return to_episode([*path, *found], job.round, beta, path=len(path))
+
+
+def _without_pictures(transition: Transition) -> Transition:
+    final = replace(transition.final, images={}, keypoints={}) if transition.final else None
+    return replace(transition, observation=replace(transition.observation, images={}, keypoints={}), final=final)
+
+
+@lru_cache(SCENES_KEPT)
+def _expert(config: EnvConfig) -> Labeller:
+    return make_expert(config)

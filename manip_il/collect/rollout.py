@@ -1,0 +1,245 @@
+"""The one loop that steps environments, as a generator of transitions.
+
+Environments run in lockstep, so that a learner acts in all of them in one batch. Recording, labelling and evaluation
+consume what it yields and are no branches inside it. The expert is queried in one place, `_choose`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.errors import ManipError
+from manip_il.mdp import Actor, Label, Observation, State, Transition
+
+F64 = NDArray[np.float64]
+GROWTH = 0.01  # of the share of a task that is done: less is no progress
+
+
+class Environment(Protocol):
+    """Interface of an environment."""
+
+    @property
+    def task_description(self) -> str:
+        """Instruction of the episode, for policies that read language."""
+        ...
+
+    @property
+    def solved(self) -> bool:
+        """Whether the task is solved now."""
+        ...
+
+    @property
+    def reward(self) -> float:
+        """Reward of the last control step."""
+        ...
+
+    @property
+    def progress(self) -> float:
+        """Share of the task that is done, 0 to 1."""
+        ...
+
+    @property
+    def world(self) -> object | None:
+        """Physics in the present state, which a labeller of the same scene may read; None if there is none."""
+        ...
+
+    def start(self, seed: int) -> None:
+        """Begin the episode of a seed."""
+        ...
+
+    def begin_step(self) -> None:
+        """Apply what disturbs the world before a control step; called before its state is read."""
+        ...
+
+    def advance(self, action: F64) -> F64:
+        """Apply an action (n,) for one control step; returns it as it reached the robot."""
+        ...
+
+    def observe(self) -> Observation:
+        """Return what a learner observes now."""
+        ...
+
+    def get_state(self) -> State:
+        """Return everything that the future depends on."""
+        ...
+
+    def set_state(self, state: State) -> None:
+        """Restore a state."""
+        ...
+
+
+class Labeller(Protocol):
+    """Interface of the expert."""
+
+    def label(self, state: State, world: object | None = None) -> Label:
+        """Return the expert's action in `state`. world: one that is in it, so that nothing need be restored."""
+        ...
+
+
+@dataclass(slots=True)
+class Turn:
+    """One running episode at one step, as a driver sees it. `label` is None where the expert was not queried.
+
+    world: in this state for as long as the turn lasts, where the environment has one.
+    """
+
+    seed: int
+    step: int
+    observation: Observation
+    state: State
+    labeller: Labeller | None = None
+    label: Label | None = None
+    progress: float = 0.0
+    world: object | None = None
+
+    def query(self) -> Label:
+        """Return the expert's label of this state and keep it. Raises `ManipError` where there is no expert."""
+        if self.label is None:
+            self.label = self.peek()
+        return self.label
+
+    def peek(self) -> Label:
+        """Return the expert's label of this state without keeping it."""
+        if self.labeller is None:
+            raise ManipError(f"episode {self.seed}: nobody to ask for a label at step {self.step}")
+        return self.labeller.label(self.state, self.world)
+
+
+Act = Callable[[Sequence[Turn]], list[tuple[F64, Actor]]]
+"""A driver at work: returns an action (n,) and who chose it, for every turn of a step."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Rules of an episode.
+
+    horizon: control steps at most. hold: go on for this many steps once solved, then end; None: to the horizon.
+    patience: end it after this many steps without progress, too. takeover: once queried, the expert drives to the end.
+    """
+
+    horizon: int
+    hold: int | None = None
+    patience: int | None = None
+    takeover: bool = False
+
+
+@dataclass(slots=True)
+class _Slot:
+    env: Environment
+    seed: int
+    step: int = 0
+    held: int = 0
+    best: float = -math.inf
+    since: int = 0
+    taken_over: bool = False
+    turn: Turn = field(init=False)
+    chosen: tuple[F64, Actor] = field(init=False)
+
+    def is_stuck(self, patience: int) -> bool:
+        """Return whether progress has grown by no `GROWTH` for so many steps."""
+        if self.turn.progress >= self.best + GROWTH:
+            self.best, self.since = self.turn.progress, self.step
+        return self.step - self.since >= patience
+
+
+def rollout(
+    envs: Sequence[Environment],
+    seeds: Iterable[int],
+    act: Act,
+    rules: Rules,
+    labeller: Labeller | None = None,
+    gate: Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]] | None = None,
+    *,
+    first: State | None = None,
+) -> Iterator[Transition]:
+    """Run one episode per seed, `len(envs)` at a time; yields every step's transition as it happens.
+
+    An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on its neighbours.
+    gate: whether the labeller is queried in each turn, given the actions (n,) that would be executed. first: the state in
+    which every episode begins, in place of its seed's.
+    """
+    waiting = iter(seeds)
+    running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
+    while running:
+        for slot in running:
+            _begin_step(slot, labeller)
+        _choose(running, act, gate, rules.takeover)
+        still: list[_Slot] = []
+        for slot in running:
+            transition = _advance(slot, rules)
+            yield transition
+            following = _next_episode(slot.env, waiting, first) if transition.done else slot
+            if following is not None:
+                still.append(following)
+        running = still
+
+
+def _next_episode(env: Environment, seeds: Iterator[int], first: State | None) -> _Slot | None:
+    seed = next(seeds, None)
+    if seed is None:
+        return None
+    if first is None:
+        env.start(seed)
+    else:
+        env.set_state(first)
+    return _Slot(env, seed)
+
+
+def _begin_step(slot: _Slot, labeller: Labeller | None) -> None:
+    env = slot.env
+    env.begin_step()
+    seen, state = env.observe(), env.get_state()
+    slot.turn = Turn(slot.seed, slot.step, seen, state, labeller, progress=env.progress, world=env.world)
+
+
+def _choose(
+    running: Sequence[_Slot],
+    act: Act,
+    gate: Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]] | None,
+    takeover: bool,
+) -> None:
+    """Choose every episode's action and, where the gate says so, query the expert."""
+    led = [slot for slot in running if not slot.taken_over]
+    turns = [slot.turn for slot in led]
+    chosen = act(turns) if led else []
+    wanted = gate(turns, [action for action, _ in chosen]) if led and gate else [False] * len(led)
+    for slot, choice, wants in zip(led, chosen, wanted, strict=True):
+        slot.chosen = choice
+        if wants:
+            slot.turn.query()
+            slot.taken_over = takeover
+    for slot in running:
+        if slot.taken_over:
+            slot.chosen = slot.turn.query().action, Actor.EXPERT
+
+
+def _advance(slot: _Slot, rules: Rules) -> Transition:
+    action, actor = slot.chosen
+    executed = slot.env.advance(action)
+    if actor == Actor.EXPERT and executed is not action:
+        actor = Actor.NOISY_EXPERT
+    slot.step += 1
+    solved = slot.env.solved
+    slot.held += slot.held > 0 or solved
+    done = slot.step >= rules.horizon or (rules.hold is not None and slot.held > rules.hold)
+    done |= rules.patience is not None and not slot.held and slot.is_stuck(rules.patience)
+    return Transition(
+        seed=slot.seed,
+        step=slot.step - 1,
+        state=slot.turn.state,
+        observation=slot.turn.observation,
+        label=slot.turn.label,
+        executed_action=executed,
+        actor=actor,
+        reward=slot.env.reward,
+        success=solved,
+        done=done,
+        progress=slot.turn.progress,
+        final=slot.env.observe() if done else None,
+    )

@@ -1,0 +1,251 @@
+"""Runs rollout jobs: in this process, in processes of this machine, or on a Ray cluster.
+
+Each seed of a job gives one episode, the same one wherever and however often it runs. So a worker that dies costs
+nothing but time: what it had not finished runs again, each seed alone, so that the one that kills its worker is known.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Protocol
+
+from manip_il.child_processes import kill_pool, open_pool, start_server
+from manip_il.data.journal import Journal
+from manip_il.errors import ManipError, UsageError
+from manip_il.mdp import Episode
+from manip_il.sim.config import CameraConfig, EnvConfig
+
+MAX_DEATHS = 3  # of workers that one seed may cost before it is left out
+Backend = Literal["local", "ray"]
+Seeds = tuple[int, ...]
+Answer = list[tuple[Episode, bytes | None]]
+"""Episodes without pictures, each with its journal if that is still to be stored."""
+_EVERY_JOB, _LEARNED_JOB = ("manip_il.collect.job",), ("manip_il.collect.job", "manip_il.learn.policy")
+
+
+class Job(Protocol):
+    """Work that makes episodes of seeds; must pickle, and depend on nothing else."""
+
+    @property
+    def env(self) -> EnvConfig:
+        """Environment of its episodes."""
+        ...
+
+    @property
+    def cameras(self) -> CameraConfig | None:
+        """Cameras whose pictures its episodes have."""
+        ...
+
+    @property
+    def learned(self) -> bool:
+        """Whether it needs a policy, which takes torch and memory."""
+        ...
+
+    @property
+    def batch(self) -> int:
+        """Seeds that are run together at most, where it is learned."""
+        ...
+
+    @property
+    def files(self) -> Path | None:
+        """A folder that workers on other machines need a copy of."""
+        ...
+
+    def with_files(self, files: Path) -> Job:
+        """Return the same where its folder has been copied to."""
+        ...
+
+    def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
+        """Yield one episode a seed, in the order in which they end."""
+        ...
+
+
+class Workers(Protocol):
+    """Workers of one backend."""
+
+    @property
+    def died(self) -> tuple[type[BaseException], ...]:
+        """Errors of a future whose worker died."""
+        ...
+
+    @property
+    def count(self) -> int:
+        """Tasks that run at once."""
+        ...
+
+    def submit(self, job: Job, seeds: Seeds, journal: Journal | None) -> Future[Answer]:
+        """Start some seeds of a job."""
+        ...
+
+    def close(self, in_order: bool) -> None:
+        """End all workers; those still at work are killed unless all is `in_order`."""
+        ...
+
+
+class Engine:
+    """Runs rollout jobs; use as a context manager. Workers live as long as the engine.
+
+    workers: processes, 1 for this one alone; on Ray the tasks that run at once; None for one a core. Seeds that were
+    left out, as each of them killed its worker three times, are in `given_up`.
+    """
+
+    def __init__(self, workers: int | None = 1, backend: Backend = "local"):
+        if workers is not None and workers < 1:
+            raise UsageError(f"workers is {workers}; expected at least 1")
+        self.workers = default_workers() if workers is None and backend == "local" else workers
+        self.given_up: list[int] = []
+        self._backend: Backend = backend
+        self._pool: Workers | None = None
+
+    def run(self, job: Job, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+        """Yield one episode a seed as they end, in no fixed order, each once it is in the journal.
+
+        Pictures stay in the process that made them: episodes from another one come without. Raises what the work
+        raises, and `ManipError` if workers die without one episode getting done.
+        """
+        wanted = [seed for seed in seeds if seed not in self.given_up]
+        if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
+            yield from job.run(wanted) if journal is None else _stored(job.run(wanted), journal)
+            return
+        pool = self._pool = self._pool or _open_workers(self._backend, self.workers)
+        try:
+            for answer in self._answers(pool, job, wanted, journal):
+                for episode, packed in answer:
+                    if packed is not None and journal is not None:
+                        journal.store(episode.seed, packed)
+                    yield episode
+        except BaseException:
+            self._close(in_order=False)  # nobody takes the episodes that still run
+            raise
+
+    def warm_up(self, learned: bool) -> None:
+        """Begin to start what workers need, and return at once. learned: whether policies will drive."""
+        if self._backend == "local" and self.workers != 1:
+            start_server(_LEARNED_JOB if learned else _EVERY_JOB)
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close(in_order=kind is None)
+
+    def _close(self, in_order: bool) -> None:
+        if self._pool is not None:
+            self._pool.close(in_order)
+            self._pool = None
+
+    def _answers(self, pool: Workers, job: Job, seeds: Sequence[int], journal: Journal | None) -> Iterator[Answer]:
+        """Yield what tasks answer; those whose worker died run again, seed by seed, with no other beside."""
+        tasks, alone = split(job, seeds, pool.count), deque[Seeds]()
+        running: dict[Future[Answer], Seeds] = {}
+        deaths: Counter[int] = Counter()
+        in_a_row = 0
+        while tasks or alone or running:
+            while (alone and not running) or (tasks and not alone and len(running) < pool.count):
+                task = alone.popleft() if alone else tasks.popleft()
+                running[pool.submit(job, task, journal)] = task
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                task = running.pop(future)
+                try:
+                    answer = future.result()
+                except pool.died as death:
+                    in_a_row += 1
+                    if in_a_row > MAX_DEATHS * (pool.count + 1):
+                        raise ManipError(
+                            f"{in_a_row} rollout workers died one after the other ({death}); out of memory? Finished "
+                            "episodes are kept"
+                        ) from death
+                    deaths.update(task)
+                    self.given_up += [seed for seed in task if deaths[seed] >= MAX_DEATHS]
+                    alone.extend((seed,) for seed in task if deaths[seed] < MAX_DEATHS)
+                    continue
+                in_a_row = 0
+                yield answer
+
+
+class LocalProcesses:
+    """Processes of this machine."""
+
+    died = (BrokenExecutor,)
+
+    def __init__(self, count: int):
+        self.count = count
+        self._pool: ProcessPoolExecutor | None = None
+
+    def submit(self, job: Job, seeds: Seeds, journal: Journal | None) -> Future[Answer]:
+        """Start some seeds of a job, in new processes if one had died."""
+        if self._pool is None:
+            self._pool = open_pool(self.count, _LEARNED_JOB if job.learned else _EVERY_JOB)
+        try:
+            return self._pool.submit(run_seeds, job, seeds, journal, True)
+        except BrokenExecutor:
+            self.close(in_order=False)
+            return self.submit(job, seeds, journal)
+
+    def close(self, in_order: bool) -> None:
+        """End all processes."""
+        if self._pool is not None:
+            self._pool.shutdown() if in_order else kill_pool(self._pool)
+            self._pool = None
+
+
+def run_seeds(job: Job, seeds: Seeds, journal: Journal | None, store: bool) -> Answer:
+    """Run some seeds of a job in a worker. store: journals here, else whoever asked for them has the disk."""
+    found: Answer = []
+    try:
+        for episode in job.run(seeds):
+            packed = journal.pack(episode) if journal is not None else None
+            if store and journal is not None and packed is not None:
+                journal.store(episode.seed, packed)
+                packed = None
+            found.append((episode.without_pictures(), packed))
+    except ManipError:
+        raise
+    except Exception as error:  # which need not pickle
+        raise ManipError(f"{type(error).__name__}: {error}") from None
+    return found
+
+
+def split(job: Job, seeds: Sequence[int], workers: int) -> deque[Seeds]:
+    """Return one seed a task; where a learner drives, a lockstep batch, smaller if that would leave a worker idle."""
+    size = 1 if not job.learned else max(1, min(job.batch, -(-len(seeds) // workers)))
+    return deque(tuple(seeds[i : i + size]) for i in range(0, len(seeds), size))
+
+
+def _stored(episodes: Iterable[Episode], journal: Journal) -> Iterator[Episode]:
+    """Yield episodes once they are stored; the disk takes each while the next one runs."""
+    with ThreadPoolExecutor(1, "store") as disk:
+        before: tuple[Episode, Future[None]] | None = None
+        for episode in episodes:
+            storing = episode, disk.submit(journal.store, episode.seed, journal.pack(episode))
+            if before is not None:
+                yield _settled(*before)
+            before = storing
+        if before is not None:
+            yield _settled(*before)
+
+
+def _settled(episode: Episode, stored: Future[None]) -> Episode:
+    stored.result()
+    return episode
+
+
+def _open_workers(backend: Backend, workers: int | None) -> Workers:
+    if backend == "local":
+        return LocalProcesses(workers or default_workers())
+    from manip_il.collect.ray_pool import RayCluster  # here, as Ray is an extra
+
+    return RayCluster(workers)
+
+
+def default_workers() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0))

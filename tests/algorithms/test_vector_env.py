@@ -1,0 +1,131 @@
+"""Environments in lockstep: what reaches the robot, when an episode ends, and that it depends on its seed alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
+from manip_il.collect.environments import make_expert
+from manip_il.collect.rollout import Turn
+from manip_il.errors import MismatchError
+from manip_il.learn.action_spaces import conversion
+from manip_il.sim.config import EnvConfig
+from manip_il.sim.env import ManipEnv
+
+ENV = EnvConfig("fetch", "reach")
+HAND = conversion("ee_delta", "fetch")
+
+
+def up(height: float) -> np.ndarray:
+    """A target that raises the hand [m]."""
+    target = np.zeros(8, np.float32)
+    target[2] = height
+    return target
+
+
+def lockstep(count: int, hold: int | None = 2, horizon: int = 12) -> Lockstep:
+    ones = np.ones(8, np.float32)
+    episodes = [RobotEpisode(ENV, hold) for _ in range(count)]
+    return Lockstep(episodes, ActionRange(0 * ones, ones, -ones, ones), horizon, HAND)
+
+
+def expert_action(episode: RobotEpisode) -> np.ndarray:
+    env = episode._env
+    turn = Turn(0, 0, env.observe(), env.get_state(), make_expert(ENV))
+    return turn.query().action
+
+
+def test_a_target_reaches_the_robot_as_the_joints_it_means():
+    ours, env = lockstep(2, hold=None), ManipEnv.of(ENV)
+    ours.seeds = [4, 5]
+    observed = ours.reset()
+    env.start(5)
+    for step in range(3):
+        seen = env.observe()
+        assert np.array_equal(observed[1, :-2], np.concatenate([seen.state, seen.environment_state]))
+        action = HAND.decode(up(0.02)[None], seen.state[None])[0].astype(np.float64)
+        env.begin_step()
+        env.advance(action)
+        ours.step_async(np.stack([up(-0.01), up(0.02)]))
+        observed = ours.step_wait()[0]
+        assert np.array_equal(ours.executed[step][1], action)
+
+
+def test_an_episode_that_has_ended_leaves_the_others_as_they_are():
+    alone, beside = lockstep(1, hold=None), lockstep(3, hold=None)
+    alone.seeds, beside.seeds = [7], [5, 6, 7]
+    alone.reset()
+    beside.reset()
+    middle = beside.episodes[1]
+    assert isinstance(middle, RobotEpisode)
+    middle._hold, middle._held = 0, 1  # it has ended
+    one, three = np.stack([up(0.02)]), np.stack([up(0.03), up(-0.01), up(0.02)])
+    for _ in range(2):
+        alone.step_async(one)
+        beside.step_async(three)
+        assert np.array_equal(alone.step_wait()[0][0], beside.step_wait()[0][2])
+    assert not beside.executed[0][1].any()
+    assert beside.simulated == 4
+
+
+@pytest.mark.parametrize("hold", [0, 3])
+def test_an_episode_ends_as_many_steps_after_success_as_demonstrations_do(hold):
+    episode = RobotEpisode(ENV, hold)
+    episode.start(3)
+    after = 0
+    while not episode.ended:
+        episode.advance(expert_action(episode))
+        after += episode.solved
+    assert after == hold + 1
+
+
+def test_without_a_hold_an_episode_goes_on_after_success():
+    episode = RobotEpisode(ENV, None)
+    episode.start(3)
+    for _ in range(40):
+        episode.advance(expert_action(episode))
+    assert episode.solved
+    assert not episode.ended
+
+
+def test_an_episode_depends_on_its_seed_alone():
+    alone, beside = lockstep(1), lockstep(3)
+    alone.seeds, beside.seeds = [7], [5, 6, 7]
+    assert np.array_equal(alone.reset()[0], beside.reset()[2])
+    for step in range(3):
+        action = up(0.01 * step)
+        alone.step_async(action[None])
+        beside.step_async(np.stack([up(0.03), up(-0.01), action]))
+        assert np.array_equal(alone.step_wait()[0][0], beside.step_wait()[0][2])
+
+
+def test_all_episodes_end_together_and_time_is_the_last_number():
+    env = lockstep(2, hold=None)
+    env.seeds = [1, 2]
+    env.reset()
+    for step in range(1, 13):
+        env.step_async(np.zeros((2, 8), np.float32))
+        observations, rewards, dones, _ = env.step_wait()
+        assert observations[:, -1] == pytest.approx(step / 12)
+        assert dones.tolist() == [step == 12] * 2
+        assert not rewards.any()
+    assert env.simulated == 24
+    assert np.concatenate(env.executed).shape == (24, 8)
+
+
+def test_another_number_of_seeds_than_environments_is_refused():
+    env = lockstep(2)
+    env.seeds = [1]
+    with pytest.raises(MismatchError, match="environments has 2, seeds has 1"):
+        env.reset()
+
+
+def test_normalised_actions_mean_their_targets_within_the_range():
+    mean, scale = np.float32([0.1, 0.0018]), np.float32([0.2, 0.0])
+    actions = ActionRange(mean, scale, np.float32([-0.3, 0.0018]), np.float32([0.7, 0.0018]))
+    targets = np.float32([[0.3, 0.0018], [-0.2, 0.0018]])
+    assert actions.raw(actions.normalised(targets)) == pytest.approx(targets)
+    assert actions.raw(np.float32([[9, 9]])) == pytest.approx(np.float32([[0.7, 0.0018]]))
+    assert actions.space.low == pytest.approx(np.float32([-2, -1]))
+    assert actions.space.high == pytest.approx(np.float32([3, 1]))
