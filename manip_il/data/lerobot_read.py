@@ -228,11 +228,19 @@ def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:
 def check_dataset(root: Path) -> None:
     """Raise `ManipError` where another program must not be let read a dataset: for what its description or files say.
 
-    Paths and names that lead out of its folder, and parquet files that unpack to more than real ones do.
+    Paths and names that lead out of its folder, what is no regular file, and parquet files that unpack to more than
+    real ones do.
     """
     _read_info(root)
+    for path in find_irregular(root):
+        raise ManipError(f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links")
     for pattern in (layout.TASKS, layout.EPISODES_FILES, layout.DATA_FILES):
         check_files(root, sorted(root.glob(pattern)), None)
+
+
+def find_irregular(root: Path) -> list[Path]:
+    """Return what a folder holds besides files and folders: pipes, devices, sockets and links to nothing."""
+    return sorted(path for path in root.rglob("*") if not (path.is_file() or path.is_dir()))
 
 
 def _decode(
@@ -308,7 +316,7 @@ def _check_rows(root: Path, found: int) -> None:
 def _read_info(root: Path) -> dict[str, Any]:
     """Stricter than `info.read_info`, which the doctor lists all problems of: no NaN, and `robot_type` is there."""
     path = root / layout.INFO
-    if not path.is_file():
+    if not path.exists():
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {layout.INFO}")
     info = checks.read_json(path, "a LeRobot dataset's description", LARGEST_META)
     version = info.get("codebase_version")
@@ -325,7 +333,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 
 def _read_ours(root: Path) -> dict[str, Any]:
     path = root / layout.OURS
-    if not path.is_file():
+    if not path.exists():
         _read_info(root)
         return {}
     ours = checks.read_json(path, "what this program says of its datasets", LARGEST_META)

@@ -22,6 +22,7 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 from PIL import Image
 
+from manip_il import checks
 from manip_il.data.schema import MOST_PIXELS
 from manip_il.errors import ManipError
 
@@ -141,10 +142,13 @@ def count_packets(path: Path) -> int:
 
 def _check_index(path: Path) -> None:
     """Raise `ValueError` where FFmpeg would make a larger index of the file than any video needs."""
-    if path.stat().st_size < _BOX:
+    if path.is_file() and path.stat().st_size < _BOX:
         return  # FFmpeg refuses it
     frames, edits = 0, 1
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with (
+        open(checks.open_regular(path), "rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
         for name, size, start, stop in find_boxes(data):
             if name == b"mdat" and size >= _BOX:
                 continue  # coded frames

@@ -82,13 +82,13 @@ def _fill(staging: Path, remote: Remote, snapshot: Snapshot, retry: Retry, progr
     In `staging`, `parts` holds unfinished files, by hash, and `tree` verified ones, as they will be.
     """
     manifest, tree, parts = snapshot.manifest, staging / "tree", staging / "parts"
-    if staging.is_symlink():
-        staging.unlink()
-    for folder in (tree, parts):
+    for folder in (staging, tree, parts):
+        if folder.is_symlink():
+            folder.unlink()
         folder.mkdir(parents=True, exist_ok=True)
     missing = _missing(tree, manifest)
     for path in parts.iterdir():
-        if path.name not in missing or path.is_symlink():
+        if path.name not in missing or path.is_symlink() or not path.is_file():
             path.unlink()
     wanted = sum(entries[0].size * len(entries) for entries in missing.values())
     had = sum(path.stat().st_size for path in parts.iterdir())
