@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 obey_parent()  # before all other imports: they take a second, in which the process that started this one may be killed
 
-from manip_il.sim.gl import choose_backend  # noqa: E402
+from manip_il.sim.gl import choose_backend, require_known_backend  # noqa: E402
 
 choose_backend()
 
@@ -29,6 +29,7 @@ __version__ = "0.1.0"
 
 
 def _register() -> None:
+    require_known_backend()  # before mujoco is imported
     from manip_il.sim.register import register_envs
 
     register_envs()
