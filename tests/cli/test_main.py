@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import COMMANDS, Command, main
+from manip_il.robots import ROBOTS
 
 HERE = Path(__file__).parent
 PREPARE = f"""
@@ -125,3 +126,11 @@ program.script()
 def test_ctrl_c_does_not_wait_for_what_threads_send():
     done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (130, "manip-il: interrupted\n")
+
+
+@pytest.mark.parametrize("command", ["record", "eval"])
+def test_help_says_every_kind_of_robot_and_the_stock_tasks(command, capsys):
+    assert main([command, "--help"]) == 0
+    [robot] = [line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("--robot.type")]
+    for words in (*ROBOTS, "path of the YAML of an arm of your own", "fetch_stock: gymnasium-robotics' own Fetch"):
+        assert words in robot
