@@ -116,12 +116,21 @@ def script() -> NoReturn:
 
     Nothing is lost by that: what every command writes outlives a kill.
     """
+    _reopen_streams()
     code = main()
     busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
     if code == EXIT_INTERRUPTED and busy:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _reopen_streams() -> None:
+    """Make /dev/null of the streams that the shell closed (`>&-`): else the next file opened would take their place."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free, so this one
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def load(name: str) -> type:
