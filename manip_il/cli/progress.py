@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.interrupt import Interrupted, StopRequest
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, printable
 
 if TYPE_CHECKING:
     from manip_il.algorithms.run import Watch
@@ -39,7 +39,7 @@ def set_quiet(quiet: bool) -> None:
 
 def say(line: str) -> None:
     """Print a line of normal output, on standard output."""
-    print(line, flush=True)
+    print(printable(line), flush=True)
 
 
 def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -> None:
@@ -61,7 +61,7 @@ def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -
 def warn(*lines: str) -> None:
     """Print warnings on standard error, one line each."""
     for line in lines:
-        print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)
+        print(f"manip-il: warning: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
 @contextmanager
