@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from manip_il import checks
+from manip_il.data.picture_columns import picture_columns
 
 MIB = 1024 * 1024
 LARGEST_FOOTER = 32 * MIB  # [bytes]; 10,000 row groups of 20 columns take about 30
@@ -94,6 +95,7 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
             count = len(schema.names)
             if count > MOST_COLUMNS:
                 raise ValueError(f"it has {count:,} columns; expected at most {MOST_COLUMNS:,}")
+            picture_columns(schema.to_arrow_schema())  # refuses what a reader would run
             if twice := [name for name, n in Counter(schema.to_arrow_schema().names).items() if n > 1]:
                 raise ValueError(f"it has more than one column {twice[0][:100]!r}; expected different names")
             read = ("",) if columns is None else tuple(f"{column}." for column in columns)

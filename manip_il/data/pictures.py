@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
+from typing import Any, cast
 
 import av
 import numpy as np
@@ -67,6 +68,15 @@ def to_png(picture: NDArray[np.uint8]) -> bytes:
     stream = BytesIO()
     Image.fromarray(picture).save(stream, "PNG", compress_level=_LEVEL)
     return stream.getvalue()
+
+
+def decode_cell(cell: Any) -> Pictures:
+    """Return the picture (height, width, 3) in a cell of a data file, whose `path` is not followed.
+
+    Raises `ValueError` as `decode_picture` does.
+    """
+    content = cast(dict[str, Any], cell).get("bytes") if isinstance(cell, dict) else None
+    return decode_picture(content if isinstance(content, bytes) else None)
 
 
 def decode_picture(content: bytes | None) -> Pictures:

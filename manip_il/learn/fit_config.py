@@ -99,11 +99,11 @@ class FitConfig:
     image_augment: bool | None = option(
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
-    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
+    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it each step decodes its own")
     memory: float | None = option(
         None, "what the numbers learnt from may take [GB]; if they take more, they are kept in files of OUTPUT_DIR"
     )
-    num_workers: int = option(4, "processes of LeRobot's loader")
+    num_workers: int = option(4, "processes that decode pictures beyond image_cache_gb")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")
     save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}")
