@@ -33,7 +33,7 @@ from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.lerobot_read import camera_keys, read_table
 from manip_il.learn.batches import Augment, pictures_to_float
 from manip_il.learn.limits import threads
-from manip_il.learn.samples import JoinedFrames, MemorySource, Windows
+from manip_il.learn.samples import JoinedFrames, SampleSource, Windows
 
 BATCH = 64
 SECONDS = 2.0  # of ours, each time
@@ -101,7 +101,7 @@ def epochs(root: Path, workers: int) -> Iterator[float]:
         yield samples / (time.perf_counter() - started)
 
 
-def our_source(root: Path, folder: Path) -> MemorySource:
+def our_source(root: Path, folder: Path) -> SampleSource:
     frames = open_frame_cache(root, camera_keys(root), max_bytes=PLENTY, folder=folder / "cache")
     assert frames is not None
     table = {key: values for key, values in read_table(root).items() if values.dtype != object}
@@ -110,10 +110,10 @@ def our_source(root: Path, folder: Path) -> MemorySource:
     assert texts is not None
     tasks = tuple(map(str, texts.index))
     joined = {camera: JoinedFrames([one]) for camera, one in frames.items()}
-    return MemorySource(Windows(table["episode_index"], {}), columns, joined, tasks)
+    return SampleSource(Windows(table["episode_index"], {}), columns, joined, tasks)
 
 
-def our_epoch(source: MemorySource, augment: Augment | None, number: Iterator[int]) -> int:
+def our_epoch(source: SampleSource, augment: Augment | None, number: Iterator[int]) -> int:
     """One pass in an order of its own; the number of samples."""
     count, seed = len(source.windows.episodes), next(number)
     order = np.random.default_rng(seed).permutation(count)

@@ -9,44 +9,43 @@ The OpenGL for pictures is chosen too, as mujoco reads MUJOCO_GL when it is impo
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from importlib.abc import Loader
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
-from manip_il.sim.gl import choose_backend
+    from manip_il.collect.expert import Expert
+    from manip_il.collect.record import record
+    from manip_il.sim.env import make_env
+
+from manip_il.sim.gl import choose_backend, require_known_backend
 
 choose_backend()
 
 __version__ = "0.1.0"
+__all__ = ["Expert", "make_env", "record"]
+_HOMES = {"Expert": "collect.expert", "make_env": "sim.env", "record": "collect.record"}
+
+
+def __getattr__(name: str) -> Any:
+    """Return what `__all__` names, imported when it is first asked for."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'manip_il' has no attribute {name!r}")
+    return getattr(import_module(f"manip_il.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
 
 
 def _register() -> None:
+    require_known_backend()  # before mujoco is imported
     from manip_il.sim.register import register_envs
 
     register_envs()
-
-
-class _ThenRegister:
-    """gymnasium's own loader, and after it our environments' registration."""
-
-    def __init__(self, loader: Loader) -> None:
-        self._loader = loader
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
-        """As the own loader does."""
-        return self._loader.create_module(spec)
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Load gymnasium as if nobody had been waiting for it, then register."""
-        if module.__spec__ is not None:
-            module.__spec__.loader = self._loader
-        module.__loader__ = self._loader
-        self._loader.exec_module(module)
-        _register()
 
 
 class _WaitForGymnasium:
@@ -61,7 +60,13 @@ class _WaitForGymnasium:
         sys.meta_path.remove(self)  # pyright: ignore[reportArgumentType]
         spec = find_spec(name)
         if spec is not None and spec.loader is not None:
-            spec.loader = _ThenRegister(spec.loader)  # pyright: ignore[reportAttributeAccessIssue]
+            load = spec.loader.exec_module
+
+            def load_and_register(module: ModuleType) -> None:
+                load(module)
+                _register()
+
+            spec.loader.exec_module = load_and_register
         return spec
 
 

@@ -30,6 +30,7 @@ LONGEST_TEXT = 10_000  # [characters]
 LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million episodes
 LARGEST_YAML = 256 * 1024  # [bytes]: the parser takes a second for 100 kB
 DEEPEST_YAML = 50  # levels
+LONGEST_INTEGER = 1_000  # in YAML [characters]
 LARGEST_SEED = 2**63 - 1  # datasets store seeds as int64
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
@@ -260,4 +261,13 @@ def _loader() -> Any:
             self._depth -= 1
             return node
 
+        def construct_yaml_int(self, node: Any) -> int:
+            if len(node.value) > LONGEST_INTEGER:  # such a one could be read, and not printed
+                raise yaml.YAMLError(
+                    f"a number of {len(node.value)} characters in line {node.start_mark.line + 1}; expected at most "
+                    f"{LONGEST_INTEGER}"
+                )
+            return super().construct_yaml_int(node)
+
+    Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
     return Loader

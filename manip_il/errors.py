@@ -31,6 +31,9 @@ class ManipError(Exception):
 
     exit_code = 1
 
+    def __str__(self) -> str:
+        return printable(super().__str__())
+
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle by the message: subclasses build theirs from other arguments, and a worker's error must come home."""
         return _with_message, (type(self), str(self))
@@ -122,6 +125,11 @@ def did_you_mean(names: Sequence[str]) -> str:
     """Return ` (did you mean 'x', 'y' or 'z'?)`, or nothing without names."""
     *others, last = map(repr, names) if names else ("",)
     return f" (did you mean {', '.join(others)}{' or ' if others else ''}{last}?)" if last else ""
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters escaped, as a terminal obeys them; line breaks and tabs stay."""
+    return "".join(one if one.isprintable() or one in "\n\t" else repr(one)[1:-1] for one in text)
 
 
 def shorten(text: str) -> str:

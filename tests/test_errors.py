@@ -1,5 +1,9 @@
+import pickle
+
 import pytest
 
+from manip_il.cli.main import main
+from manip_il.cli.progress import say, warn
 from manip_il.errors import (
     FolderExistsError,
     ManipError,
@@ -10,6 +14,7 @@ from manip_il.errors import (
     UsageError,
     nearest,
 )
+from manip_il.evaluation.tables import Table, print_table
 
 
 def test_a_near_name_is_offered_and_all_are_listed():
@@ -17,6 +22,17 @@ def test_a_near_name_is_offered_and_all_are_listed():
     assert near == "unknown robot 'pnada' (did you mean 'panda'?); known: fetch, panda"
     assert far == "unknown robot 'xylophone'; known: fetch, panda"
     assert nearest("lfit", iter(["reach", "lift"])) == " (did you mean 'lift'?)"
+
+
+def test_no_control_character_of_a_name_reaches_a_terminal(capsys: pytest.CaptureFixture[str]):
+    name = "\x1b[31mred\x07\x9b\udcff"
+    error = UnknownName("body", "hand", [name])
+    assert "known: \\x1b[31mred\\x07\\x9b\\udcff" in str(error)
+    for write in (say, warn, lambda line: print_table(Table(("joint",), ((line,),)))):
+        write(name)
+    assert main(["data", name]) == main(["robot", "check", f"{name}.yaml"]) == 2
+    assert not {"\x1b", "\x07", "\x9b", "\udcff"} & set("".join(capsys.readouterr()))
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_a_mismatch_names_both_sides():

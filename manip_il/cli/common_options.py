@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 from manip_il.errors import UsageError
 from manip_il.option import option, option_of
 from manip_il.robots import ROBOTS
-from manip_il.sim.config import CameraConfig, EnvConfig, Look
+from manip_il.sim.config import ROBOT_HELP, TASK_HELP, CameraConfig, EnvConfig, Look
 from manip_il.sim.shape import SHAPE_HELP
 from manip_il.stock import table as stock
-from manip_il.tasks import NAMES
 from manip_il.tasks.reward import Reward
 
 if TYPE_CHECKING:
@@ -90,16 +89,14 @@ class TaskGroup:
 class MaybeRobotGroup:
     """`--robot.*` where a checkpoint may say it."""
 
-    type: str | None = option(
-        None, f"{' or '.join([*ROBOTS, stock.ROBOT])}; by default the policy's, else {EnvConfig.robot}"
-    )
+    type: str | None = option(None, f"{ROBOT_HELP}; by default the policy's, else {EnvConfig.robot}")
 
 
 @dataclass
 class MaybeTaskGroup:
     """`--task.*` where a checkpoint may say it."""
 
-    type: str | None = option(None, f"{', '.join(NAMES)}; by default the policy's, else {EnvConfig.task}")
+    type: str | None = option(None, f"{TASK_HELP}; by default the policy's, else {EnvConfig.task}")
     object: str | None = option(None, f"{SHAPE_HELP}; by default the policy's, else the task's own")
     reward: str = option_of(EnvConfig, "reward")
 

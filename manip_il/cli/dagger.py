@@ -25,7 +25,7 @@ from manip_il.cli.outputs import (
     require_output,
 )
 from manip_il.cli.parsing import from_yaml
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import Stages, say, say_policy
 from manip_il.cli.trials import VARY_HELP, varied
 from manip_il.errors import ManipError
 from manip_il.learn.fit_config import DEFAULTS, FitConfig, check_weights
@@ -131,12 +131,15 @@ class DaggerOptions(common.EnvOptions):
                 results = run_rounds(config, folder, engine, stages)
             _report(self, config, results).write(folder / REPORT_FILE)
         best = folder / "best" / "pretrained_model"
-        say(f"best policy: {best}")
         if (folder / "dataset").is_dir():
             say(f"all rounds' labels as one dataset: {folder / 'dataset'}")
         say(f"report: {folder / REPORT_FILE}")
         robot = common.own_robot(config.env.robot)
-        say(f"next: manip-il eval --policy.path={best}{robot} --output_dir={folder}/test")
+        test = f"manip-il eval --policy.path={best}{robot} --output_dir={folder}/test"
+        remedies = f"more --steps ({config.fit.total_steps:,} a round now)"
+        if config.start is None and not config.datasets:
+            remedies += f", more --demonstrations ({config.demonstrations:,} now)"
+        say_policy(best, best_round(results).validation, test, remedies)
 
     def config(self) -> RunConfig:
         """Return what `run_algorithm` takes; `UsageError` for what does not go together."""
@@ -245,6 +248,8 @@ def best_verdict(names: Sequence[str], results: Sequence[RoundResult]) -> str:
     from manip_il.evaluation.results import compare_results
 
     best = best_round(list(results))
+    if not best.validation.success.successes:
+        return f"No round of {len(results)} succeeds in any of {best.validation.success.n:,} validation episodes."
     found = f"{best.validation.success} success on {best.validation.success.n:,} validation episodes"
     other = results[0] if best.round else results[-1]
     if other is best:

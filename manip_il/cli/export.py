@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from manip_il.cli.inputs import find_policy
-from manip_il.cli.outputs import atomic_write
+from manip_il.cli.outputs import atomic_write, require_short_path
 from manip_il.cli.progress import say, warn
 from manip_il.errors import ManipError, UsageError
 from manip_il.option import option
@@ -52,6 +52,7 @@ class ExportOptions:
 
     def _find(self, output: Path) -> Path:
         """Return the policy; raise, before anything heavy is imported, where it cannot be exported, or not to there."""
+        require_short_path(output)
         if output.is_dir():
             raise UsageError(f"--output is {output}, a folder; expected a file such as {output}/policy.onnx")
         if output.exists() and not self.overwrite:

@@ -13,7 +13,7 @@ from manip_il.cli import common_options as common
 from manip_il.cli.inputs import find_policy
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import REPORT_FILE, append_jsonl, open_output, read_jsonl, require_output
-from manip_il.cli.progress import Stages, say
+from manip_il.cli.progress import Stages, say, say_policy
 from manip_il.learn.adversarial_config import PPOConfig
 from manip_il.option import option, option_of
 
@@ -64,6 +64,7 @@ class LearningOptions:
 
     def run(self) -> None:
         """Run, or go on with, all iterations, and write the report."""
+        from manip_il.algorithms.iterations import best_validation, validations
         from manip_il.collect.workers import Engine
 
         config = self.learning_config()
@@ -72,10 +73,12 @@ class LearningOptions:
             with Stages(kept) as stages, Engine(self.workers) as engine:
                 self._learn(config, folder, engine, stages)
             self._report(config, folder)
-        say(f"best policy: {folder / 'best' / 'pretrained_model'}")
         say(f"report: {folder / REPORT_FILE}")
         robot = common.own_robot(config.env.robot)
-        say(f"next: manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test")
+        test = f"manip-il eval --policy.path={folder}{robot} --output_dir={folder}/test"
+        remedies = f"more --steps ({config.steps:,} now){'' if self.init else ', a clone to begin with (--init)'}"
+        found = validations(folder)
+        say_policy(folder / "best" / "pretrained_model", found[best_validation(found)], test, remedies)
 
     def learning_config(self) -> LearningConfig:
         """Return what the run takes; raises for what is wrong with datasets and policy together."""

@@ -23,7 +23,7 @@ from manip_il.cli import progress
 from manip_il.cli.interrupt import Interrupted, resume_command
 from manip_il.cli.options import Option, metavar, options_of, word
 from manip_il.cli.parsing import parse
-from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.errors import ManipError, UnknownName, UsageError, printable
 
 PROGRAM = "manip-il"
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
@@ -116,12 +116,21 @@ def script() -> NoReturn:
 
     Nothing is lost by that: what every command writes outlives a kill.
     """
+    _reopen_streams()
     code = main()
     busy = any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
     if code == EXIT_INTERRUPTED and busy:
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _reopen_streams() -> None:
+    """Make /dev/null of the streams that the shell closed (`>&-`): else the next file opened would take their place."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free, so this one
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def load(name: str) -> type:
@@ -209,7 +218,10 @@ def _how_to_go_on(error: KeyboardInterrupt, words: list[str]) -> str:
 
 
 def _clean(text: str, words: list[str]) -> str:
-    """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library."""
+    """Without tokens, keys and passwords, which a word that was given may hold, or an error of a library.
+
+    Without control characters, too.
+    """
     from manip_il.store.errors import mask, redact
 
     if any(":" in word or "@" in word for word in words):
@@ -217,7 +229,7 @@ def _clean(text: str, words: list[str]) -> str:
 
         for secret in (one for word in words for one in secrets_in(word)):
             text = mask(text, secret)
-    return redact(text)
+    return printable(redact(text))
 
 
 def _help() -> str:

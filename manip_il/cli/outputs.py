@@ -17,6 +17,7 @@ from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.html"
+_LONGEST_NAME, _LONGEST_PATH = 220, 3_500  # of a folder that is written [bytes]; file systems take 255 and 4,096
 _MARKS = (CONFIG_FILE, "eval.json", "meta")  # by which `require_ours` knows a folder
 
 
@@ -52,6 +53,7 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     `FolderExistsError` where the folder holds something, and `UsageError` where `overwrite` would delete what this
     program did not make.
     """
+    require_short_path(folder)
     if resume and overwrite:
         raise UsageError("--resume=true and --overwrite=true contradict each other; give one of them")
     if folder.is_symlink() and not folder.exists():
@@ -63,6 +65,14 @@ def check_output(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not overwrite:
         raise FolderExistsError(folder)
     require_ours(folder)
+
+
+def require_short_path(path: Path) -> None:
+    """Raise `UsageError` for a path that leaves no room for the longer names that are written beside and inside it."""
+    longest, whole = max(len(os.fsencode(part)) for part in path.parts or ("",)), len(os.fsencode(path.absolute()))
+    for what, size, most in (("a name in", longest, _LONGEST_NAME), ("the absolute path of", whole, _LONGEST_PATH)):
+        if size > most:
+            raise UsageError(f"{what} {checks.shorten(str(path))} has {size:,} bytes; expected at most {most:,}")
 
 
 def require_output(folder: Path, command: str, *, resume: bool = False, overwrite: bool = False) -> None:
@@ -128,7 +138,7 @@ def append_jsonl(path: Path, record: Mapping[str, Any]) -> None:
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         _mend_tail(path)
-        with path.open("ab") as file:
+        with open(checks.open_regular(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab") as file:
             file.write(line.encode() + b"\n")
 
 
@@ -139,7 +149,8 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    *lines, tail = path.read_bytes().split(b"\n")
+    with open(checks.open_regular(path), "rb") as file:
+        *lines, tail = file.read().split(b"\n")
     records = [_record(line) for line in lines]
     if None in records:
         number = records.index(None)
@@ -191,7 +202,7 @@ def _delete(folder: Path) -> None:
 def _mend_tail(path: Path) -> None:
     if not path.exists():
         return
-    with path.open("rb+") as file:
+    with open(checks.open_regular(path, os.O_RDWR), "rb+") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 1, 0))
         if file.read(1) in (b"", b"\n"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
-from manip_il.cli.outputs import atomic_write, open_output, require_new
+from manip_il.cli.outputs import atomic_write, open_output, require_new, require_short_path
 from manip_il.cli.progress import progress, say, warn
 from manip_il.errors import UsageError
 from manip_il.option import option
@@ -239,6 +239,7 @@ def _require_file(path: Path, what: str) -> None:
 
 
 def _require_new_file(path: Path, suffix: str, overwrite: bool) -> None:
+    require_short_path(path)
     if path.suffix != suffix:
         raise UsageError(f"--output is {path}; expected a file, NAME{suffix}")
     if path.is_dir() or (path.exists() and not overwrite):

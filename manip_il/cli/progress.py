@@ -6,15 +6,16 @@ import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from manip_il.cli.interrupt import Interrupted, StopRequest
-from manip_il.errors import ManipError, UsageError
+from manip_il.errors import ManipError, UsageError, printable
 
 if TYPE_CHECKING:
     from manip_il.algorithms.run import Watch
-    from manip_il.evaluation.results import EpisodeResult
+    from manip_il.evaluation.results import EpisodeResult, EvalResult
     from manip_il.mdp import Episode
 
 INTERVAL = 5.0  # [s] between plain lines
@@ -38,13 +39,29 @@ def set_quiet(quiet: bool) -> None:
 
 def say(line: str) -> None:
     """Print a line of normal output, on standard output."""
-    print(line, flush=True)
+    print(printable(line), flush=True)
+
+
+def say_policy(policy: Path, validation: EvalResult, test: str, remedies: str) -> None:
+    """Print where a run's best policy is and how to test it, or, if it never succeeded, what to try.
+
+    test: the command that tests it. remedies: what may help.
+    """
+    from manip_il.evaluation.failures import evaluation_verdict
+
+    if validation.success.successes:
+        say(f"best policy: {policy}")
+        say(f"next: {test}")
+        return
+    say(evaluation_verdict(validation))
+    say(f"try in a new run: {remedies}")
+    say(f"failures by phase, with films: {test}")
 
 
 def warn(*lines: str) -> None:
     """Print warnings on standard error, one line each."""
     for line in lines:
-        print(f"manip-il: warning: {' '.join(line.split())}", file=sys.stderr, flush=True)
+        print(f"manip-il: warning: {printable(' '.join(line.split()))}", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.interrupt import Interrupted
-from manip_il.cli.outputs import require_ours
+from manip_il.cli.outputs import require_ours, require_short_path
 from manip_il.cli.progress import bytes_text, progress, say, warn
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
@@ -135,6 +135,7 @@ class PullOptions:
     def check(self) -> None:
         """Refuse an invalid address, and a folder that may not be replaced."""
         self._url()
+        require_short_path(self.target)
         if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
             require_ours(self.target)
 

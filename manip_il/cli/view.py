@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import check_policy, find_policy, observation_text, require_folder
+from manip_il.cli.outputs import require_short_path
 from manip_il.cli.progress import say, warn
 from manip_il.cli.trials import SUITE_HELP, require_suite, suite_conditions
 from manip_il.errors import RenderError, UsageError
@@ -66,6 +67,7 @@ class ViewOptions:
             raise UsageError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         self._seeds()
         if self.output is not None:
+            require_short_path(self.output)
             if self.output.suffix != SUFFIX or self.output.is_dir():
                 raise UsageError(f"--output is {self.output}; expected a file, NAME{SUFFIX}")
             require_folder(self.output.parent, f"the folder of --output={self.output}")

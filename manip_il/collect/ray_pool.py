@@ -18,7 +18,7 @@ from typing import Any
 import zstandard
 
 from manip_il import __version__
-from manip_il.collect.workers import Answer, Job, Seeds, run_seeds
+from manip_il.collect.task import Answer, Job, Seeds, run_seeds
 from manip_il.data.atomic import new_folder
 from manip_il.data.journal import Journal
 from manip_il.errors import FolderExistsError, ManipError

@@ -14,7 +14,8 @@ from typing import Any
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.redraw import STATES, RedrawJob, write_states
-from manip_il.collect.workers import Engine, Job
+from manip_il.collect.task import Job
+from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, dataset_sha256, local_id
 from manip_il.data.episodes import Header
 from manip_il.data.fingerprint import compare_fingerprints

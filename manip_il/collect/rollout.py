@@ -161,8 +161,8 @@ def rollout(
     """Run one episode per seed, `len(envs)` at a time; yields every step's transition as it happens.
 
     An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on its neighbours.
-    gate: whether the labeller is queried in each turn, given the actions (n,) that would be executed. first: the state in
-    which every episode begins, in place of its seed's.
+    gate: whether the labeller is queried in each turn, given the actions (n,) that would be executed. first: the state
+    in which every episode begins, in place of its seed's.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]

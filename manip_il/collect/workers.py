@@ -10,59 +10,18 @@ import os
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from pathlib import Path
 from types import TracebackType
 from typing import Literal, Protocol
 
 from manip_il.child_processes import kill_pool, open_pool, start_server
+from manip_il.collect.task import Answer, Job, Seeds, run_seeds
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
-from manip_il.sim.config import CameraConfig, EnvConfig
 
 MAX_DEATHS = 3  # of workers that one seed may cost before it is left out
 Backend = Literal["local", "ray"]
-Seeds = tuple[int, ...]
-Answer = list[tuple[Episode, bytes | None]]
-"""Episodes without pictures, each with its journal if that is still to be stored."""
 _EVERY_JOB, _LEARNED_JOB = ("manip_il.collect.job",), ("manip_il.collect.job", "manip_il.learn.policy")
-
-
-class Job(Protocol):
-    """Work that makes episodes of seeds; must pickle, and depend on nothing else."""
-
-    @property
-    def env(self) -> EnvConfig:
-        """Environment of its episodes."""
-        ...
-
-    @property
-    def cameras(self) -> CameraConfig | None:
-        """Cameras whose pictures its episodes have."""
-        ...
-
-    @property
-    def learned(self) -> bool:
-        """Whether it needs a policy, which takes torch and memory."""
-        ...
-
-    @property
-    def batch(self) -> int:
-        """Seeds that are run together at most, where it is learned."""
-        ...
-
-    @property
-    def files(self) -> Path | None:
-        """A folder that workers on other machines need a copy of."""
-        ...
-
-    def with_files(self, files: Path) -> Job:
-        """Return the same where its folder has been copied to."""
-        ...
-
-    def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
-        """Yield one episode a seed, in the order in which they end."""
-        ...
 
 
 class Workers(Protocol):
@@ -195,23 +154,6 @@ class LocalProcesses:
         if self._pool is not None:
             self._pool.shutdown() if in_order else kill_pool(self._pool)
             self._pool = None
-
-
-def run_seeds(job: Job, seeds: Seeds, journal: Journal | None, store: bool) -> Answer:
-    """Run some seeds of a job in a worker. store: journals here, else whoever asked for them has the disk."""
-    found: Answer = []
-    try:
-        for episode in job.run(seeds):
-            packed = journal.pack(episode) if journal is not None else None
-            if store and journal is not None and packed is not None:
-                journal.store(episode.seed, packed)
-                packed = None
-            found.append((episode.without_pictures(), packed))
-    except ManipError:
-        raise
-    except Exception as error:  # which need not pickle
-        raise ManipError(f"{type(error).__name__}: {error}") from None
-    return found
 
 
 def split(job: Job, seeds: Sequence[int], workers: int) -> deque[Seeds]:

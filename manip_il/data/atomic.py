@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
+from manip_il import checks
 from manip_il.errors import FolderBusyError, FolderExistsError, ManipError
 
 PARTIAL = ".partial"  # suffix of what is not finished
@@ -136,8 +137,10 @@ def exclusive(folder: Path) -> Generator[None]:
 
 @contextlib.contextmanager
 def descriptor(path: Path, flags: int = os.O_RDONLY) -> Generator[int]:
-    """Give the descriptor of a file or folder, and close it on leaving."""
-    handle = os.open(path, flags, 0o666)
+    """Give the descriptor of a file or folder, and close it on leaving. For writing it must be a regular file."""
+    handle = (
+        checks.open_regular(path, flags) if flags & (os.O_WRONLY | os.O_RDWR) else os.open(path, flags | os.O_NONBLOCK)
+    )
     try:
         yield handle
     finally:
@@ -160,7 +163,7 @@ def try_lock(handle: int, kind: int = fcntl.LOCK_EX) -> bool:
 
 def _lock(folder: Path, path: Path) -> int:
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        handle = checks.open_regular(path, os.O_RDWR | os.O_CREAT)
         if not try_lock(handle):
             holder = os.pread(handle, 32, 0).decode(errors="replace").strip()
             os.close(handle)

@@ -60,7 +60,7 @@ def open_frame_cache(
     another process that builds in `folder`.
 
     Returns None where the pictures would take more than `max_bytes`, alone or with what other processes have open: read
-    the dataset by `lerobot_windows` then. Raises what `find_frames` raises, `UsageError` for a folder in the dataset,
+    them as `LazyFrames` then. Raises what `find_frames` raises, `UsageError` for a folder in the dataset,
     `ManipError` where the disk is full or cannot be written.
     """
     sources = {key: find_frames(root, key) for key in image_keys}

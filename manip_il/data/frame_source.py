@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Feature, Info, read_info
 from manip_il.data.parquet_files import UNREADABLE, Shard, find_shards, floats, integers
-from manip_il.data.pictures import Pictures, VideoReader, decode_picture
+from manip_il.data.pictures import Pictures, VideoReader, decode_cell
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 Rows = tuple[int, Pictures]  # pictures of consecutive frames, and the `index` of the first
@@ -63,7 +63,7 @@ class ParquetPart:
                 for batch in file.iter_batches(64, groups, [key, layout.INDEX], use_threads=False):
                     rows, stored = (batch.column(name).to_pylist() for name in (layout.INDEX, key))
                     for row, picture in zip(rows, stored, strict=True):
-                        yield row, decode_picture(picture["bytes"])[None]
+                        yield row, decode_cell(picture)[None]
         except UNREADABLE as error:
             raise ManipError(f"cannot read the pictures {key} in {root / self.path}: {error}; {_SEE_DOCTOR}") from error
 
@@ -99,10 +99,14 @@ class FrameSource:
         Raises `ManipError` where one is missing, `MismatchError` where one has another size.
         """
         for row, pictures in part.read(self.root, self.key, self.fps):
-            if pictures.shape[1:] != (*self.size, 3):
-                there = f"{layout.INFO} of {self.root}"
-                raise MismatchError(f"shape of {self.key}", f"frame {row}", pictures.shape[1:], there, (*self.size, 3))
-            yield row, pictures
+            yield row, self.check_size(row, pictures)
+
+    def check_size(self, row: int, pictures: Pictures) -> Pictures:
+        """Return the pictures, of the frames from `row` on. Raises `MismatchError` unless they have the size."""
+        if pictures.shape[1:] != (*self.size, 3):
+            there = f"{layout.INFO} of {self.root}"
+            raise MismatchError(f"shape of {self.key}", f"frame {row}", pictures.shape[1:], there, (*self.size, 3))
+        return pictures
 
 
 def find_frames(root: Path, key: str) -> FrameSource:

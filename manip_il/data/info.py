@@ -115,7 +115,7 @@ def read_info(root: Path) -> Info:
 
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file of at most 16 MiB. Raises `OSError`, or `ValueError` for any other content."""
-    with path.open("rb") as file:
+    with open(checks.open_regular(path), "rb") as file:
         content = file.read(LARGEST_META + 1)
     if len(content) > LARGEST_META:
         raise ValueError(f"it has more than {LARGEST_META:,} bytes")

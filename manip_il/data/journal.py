@@ -101,7 +101,7 @@ def read_journal(path: Path) -> tuple[Header, Episode]:
 
     Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
     """
-    with _explain(path), path.open("rb") as stream:
+    with _explain(path), open(checks.open_regular(path), "rb") as stream:
         check_both_sums(stream)
         header = _header(stream)
         budget = _budget(stream)
@@ -123,7 +123,7 @@ def read_header(path: Path, *, check_sums: bool = False) -> Header:
 
     Raises `ManipError` naming the file.
     """
-    with _explain(path), path.open("rb") as stream:
+    with _explain(path), open(checks.open_regular(path), "rb") as stream:
         if check_sums:
             check_both_sums(stream)
         return _header(stream)

@@ -1,26 +1,32 @@
-"""Datasets through LeRobot's own code: for features that only its writer knows, and for training with its loader."""
+"""Datasets through LeRobot's own code: for features that only its writer knows, and for what its policies ask for."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import shutil
-from collections.abc import Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 from typing import Any, override
 
 import numpy as np
-from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
+import pandas as pd
+import pyarrow as pa
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_layout import EPISODES_FILES, INFO, TASKS
-from manip_il.data.lerobot_read import check_dataset
+from datasets import Dataset
+from manip_il import checks
+from manip_il.data.info import NUMBERS, PICTURES, Feature, read_info, read_object
+from manip_il.data.lazy_frames import without_progress_bars
+from manip_il.data.lerobot_layout import EPISODES_FILES, QUANTILES, STAT_NAMES, STATS, TASK_INDEX
+from manip_il.data.lerobot_read import check_all_pictures, check_dataset, read_instructions
+from manip_il.data.parquet_files import find_shards, read_file
 from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError
@@ -67,23 +73,30 @@ def write_with_library(
 
 def _save(dataset: LeRobotDataset) -> None:
     """Save an episode without LeRobot's progress bar."""
-    enabled = is_progress_bar_enabled()
-    disable_progress_bar()
-    try:
-        with scheduling_kept():
-            dataset.save_episode(parallel_encoding=False)
-    finally:
-        if enabled:
-            enable_progress_bar()
+    with without_progress_bars(), scheduling_kept():
+        dataset.save_episode(parallel_encoding=False)
 
 
 def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
-    """Join datasets into `root`, which must not exist, by LeRobot; every video stays a file of its own."""
+    """Join datasets into `root`, which must not exist, by LeRobot; every video stays a file of its own.
+
+    Raises `ManipError` for one that its readers must not open, or that it cannot join.
+    """
     for source in roots:
         check_dataset(source)
+        check_all_pictures(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
-    with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
-        aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
+            aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+    except Exception as error:  # of every kind: it takes what the files say
+        if isinstance(error, OSError) and error.filename:  # the disk's refusal names its file
+            raise
+        told = checks.shorten(" ".join(str(error).split()))
+        joined = ", ".join(map(str, roots))
+        raise ManipError(
+            f"LeRobot cannot join {joined} ({type(error).__name__}: {told}); see `manip-il doctor`"
+        ) from error
 
 
 class Metadata(LeRobotDatasetMetadata):
@@ -99,39 +112,23 @@ class Metadata(LeRobotDatasetMetadata):
     task_numbers: tuple[I64, ...] = ()
     learnt_actions: NDArray[np.float32] | None = None
 
+    @override
+    def _load_metadata(self) -> None:
+        """Read the files with this program's readers: LeRobot's decode what the files' own metadata asks for."""
+        self.info = load_info(self.root)
+        tasks = sorted(read_instructions(self.root).items())
+        self.tasks = pd.DataFrame(
+            {TASK_INDEX: [number for number, _ in tasks]}, index=pd.Index([text for _, text in tasks], name="task")
+        )
+        self.episodes = _episodes(self.root)
+        self.stats = read_stats(self.root)
+
     def joint_tasks(self, own: I64) -> I64:
         """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""
         if len(self.roots) == 1:
             return own
         pieces = np.split(own, np.cumsum(self.frames)[:-1])
         return np.concatenate([numbers[piece] for numbers, piece in zip(self.task_numbers, pieces, strict=True)])
-
-    def numbered(self, datasets: Sequence[LeRobotDataset]) -> Sequence[Any]:
-        """Return the datasets, one for each root, with frames, episodes and tasks numbered as in `read_tables`."""
-        if len(datasets) == 1:
-            return datasets
-        starts = np.cumsum([(0, 0), *zip(self.frames, self.episodes_of, strict=True)], axis=0).tolist()
-        parts = zip(datasets, starts, self.task_numbers, strict=False)
-        return [_Numbered(one, frames, episodes, tasks) for one, (frames, episodes), tasks in parts]
-
-
-@dataclass(frozen=True)
-class _Numbered:
-    """A dataset in a row of several. frames, episodes: of those before it. tasks: joint number of its every task."""
-
-    dataset: Any  # LeRobot's
-    frames: int
-    episodes: int
-    tasks: I64
-
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, row: int) -> Frame:
-        frame: Frame = self.dataset[row]
-        task = int(frame["task_index"])
-        more = {"index": self.frames, "episode_index": self.episodes, "task_index": int(self.tasks[task]) - task}
-        return frame | {key: frame[key] + number for key, number in more.items()}
 
 
 def learn_actions(meta: Metadata, actions: NDArray[np.float32]) -> None:
@@ -158,11 +155,13 @@ def read_metadata(*roots: Path) -> Metadata:
         _join_tasks(first, metas)
         alike = {key for key in first.features if all(_shape(meta, key) == _shape(first, key) for meta in metas)}
         first.info.features = {key: value for key, value in first.features.items() if key in alike}
-    stats = [meta.stats or {} for meta in metas]
+    stats: list[dict[str, Any]] = [meta.stats or {} for meta in metas]
     shared = [{key: one for key, one in own.items() if key in first.features} for own in stats]
     joined = stats[0] if len(metas) == 1 else aggregate_stats(shared)
     for key in first.camera_keys:
-        joined[key] |= {name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()}
+        joined[key] = joined.get(key, {}) | {
+            name: np.asarray(values, np.float32) for name, values in IMAGENET_STATS.items()
+        }
     first.stats = joined
     first.info.total_episodes = sum(first.episodes_of)
     first.info.total_frames = sum(first.frames)
@@ -190,55 +189,63 @@ def _join_tasks(first: Metadata, metas: Sequence[Metadata]) -> None:
     own = [_instructions(meta) for meta in metas]
     joint = {text: number for number, text in enumerate(dict.fromkeys(text for texts in own for text in texts))}
     first.task_numbers = tuple(np.array([joint[text] for text in texts], np.int64) for texts in own)
-    if first.tasks is not None:
-        first.tasks = first.tasks.reindex(list(joint)).assign(task_index=list(joint.values()))
+    first.tasks = first.tasks.reindex(list(joint)).assign(task_index=list(joint.values()))
 
 
 def _instructions(meta: Metadata) -> list[str]:
-    return [] if meta.tasks is None else list(map(str, meta.tasks.sort_values("task_index").index))
+    return list(map(str, meta.tasks.index))
 
 
 def _metadata(root: Path) -> Metadata:
     check_dataset(root)  # else LeRobot would request what is not there from the Hub
-    meta = Metadata(f"local/{root.name}", root=root)
-    if meta.stats is None:
-        raise ManipError(f"{root} has no statistics (meta/stats.json); run `manip-il doctor` to see what is left")
-    return meta
+    return Metadata(f"local/{root.name}", root=root)
 
 
-def lerobot_windows(
-    root: Path,
-    repo_id: str,
-    delta_timestamps: Mapping[str, Sequence[float]] | None,
-    episodes: Sequence[int] | None = None,
-) -> LeRobotDataset:
-    """Open a dataset with LeRobot's own reader, for a `DataLoader`; it decodes on access, and never uses the Hub.
+def _episodes(root: Path) -> Dataset:
+    """The table of episodes without their statistics."""
+    shards = find_shards(root, EPISODES_FILES)
+    kept = [[name for name in shard.columns if not name.startswith("stats/")] for shard in shards]
+    tables = [read_file(shard.path, names) for shard, names in zip(shards, kept, strict=True)]
+    try:
+        return Dataset(pa.concat_tables(tables))
+    except Exception as error:  # types that `datasets` does not know, files that differ in theirs
+        raise ManipError(f"cannot read {root}/meta/episodes: {error}; run `manip-il doctor` to see why") from error
 
-    A picture is uint8 (3, height, width), the same bytes as in the frame cache, and (K, 3, height, width) where
-    `delta_timestamps` [s] asks for a window; episodes: the ones to read, all by default. Raises `ManipError` for a
-    folder that is no dataset or that lacks files.
+
+def read_stats(root: Path) -> dict[str, dict[str, NDArray[Any]]]:
+    """Return column -> statistic -> numbers, as LeRobot has them: (n,), of pictures (channels, 1, 1).
+
+    Raises `ManipError` for a statistic that is missing, that is not numbers, or that is not of the column's shape.
     """
-    for pattern in (INFO, TASKS, EPISODES_FILES):  # LeRobot would request them from the Hub
-        if not any(root.glob(pattern)):
-            raise ManipError(f"{root} is not a complete LeRobot dataset: no file matches {pattern}")
-    check_dataset(root)
-    return _LocalDataset(
-        repo_id,
-        root=root,
-        episodes=None if episodes is None else list(episodes),
-        delta_timestamps=None if delta_timestamps is None else {key: list(v) for key, v in delta_timestamps.items()},
-        revision="local",  # no version, so that LeRobot does not look for one on the Hub
-        image_transforms=_to_bytes,
-        return_uint8=True,
-    )
+    path = root / STATS
+    try:
+        found = read_object(path)
+    except FileNotFoundError:
+        advice = "run `manip-il doctor` to see what is left"
+        raise ManipError(f"{root} has no statistics ({STATS}); {advice}") from None
+    except (OSError, ValueError) as error:
+        raise ManipError(f"cannot read {path}: {error}; `manip-il doctor --repair=true` computes it again") from error
+    known = [feature for feature in read_info(root).of_dtype(*NUMBERS, *PICTURES) if feature.key in found]
+    return {feature.key: _statistics(path, feature, found[feature.key]) for feature in known}
 
 
-class _LocalDataset(LeRobotDataset):
-    @override
-    def _download(self, download_videos: bool = True, *, token: str | bool | None = None) -> None:
-        raise ManipError(f"{self.root} lacks data or video files of its episodes; run `manip-il doctor` to see which")
-
-
-def _to_bytes(pictures: Any) -> Any:
-    """A tensor of levels as bytes: videos come so, images that are stored one by one in [0, 1]."""
-    return pictures.mul(255).round().byte() if pictures.is_floating_point() else pictures
+def _statistics(path: Path, feature: Feature, table: Any) -> dict[str, NDArray[Any]]:
+    shapes = {(feature.size,), feature.shape[-1:], feature.shape}
+    if feature.dtype in PICTURES:
+        shapes = {(count, 1, 1) for count in feature.shape}  # the names of its axes may be missing
+    statistics: dict[str, NDArray[Any]] = {}
+    for name in STAT_NAMES:
+        value = table.get(name) if isinstance(table, dict) else None
+        if value is None and name in QUANTILES:
+            continue
+        wanted = {(1,)} if name == "count" else shapes
+        try:
+            numbers = np.atleast_1d(np.asarray(value))
+        except (ValueError, OverflowError):
+            numbers = np.zeros(0, object)
+        if numbers.dtype.kind not in "iuf" or numbers.shape not in wanted:
+            shape = " or ".join(map(str, sorted(wanted)))
+            what = f"{name} of {feature.key} is {checks.shorten(value)}"
+            raise ManipError(f"{path}: {what}; expected numbers of shape {shape} (`manip-il doctor` tells more)")
+        statistics[name] = numbers
+    return statistics

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +18,10 @@ from manip_il.data import schema as s
 from manip_il.data.arrays import Allocate, in_memory
 from manip_il.data.draws import read_drawn
 from manip_il.data.frame_source import find_clips, to_part
-from manip_il.data.info import LARGEST_META, PICTURES, info_problems
+from manip_il.data.info import LARGEST_META, PICTURES, info_problems, read_object
 from manip_il.data.parquet_files import UNREADABLE, check_files, read_column, read_file, read_tasks
-from manip_il.data.pictures import VideoReader, decode_picture
+from manip_il.data.picture_columns import check_pictures
+from manip_il.data.pictures import VideoReader, decode_cell
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -228,11 +229,43 @@ def _spec(root: Path, ours: dict[str, Any]) -> s.RobotTaskSpec:
 def check_dataset(root: Path) -> None:
     """Raise `ManipError` where another program must not be let read a dataset: for what its description or files say.
 
-    Paths and names that lead out of its folder, and parquet files that unpack to more than real ones do.
+    Paths and names that lead out of its folder, what is no regular file, and parquet files that unpack to more than
+    real ones do.
     """
     _read_info(root)
+    for path in find_irregular(root):
+        raise ManipError(f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links")
     for pattern in (layout.TASKS, layout.EPISODES_FILES, layout.DATA_FILES):
         check_files(root, sorted(root.glob(pattern)), None)
+
+
+def check_all_pictures(root: Path) -> None:
+    """Raise `ManipError` unless every picture of a dataset is in its files, as PNG or JPEG, and every film is an MP4.
+
+    For a dataset that came from somewhere: readers of others, Hugging Face's and FFmpeg's, open what it names besides.
+    """
+    try:
+        features = read_object(root / layout.INFO).get("features")
+    except (OSError, ValueError):
+        features = None  # no reader gets to its pictures
+    declared = [key for key, one in features.items() if _dtype_of(one) == "image"] if isinstance(features, dict) else []
+    for pattern in (layout.TASKS, layout.EPISODES_FILES, layout.DATA_FILES):
+        for path in sorted(root.glob(pattern)):
+            check_files(root, [path], declared)
+            check_pictures(path, declared)
+    for path in sorted(root.glob("videos/**/*.mp4")):
+        with open(checks.open_regular(path), "rb") as file:
+            if file.read(8)[4:] != b"ftyp":
+                raise ManipError(f"{path} does not begin as an MP4 file does; FFmpeg would take it for another format")
+
+
+def _dtype_of(feature: Any) -> Any:
+    return cast(dict[str, Any], feature).get("dtype") if isinstance(feature, dict) else None
+
+
+def find_irregular(root: Path) -> list[Path]:
+    """Return what a folder holds besides files and folders: pipes, devices, sockets and links to nothing."""
+    return sorted(path for path in root.rglob("*") if not (path.is_file() or path.is_dir()))
 
 
 def _decode(
@@ -247,8 +280,8 @@ def _decode(
 def _stills(root: Path, key: str, column: pa.ChunkedArray) -> NDArray[np.uint8]:
     """Pictures of a data file's rows, (T, height, width, 3)."""
     try:
-        return np.stack([decode_picture(one["bytes"]) for one in column.to_pylist()])
-    except (*UNREADABLE, KeyError, TypeError) as error:
+        return np.stack([decode_cell(one) for one in column.to_pylist()])
+    except UNREADABLE as error:
         raise ManipError(f"cannot read the pictures {key} in {root}: {error}") from error
 
 
@@ -308,7 +341,7 @@ def _check_rows(root: Path, found: int) -> None:
 def _read_info(root: Path) -> dict[str, Any]:
     """Stricter than `info.read_info`, which the doctor lists all problems of: no NaN, and `robot_type` is there."""
     path = root / layout.INFO
-    if not path.is_file():
+    if not path.exists():
         raise ManipError(f"{root} is not a LeRobot dataset: it has no {layout.INFO}")
     info = checks.read_json(path, "a LeRobot dataset's description", LARGEST_META)
     version = info.get("codebase_version")
@@ -325,7 +358,7 @@ def _read_info(root: Path) -> dict[str, Any]:
 
 def _read_ours(root: Path) -> dict[str, Any]:
     path = root / layout.OURS
-    if not path.is_file():
+    if not path.exists():
         _read_info(root)
         return {}
     ours = checks.read_json(path, "what this program says of its datasets", LARGEST_META)

@@ -208,14 +208,13 @@ class Shard:
 
 def find_shards(root: Path, pattern: str) -> list[Shard]:
     """Return every parquet file that matches, in LeRobot's order; none of them has to be readable."""
-    paths = sorted(path for path in root.glob(pattern) if path.is_file())
-    return [open_shard(path.relative_to(root).as_posix(), path) for path in paths]
+    return [open_shard(path.relative_to(root).as_posix(), path) for path in sorted(root.glob(pattern))]
 
 
 def open_shard(name: str, path: Path) -> Shard:
     """Return the file with its footer read."""
     try:
-        with path.open("rb") as stream:
+        with open(checks.open_regular(path), "rb") as stream:
             size = stream.seek(0, 2)
             stream.seek(0)
             first = stream.read(4)
@@ -241,7 +240,7 @@ def _column_names(path: Path, size: int, changed: int) -> tuple[str, ...]:
 
 def read_tasks(root: Path) -> tuple[list[int], list[str]]:
     """Return numbers and names of a dataset's tasks. Raises one of `UNREADABLE`."""
-    if not (root / layout.TASKS).is_file():
+    if not (root / layout.TASKS).exists():
         raise FileNotFoundError(root / layout.TASKS)
     shard = open_shard(layout.TASKS, root / layout.TASKS)
     if shard.problem:

@@ -17,6 +17,9 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from manip_il import checks
+from manip_il.data.picture_columns import picture_columns
+
 MIB = 1024 * 1024
 LARGEST_FOOTER = 32 * MIB  # [bytes]; 10,000 row groups of 20 columns take about 30
 LARGEST_PAGE = 64 * MIB  # unpacked [bytes]; writers close a page at one, or behind a batch of long values
@@ -83,7 +86,7 @@ def check_parquet(paths: Iterable[Path], columns: Sequence[str] | None = None, l
 @lru_cache(1_000)
 def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[int, ...]) -> int:
     """The most that the columns' values take, unpacked [bytes]. version: of the file, so that it is read once."""
-    with path.open("rb") as stream:
+    with open(checks.open_regular(path), "rb") as stream:
         if stream.seek(0, 2) < 12:
             raise ValueError("it is not a parquet file")
         with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -92,6 +95,7 @@ def _unpacked_size(path: Path, columns: tuple[str, ...] | None, version: tuple[i
             count = len(schema.names)
             if count > MOST_COLUMNS:
                 raise ValueError(f"it has {count:,} columns; expected at most {MOST_COLUMNS:,}")
+            picture_columns(schema.to_arrow_schema())  # refuses what a reader would run
             if twice := [name for name, n in Counter(schema.to_arrow_schema().names).items() if n > 1]:
                 raise ValueError(f"it has more than one column {twice[0][:100]!r}; expected different names")
             read = ("",) if columns is None else tuple(f"{column}." for column in columns)

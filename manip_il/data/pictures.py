@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
+from typing import Any, cast
 
 import av
 import numpy as np
@@ -22,6 +23,7 @@ from av.container import InputContainer
 from numpy.typing import NDArray
 from PIL import Image
 
+from manip_il import checks
 from manip_il.data.schema import MOST_PIXELS
 from manip_il.errors import ManipError
 
@@ -66,6 +68,15 @@ def to_png(picture: NDArray[np.uint8]) -> bytes:
     stream = BytesIO()
     Image.fromarray(picture).save(stream, "PNG", compress_level=_LEVEL)
     return stream.getvalue()
+
+
+def decode_cell(cell: Any) -> Pictures:
+    """Return the picture (height, width, 3) in a cell of a data file, whose `path` is not followed.
+
+    Raises `ValueError` as `decode_picture` does.
+    """
+    content = cast(dict[str, Any], cell).get("bytes") if isinstance(cell, dict) else None
+    return decode_picture(content if isinstance(content, bytes) else None)
 
 
 def decode_picture(content: bytes | None) -> Pictures:
@@ -141,10 +152,13 @@ def count_packets(path: Path) -> int:
 
 def _check_index(path: Path) -> None:
     """Raise `ValueError` where FFmpeg would make a larger index of the file than any video needs."""
-    if path.stat().st_size < _BOX:
+    if path.is_file() and path.stat().st_size < _BOX:
         return  # FFmpeg refuses it
     frames, edits = 0, 1
-    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with (
+        open(checks.open_regular(path), "rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
         for name, size, start, stop in find_boxes(data):
             if name == b"mdat" and size >= _BOX:
                 continue  # coded frames

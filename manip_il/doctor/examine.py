@@ -30,7 +30,15 @@ from manip_il.doctor.leftovers import (
     check_stale_files,
     count_readable,
 )
-from manip_il.doctor.meta import check_episodes, check_fingerprint, check_footers, check_info, check_spec, check_tasks
+from manip_il.doctor.meta import (
+    check_episodes,
+    check_fingerprint,
+    check_footers,
+    check_info,
+    check_regular,
+    check_spec,
+    check_tasks,
+)
 from manip_il.doctor.rows import check_columns, check_finite, check_rows, check_statistics, check_task_numbers
 from manip_il.errors import ManipError
 
@@ -38,6 +46,7 @@ Check = Callable[[Dataset], Iterator[Finding]]
 
 CHECKS: tuple[Check, ...] = (
     check_info,
+    check_regular,
     check_recorder,
     check_footers,
     check_episodes,

@@ -12,6 +12,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
 from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature, read_object
+from manip_il.data.lerobot_read import find_irregular
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
 from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, list_first, plural, warning
@@ -36,6 +37,13 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
         wanted = axes if feature.dtype in PICTURES else feature.size
         if count not in (None, wanted) and not (axes > 1 and count == axes):
             yield error(f"{layout.INFO}: {key}", f"{count} names for shape {list(feature.shape)}; expected {wanted}")
+
+
+def check_regular(dataset: Dataset) -> Iterator[Finding]:
+    """Check that the folder holds files and folders alone: a reader of a pipe waits, a device has no end."""
+    for path in find_irregular(dataset.root):
+        place = path.relative_to(dataset.root).as_posix()
+        yield error(place, "is not a regular file, but a pipe, device, socket or broken link")
 
 
 def check_footers(dataset: Dataset) -> Iterator[Finding]:

@@ -252,6 +252,6 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def _format_count(value: float) -> str:
-    if value >= 10_000:
+    if value >= 1000:
         return f"{value / 1000:g}k"
-    return f"{value:,.0f}" if value >= 10 or value == round(value) else f"{value:g}"
+    return f"{value:.0f}" if value >= 10 or value == round(value) else f"{value:g}"

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, printable
 from manip_il.evaluation.report_data import PolicyRow
 from manip_il.evaluation.results import EvalResult
 
@@ -79,7 +79,7 @@ def print_table(table: Table, console: Console | None = None, empty: str = "") -
     for index, row in enumerate(table.rows):
         style = STYLES.get(table.kinds[index]) if terminal and table.kinds else None
         # Text, as Rich would take the brackets of an interval for markup.
-        drawn.add_row(*(Text((cell or empty).replace(" [", f"{gap}[")) for cell in row), style=style)
+        drawn.add_row(*(Text(printable(cell or empty).replace(" [", f"{gap}[")) for cell in row), style=style)
     console.print(drawn)
 
 

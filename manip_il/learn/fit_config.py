@@ -75,7 +75,11 @@ class FitConfig:
     option of it that is not there.
     """
 
-    policy: Mapping[str, Any] = option(dict, "type (mlp), or path of a policy to start from; ...")
+    policy: Mapping[str, Any] = option(
+        dict,
+        "an option of the policy by its name: type (mlp, cnn or one of LeRobot's), path of a policy to start from, or "
+        "one that --policy.type=TYPE --help lists",
+    )
     action_space: str | None = option(
         None, "what is learnt, out of the same dataset; by default joint_delta by mlp and cnn, else joint_target"
     )
@@ -85,23 +89,27 @@ class FitConfig:
     steps: int | None = option(None, f"gradient steps; {_by_default('steps')}")
     batch_size: int | None = option(None, f"frames per step; {_by_default('batch_size')}")
     lr: float | None = option(None, f"peak learning rate; by default {MLP_LR} for mlp, else the policy's own")
-    optimizer: Mapping[str, Any] = option(dict, "in place of the policy's own: type (adamw), ...")
-    scheduler: Mapping[str, Any] = option(dict, "in place of the policy's own: type, ...")
+    optimizer: Mapping[str, Any] = option(
+        dict, "an option of an optimiser in place of the policy's own: type (adamw), weight_decay, ..."
+    )
+    scheduler: Mapping[str, Any] = option(
+        dict, "an option of a schedule of the learning rate in place of the policy's own: type, ..."
+    )
     eval_split: float = option(0.05, "share of the episodes held out for val_loss")
     image_augment: bool | None = option(
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
-    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it LeRobot's loader is used")
+    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it each step decodes its own")
     memory: float | None = option(
         None, "what the numbers learnt from may take [GB]; if they take more, they are kept in files of OUTPUT_DIR"
     )
-    num_workers: int = option(4, "processes of LeRobot's loader")
+    num_workers: int = option(4, "processes that decode pictures beyond image_cache_gb")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")
     save_freq: int | None = option(None, f"steps between checkpoints; {_by_default('save_freq')}")
     log_freq: int = option(200, "steps between metrics")
     tensorboard: bool = option(False, "curves for TensorBoard, in OUTPUT_DIR/tensorboard")
-    wandb: Mapping[str, Any] = option(dict, "Weights & Biases: enable, project, mode, ...")
+    wandb: Mapping[str, Any] = option(dict, "an option of Weights & Biases: enable, project, mode, ...")
     trust: bool = False
     seed: int = 0
     init_from: Path | None = None

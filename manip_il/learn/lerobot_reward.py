@@ -11,10 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.info import NUMBERS
+from manip_il.data.lerobot_library import read_metadata
+from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
+from manip_il.learn.columns import EPISODE_INDEX
 from manip_il.learn.limits import threads
+from manip_il.learn.samples import SampleSource, Windows, read_later
 
 _BATCH = 32
 
@@ -38,11 +42,18 @@ def score_by_lerobot(
     if missing := [key for key in features if key not in meta.features]:
         raise ManipError(f"{root} lacks {', '.join(missing)}, which the reward model in {folder} sees")
     deltas = config.observation_delta_indices
-    ahead = None if deltas is None else {key: [delta / meta.fps for delta in deltas] for key in features}
-    dataset = lerobot_windows(root, meta.repo_id, ahead)
+    ahead = {} if deltas is None else {key: np.asarray(deltas, np.int64) for key in features}
+    table = read_table(root, [key for key, feature in meta.features.items() if feature["dtype"] in NUMBERS])
+    source = SampleSource(
+        Windows(table[EPISODE_INDEX].reshape(-1), ahead),
+        {key: torch.from_numpy(column.copy()) for key, column in table.items()},
+        read_later([root], [key for key in meta.camera_keys if key not in meta.depth_keys]),
+        tuple(map(str, meta.tasks.index)),
+    )
+    samples = np.arange(meta.total_frames)
     found: list[torch.Tensor] = []
     with threads(1), torch.inference_mode():
-        for batch in torch.utils.data.DataLoader(dataset, batch_size=_BATCH, generator=torch.Generator()):
+        for batch in source.batches(np.split(samples, range(_BATCH, len(samples), _BATCH))):
             pictured = {key: to_float(one) for key, one in batch.items() if _is_picture(one)}
             rewards = model.compute_reward(preprocessor(batch | pictured)).reshape(-1).cpu()
             found.append(rewards)

@@ -1,4 +1,4 @@
-"""Samples of datasets: their frames in memory and in a cache of pictures, or read by LeRobot's own loader.
+"""Samples of datasets: numbers in memory, pictures in a cache, or decoded when they are drawn.
 
 LeRobot's policies say by `*_delta_indices` which frames around a sample's own they want: its window. A frame outside of
 the episode is the nearest one inside, and `<column>_is_pad` says so.
@@ -20,7 +20,7 @@ from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.lerobot_library import lerobot_windows
+from manip_il.data.lazy_frames import LazyFrames
 from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
@@ -60,6 +60,13 @@ class Windows:
         inside = np.clip(wanted, self._first[samples, None], self._last[samples, None])
         return inside, inside != wanted
 
+    def padded_rows(self, samples: I64, key: str) -> tuple[I64, Batch]:
+        """Return `rows` with the padding by LeRobot's name; without a window the samples (B,), and no padding."""
+        if key not in self.deltas:
+            return samples, {}
+        rows, padded = self.rows(samples, key)
+        return rows, {f"{key}_is_pad": torch.from_numpy(padded)}
+
     def usable(self, valid: NDArray[np.bool_], drop_last: int = 0) -> I64:
         """Return the samples to learn from (S,): every label in the window is sound, `drop_last` frames left out.
 
@@ -97,7 +104,7 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class JoinedFrames:
     """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
 
-    def __init__(self, pieces: Sequence[NDArray[np.uint8]]):
+    def __init__(self, pieces: Sequence[NDArray[np.uint8] | LazyFrames]):
         self._pieces = pieces
         self._ends = np.cumsum([len(piece) for piece in pieces])
 
@@ -114,76 +121,68 @@ class JoinedFrames:
 
 
 @dataclass(frozen=True)
-class MemorySource:
+class SampleSource:
     """A batch is one gather a column.
 
-    columns: numbers, (N, d) or (N,), by LeRobot's names. frames: camera column -> uint8 (N, 3, H, W), memory-mapped.
-    tasks: LeRobot's text of every `task_index`.
+    columns: numbers, (N, d) or (N,), by LeRobot's names. frames: camera column -> uint8 (N, 3, H, W). tasks: LeRobot's
+    text of every `task_index`. workers: processes that read the pictures ahead; None reads them here, out of memory.
     """
 
     windows: Windows
     columns: Mapping[str, torch.Tensor]
     frames: Mapping[str, JoinedFrames]
     tasks: tuple[str, ...]
+    workers: int | None = None
 
     def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
         """Return one batch for every array of sample numbers, (B,), in that order; pictures are uint8."""
-        return (self.batch(one) for one in samples)
+        if self.workers is None or not self.frames:
+            return (self.batch(one) for one in samples)
+        loader = torch.utils.data.DataLoader(
+            _Pictures(self.windows, self.frames),
+            batch_size=None,
+            sampler=samples,
+            num_workers=self.workers,
+            multiprocessing_context="spawn" if self.workers else None,  # decoders do not survive a fork
+            generator=torch.Generator(),  # else it draws from the global one, and a resumed run would differ
+        )
+        return (self._numbers(one.numpy()) | pictures for one, pictures in loader)
 
     def batch(self, samples: I64) -> Batch:
         """Return the batch of these samples, (B,)."""
+        return self._numbers(samples) | _Pictures(self.windows, self.frames)[samples][1]
+
+    def _numbers(self, samples: I64) -> Batch:
         batch: Batch = {}
-        for key, values in {**self.columns, **self.frames}.items():
-            rows, padded = self.windows.rows(samples, key) if key in self.windows.deltas else (samples, None)
-            numbers = isinstance(values, torch.Tensor)
-            batch[key] = values[torch.from_numpy(rows)] if numbers else torch.from_numpy(values[rows])
-            if padded is not None:
-                batch[f"{key}_is_pad"] = torch.from_numpy(padded)
+        for key, values in self.columns.items():
+            rows, padded = self.windows.padded_rows(samples, key)
+            batch[key] = values[torch.from_numpy(rows)]
+            batch |= padded
         batch[TASK] = [self.tasks[int(i)] for i in batch[TASK_INDEX]]
         return batch
 
 
 @dataclass(frozen=True)
-class LibrarySource:
-    """LeRobot's dataset behind a `DataLoader`: slow, but it needs no memory.
+class _Pictures(torch.utils.data.Dataset[tuple[I64, Batch]]):
+    """The samples (B,) with their pictures, for `DataLoader`."""
 
-    dataset: gives the windows already. workers: processes that decode.
-    """
-
-    dataset: torch.utils.data.Dataset[Batch]
-    workers: int
-
-    def batches(self, samples: Iterable[I64]) -> Iterator[Batch]:
-        """Return one batch for every array of sample numbers, (B,), in that order; pictures are float32 or uint8."""
-        loader = torch.utils.data.DataLoader(
-            self.dataset,
-            batch_sampler=(one.tolist() for one in samples),
-            num_workers=self.workers,
-            multiprocessing_context="spawn" if self.workers else None,  # decoders do not survive a fork
-            generator=torch.Generator(),  # else it draws from the global one, and a resumed run would differ
-        )
-        return iter(loader)
-
-
-@dataclass(frozen=True)
-class WithActions(torch.utils.data.Dataset[Batch]):
-    """Another dataset's samples with other actions, of every frame (N, n)."""
-
-    dataset: torch.utils.data.Dataset[Batch]
     windows: Windows
-    actions: NDArray[np.float32]
+    frames: Mapping[str, JoinedFrames]
 
-    def __getitem__(self, index: int) -> Batch:
-        planned = ACTION in self.windows.deltas
-        rows = self.windows.rows(np.array([index]), ACTION)[0][0] if planned else index
-        return self.dataset[index] | {ACTION: torch.from_numpy(self.actions[rows])}
+    def __getitem__(self, samples: I64) -> tuple[I64, Batch]:
+        batch: Batch = {}
+        for key, values in self.frames.items():
+            rows, padded = self.windows.padded_rows(samples, key)
+            batch[key] = torch.from_numpy(values[rows])
+            batch |= padded
+        return samples, batch
 
 
 @dataclass(frozen=True)
 class Samples:
     """The data of one fit. train, held_out: sample numbers; digest: of everything that is learnt from."""
 
-    source: MemorySource | LibrarySource
+    source: SampleSource
     train: I64
     held_out: I64
     cameras: tuple[str, ...]
@@ -231,20 +230,13 @@ def load_samples(
     train, held_out = split_by_episode(episodes[usable], config.eval_split, config.seed)
     limit = int(config.image_cache_gb * 1e9)
     frames = _frames(roots, cameras, limit, on_frames)
+    workers = None
     if frames is None:
-        names = ", ".join(map(str, roots))
-        _LOG.warning(
-            "the pictures of %s take more than %g GB: LeRobot's loader decodes them on the fly", names, limit / 1e9
-        )
-        ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in windows.deltas.items()}
-        read = [lerobot_windows(root, meta.repo_id, ahead or None) for root in roots]
-        dataset: torch.utils.data.Dataset[Batch] = torch.utils.data.ConcatDataset(meta.numbered(read))
-        if meta.learnt_actions is not None:
-            dataset = WithActions(dataset, windows, meta.learnt_actions)
-        source = LibrarySource(dataset, config.num_workers)
-    else:
-        columns = {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)}
-        source = MemorySource(windows, columns, frames, tuple(map(str, meta.tasks.index)))
+        names, workers = ", ".join(map(str, roots)), config.num_workers
+        _LOG.warning("the pictures of %s take more than %g GB: they are decoded on the fly", names, limit / 1e9)
+        frames = read_later(roots, cameras)
+    columns = {key: torch.from_numpy(table[key]) for key in (*numbers, *_ALWAYS)}
+    source = SampleSource(windows, columns, frames, tuple(map(str, meta.tasks.index)), workers)
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
     return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
@@ -267,6 +259,11 @@ def _frames(
             return None
         found.append(frames)
     return {camera: JoinedFrames([frames[camera] for frames in found]) for camera in cameras}
+
+
+def read_later(roots: Sequence[Path], cameras: Sequence[str]) -> dict[str, JoinedFrames]:
+    """Return the pictures of every camera in all datasets, which are decoded when they are read."""
+    return {camera: JoinedFrames([LazyFrames(root, camera) for root in roots]) for camera in cameras}
 
 
 def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:

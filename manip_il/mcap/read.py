@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data.mcap_records import MIB, Budget, read_messages
 from manip_il.data.pictures import open_picture
 from manip_il.errors import ManipError, nearest
@@ -141,7 +142,7 @@ def _read(path: Path, topics: Iterable[str], counts: Counter[str], decoded: Coll
     decoders: dict[int, Callable[[bytes], Any]] = {}
     factory = DecoderFactory()
     try:
-        with path.open("rb") as stream:
+        with open(checks.open_regular(path), "rb") as stream:
             budget = Budget(path.stat().st_size, LARGEST_FILE, _LARGEST_RATIO)
             for schema, channel, message in read_messages(stream, budget):
                 counts[channel.topic] += 1

@@ -1,4 +1,4 @@
-"""Files of a MuJoCo model: read, mended where the YAML says so, and what identifies them."""
+"""Files of a MuJoCo model: read, mended where the YAML says so, and tried in a child process if they are anyone's."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import mujoco
+import numpy as np
 
 from manip_il import checks
 from manip_il.errors import ManipError, UsageError
@@ -15,14 +16,17 @@ from manip_il.robots.reading import place
 
 KEYS = ("model", "includes", "meshes", "mend")  # of a YAML
 _MOST_MENDED = 10_000  # of a text that is mended [characters]
+_LARGEST = 16 * 1024**2  # of an MJCF [bytes], and of what it is mended to [characters]
+_LARGEST_NUMBER = 1e15  # of a model; dampings of 1e11 are in use
 
 
 @dataclass(frozen=True)
 class ModelFiles:
     """An MJCF and what it needs; paths are absolute.
 
-    includes, meshes: folders of what it includes and of its meshes. mend: text of the file, and what MuJoCo reads in
-    its place: for a file of somebody else's that does not compile.
+    includes: the folder that the model is read as if it lay in: that of what it includes. meshes: the folder of its
+    meshes. mend: text of the file, and what MuJoCo reads in its place: for a file of somebody else's that does not
+    compile.
     """
 
     model: Path
@@ -44,45 +48,77 @@ class ModelFiles:
         return cls(place(f"{what}model", tree["model"], folder), **folders, mend=texts)
 
     def load(self, robot: str) -> mujoco.MjSpec:
-        """Read the model with its includes and meshes. Raises `UsageError` where MuJoCo cannot; robot: its name."""
+        """Read the model; MuJoCo finds what it includes and its meshes. Raises `UsageError` if it cannot be read.
+
+        robot: its name.
+        """
         try:
-            text = self._text()  # before MuJoCo: it does not say why a file cannot be read
-            if self.includes is None and self.meshes is None:
-                if not self.mend:
-                    return mujoco.MjSpec.from_file(str(self.model))
-                spec = mujoco.MjSpec.from_string(text)
-                spec.modelfiledir = str(self.model.parent)
-                return spec
-            included = {one.name: one.read_bytes() for one in self._included()}
-            spec = mujoco.MjSpec.from_string(text, include=included, assets=self._assets())
-        except (OSError, ValueError) as error:
-            raise UsageError(f"robot {robot}: cannot read {self.model}: {' '.join(str(error).split())}") from None
-        spec.meshdir = ""
+            model = self._mended(checks.read_bytes(self.model, "an MJCF", _LARGEST))
+            name = str((self.includes or self.model.parent) / f"mended {self.model.name}")
+            spec = mujoco.MjSpec.from_file(name, include={name: model})
+        except (ManipError, ValueError) as error:
+            why = " ".join(str(error).split())
+            named = "" if str(self.model) in why else f"cannot read {self.model}: "
+            raise UsageError(f"robot {robot}: {named}{why}") from None
+        if self.meshes is not None:
+            for mesh in spec.meshes:  # MuJoCo puts an included file's folder before what that names
+                mesh.file = mesh.file.removeprefix(spec.modelfiledir)
+            spec.meshdir = str(self.meshes)
         return spec
 
-    def content(self) -> tuple[list[tuple[str, int]], list[bytes]]:
-        """Return what identifies them: names and sizes of the meshes, and the texts."""
-        files = sorted((name, path.stat().st_size) for name, path in self.mesh_files().items())
-        return files, [one.read_bytes() for one in (self.model, *self._included())]
-
-    def mesh_files(self) -> dict[str, Path]:
-        """Return the model's meshes by name: of the folder that is given, else those that the model names."""
-        if self.meshes or self.includes:
-            folder = self.meshes or self.model.parent
-            return {str(one.relative_to(folder)): one for one in folder.rglob("*.stl")}
-        spec = self.load("")
-        return {mesh.file: self.model.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file}
-
-    def _text(self) -> str:
-        text = self.model.read_text()
+    def _mended(self, model: bytes) -> bytes:
+        if not self.mend:
+            return model
+        text = model.decode()
         for old, new in self.mend.items():
             if old not in text:
-                raise ManipError(f"{self.model} has no text {checks.shorten(old)} to mend")
+                raise ManipError(
+                    f"{self.model} has no text {checks.shorten(old)} to mend (files that it includes are not mended)"
+                )
+            if len(text) + text.count(old) * (len(new) - len(old)) > _LARGEST:
+                raise ManipError(f"{self.model} mended has more than {_LARGEST} characters; expected an MJCF")
             text = text.replace(old, new)
-        return text
+        return text.encode()
 
-    def _included(self) -> list[Path]:
-        return sorted((self.includes or self.model.parent).glob("*.xml"))
 
-    def _assets(self) -> dict[str, bytes]:
-        return {name: one.read_bytes() for name, one in self.mesh_files().items()}
+def try_models(robot: str, *models: ModelFiles) -> None:
+    """Compile models of a robot's for the first time, in a child process with limits of memory and time.
+
+    Raises `UsageError` if that fails, or if a number is not finite. robot: its name.
+    """
+    try:
+        checks.in_child(f"the model of robot {robot}", _compile, robot, models)
+    except ManipError as error:
+        raise UsageError(str(error)) from None
+
+
+def _compile(robot: str, models: tuple[ModelFiles, ...]) -> None:
+    for files in models:
+        try:
+            spec = files.load(robot)
+            _require_regular(robot, spec)
+            model = spec.compile()
+            mujoco.MjData(model)
+        except ValueError as error:
+            why = " ".join(str(error).split())
+            raise ManipError(f"robot {robot}: MuJoCo cannot compile {files.model}: {why}") from None
+        except RuntimeError:  # "unknown exception": an allocation beyond the limit
+            raise MemoryError from None
+        for name in sorted(dir(model), key=lambda name: name.endswith("0")):  # those last that follow from others
+            numbers = getattr(model, name)
+            if isinstance(numbers, np.ndarray) and numbers.dtype.kind == "f":
+                wrong = numbers[~(np.abs(numbers) <= _LARGEST_NUMBER)]
+                if wrong.size:
+                    raise ManipError(
+                        f"robot {robot}: {name} of {files.model} has {wrong[0]:g}; expected finite numbers up to "
+                        f"{_LARGEST_NUMBER:g}"
+                    )
+
+
+def _require_regular(robot: str, spec: mujoco.MjSpec) -> None:
+    """Raise `ManipError` for what a model names as a file and is a pipe, a socket or a device."""
+    for one in (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins):
+        for folder in (spec.meshdir, spec.texturedir):
+            path = Path(spec.modelfiledir, folder, one.file)
+            if path.exists() and not path.is_file() and not path.is_dir():
+                raise ManipError(f"robot {robot}: {path} is not a regular file")

@@ -10,6 +10,7 @@ import numpy as np
 
 from manip_il.robots.robot import Robot
 
+PLAIN = mujoco.MjSpec()  # its defaults are for what we add to a model, whose own may name a material or a range
 _KV_PER_KP = 1 / 20  # [s]: a time constant of one control step at 20 Hz
 _DAMPING = 1.0  # of an arm joint [N m s/rad]
 _FINGER_GAINS = (800.0, 20.0, 40.0)  # kp [N/m], kv [N s/m], force [N] of a sliding finger
@@ -51,7 +52,7 @@ def calm(spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
 def _position_actuator(spec: mujoco.MjSpec, joint: Any, gains: tuple[float, float, float]) -> None:
     """PD position control of one joint: force = kp (ctrl - q) - kv v, within +-force [N or N m]."""
     kp, kv, force = gains
-    actuator = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator = spec.add_actuator(PLAIN.default, name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.set_to_position(kp=kp, kv=kv)
     actuator.forcelimited, actuator.forcerange = True, [-force, force]
     if joint.range[0] < joint.range[1]:

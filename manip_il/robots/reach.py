@@ -1,7 +1,7 @@
 """A map of the points that a robot's hand, pointing down, gets to by inverse kinematics.
 
 It is computed once a robot and kept: beside the YAML of a robot that ships, else in the user's cache, under the hash
-of what it follows from.
+of what it follows from: the compiled model and what the YAML says beyond that.
 """
 
 from __future__ import annotations
@@ -13,18 +13,22 @@ import os
 import zipfile
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.robots import HERE
+from manip_il.checks import open_regular
+from manip_il.robots import HERE, ROBOTS
+from manip_il.robots.files import ModelFiles
 from manip_il.robots.meeting import CLEARANCE, Body
-from manip_il.robots.robot import Robot
+from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.rotations import angle_off_vertical, hand_down, off_yaw
+from manip_il.robots.spec import arm_spec
 
 if TYPE_CHECKING:
     from manip_il.robots.ik import ArmIK
@@ -137,33 +141,39 @@ def reach_of(robot: Robot) -> Reach:
 
 def kept_reach(robot: Robot) -> Reach | None:
     """Return a robot's map from where it is kept; None where it is not."""
-    for path in _places(robot):
-        with contextlib.suppress(*_BROKEN), np.load(path, allow_pickle=False) as kept:
-            return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
+    path = _place(robot)
+    with contextlib.suppress(*_BROKEN), open(open_regular(path), "rb") as file, np.load(file) as kept:
+        return Reach(kept["origin"].astype(np.float64), kept["errors"].astype(np.float64))
     return None
 
 
-def _places(robot: Robot) -> tuple[Path, Path]:
-    """Where a map may lie: beside the YAML of a robot that ships, and in the cache."""
-    name = f"{robot.name}.reach.{_key(robot)}.npz"
-    return HERE / name, Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manip_il" / name
+def _place(robot: Robot) -> Path:
+    """Where a map lies: beside the YAML of a robot that ships, else in the cache."""
+    if robot.name in ROBOTS and robot == get_robot(robot.name):
+        return HERE / f"{robot.name}.reach.npz"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "manip_il" / f"{robot.name}.reach.{_key(robot)}.npz"
 
 
 def keep_reach(robot: Robot, reach: Reach) -> None:
-    """Write a robot's map to the cache; one that cannot be kept is computed again."""
-    path = _places(robot)[-1]
+    """Write a robot's map to where it is kept; one that cannot be kept is computed again."""
+    path = _place(robot)
     partial = path.with_suffix(f".{os.getpid()}")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as stream:
-            np.savez_compressed(stream, origin=reach.origin, errors=reach.errors.astype(np.float32))
+        with open(open_regular(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "wb") as file:
+            np.savez_compressed(file, origin=reach.origin, errors=reach.errors.astype(np.float32))
         partial.replace(path)
 
 
 def _key(robot: Robot) -> str:
-    """Hash what a map follows from: the robot's files, and the constants of this file."""
+    """Hash what a map follows from: the constants of this file, the YAML, and the robot's model as it is compiled."""
     constants = (_VERSION, _CELL, _BEYOND, _ABOVE, _STEPS, _NEAR, _ANGLE, _BLOCKED, CLEARANCE)
-    return hashlib.sha256(repr(constants).encode() + robot.content()).hexdigest()[:16]
+    model = arm_spec(robot).compile()
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, compiled)
+    said = replace(robot, files=ModelFiles(Path()), gripper=replace(robot.gripper, files=None))  # paths do not count
+    return hashlib.sha256(repr((constants, said)).encode() + compiled.tobytes()).hexdigest()[:16]
 
 
 def _solve(robot: Robot) -> Reach:

@@ -60,8 +60,11 @@ def place(what: str, value: Any, folder: Path) -> Path:
     package, colon, path = checks.text(what, value).partition(":")
     if not colon:
         return folder / package
-    found = importlib.util.find_spec(package) if package.isidentifier() else None
-    if found is None or found.origin is None:
+    try:
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
+    except ValueError:  # of a module that was not imported from a file, as `__main__`
+        found = None
+    if found is None or not found.has_location or found.origin is None:
         distribution = package.replace("_", "-")
         raise ManipError(
             f"{what} is in {package!r}, which is not installed; run: pip install --no-deps {distribution}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -12,7 +12,7 @@ from manip_il import checks
 from manip_il.checks import read_yaml
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.robots import ROBOTS
-from manip_il.robots.files import KEYS, ModelFiles
+from manip_il.robots.files import KEYS, ModelFiles, try_models
 from manip_il.robots.parts import Costs, EndEffector, GripperConfig, Workspace
 from manip_il.robots.reading import FURTHEST, missing, names, numbers, tree_of
 from manip_il.robots.servos import RATE, LeRobotConfig
@@ -79,21 +79,14 @@ class Robot:
         """Whether the hand leans wherever it is, as an arm of too few joints cannot hold it upright."""
         return self.costs.orientation == self.costs.leaning
 
-    def content(self) -> bytes:
-        """Return what decides how the robot moves: fields, its model with all includes, its meshes' names and sizes."""
-        apart = ("files", "colours", "lerobot")
-        said = {one.name: getattr(self, one.name) for one in fields(self) if one.name not in apart}
-        said["gripper"] = {**vars(self.gripper), "files": None}
-        parts = [one.content() for one in (self.files, self.gripper.files) if one is not None]
-        texts = [text for _, several in parts for text in several]
-        return b"".join([repr((said, [meshes for meshes, _ in parts])).encode(), *texts])
-
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a robot's YAML. Raises `UsageError` naming the file and what is wrong in it."""
         said: dict[str, Any] = {}
         try:
             said = cls._said(path, read_yaml(path, "a robot's YAML"))
+            if path not in ROBOTS.values():  # what ships has been compiled
+                try_models(said["name"], *filter(None, (said["files"], said["gripper"].files)))
             lacking = [name for name in FOUND if name not in said]
             if lacking:
                 from manip_il.robots.found import complete  # here, as what ships says it all, and mink takes long

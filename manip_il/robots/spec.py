@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import fnmatch
 import itertools
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -12,11 +13,40 @@ import numpy as np
 
 from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.files import ModelFiles
-from manip_il.robots.motors import calm, motorise
+from manip_il.robots.motors import PLAIN, calm, motorise
 from manip_il.robots.parts import GRIPPER, GripperConfig
 from manip_il.robots.robot import Robot
 
 WRIST = "wrist"  # the camera that a robot may keep
+_OF_A_SCENE = ("fusestatic", "discardvisual", "settotalmass", "alignfree", "saveinertial")  # of a compiler's options
+_SCALAR = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def load(files: ModelFiles, robot: str) -> mujoco.MjSpec:
+    """Read a model: its angles in radians, and nothing that its file would have the compiler do to the whole scene.
+
+    robot: its name. Raises `UsageError` if MuJoCo cannot read the model.
+    """
+    spec = files.load(robot)
+    if spec.compiler.degree:
+        _to_radians(spec)
+    for name in _OF_A_SCENE:
+        setattr(spec.compiler, name, getattr(PLAIN.compiler, name))
+    return spec
+
+
+def _to_radians(spec: mujoco.MjSpec) -> None:
+    """Convert every angle of a model that has them in degrees."""
+    for joint in spec.joints:
+        if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
+            joint.range = np.radians(joint.range)
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            joint.ref, joint.springref = math.radians(joint.ref), math.radians(joint.springref)
+    turned = [one.alt for kind in ("bodies", "geoms", "sites", "cameras", "frames") for one in getattr(spec, kind)]
+    for alt in (*turned, *(body.ialt for body in spec.bodies)):
+        alt.euler = np.radians(alt.euler)
+        alt.axisangle = [*alt.axisangle[:3], math.radians(alt.axisangle[3])]
+    spec.compiler.degree = False
 
 
 def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, camera: str = "") -> mujoco.MjSpec:
@@ -25,15 +55,15 @@ def bare_spec(robot: str, files: ModelFiles, hand: str, gripper: GripperConfig, 
     robot: its name. camera: the one on the hand, kept as `wrist`.
     Raises `UsageError` naming the file that MuJoCo cannot read, or the body or camera that is not there.
     """
-    spec = files.load(robot)
+    spec = load(files, robot)
+    require(robot, "body", (hand,), spec.bodies)
     if camera:
         require(robot, "camera", (camera,), spec.cameras)
         spec.camera(camera).name = WRIST
-    _strip(spec, WRIST if camera else "")
+    _strip(spec, hand, WRIST if camera else "")
     if gripper.files is None:
         return spec
-    require(robot, "body", (hand,), spec.bodies)
-    hand_spec = gripper.files.load(robot)
+    hand_spec = load(gripper.files, robot)
     _strip(hand_spec)
     copy_options(spec, hand_spec)
     mount = spec.body(hand).add_frame(pos=gripper.position, quat=gripper.quaternion)
@@ -57,7 +87,8 @@ def arm_spec(robot: Robot) -> mujoco.MjSpec:
         calm(spec, linked)
     motorise(robot, spec)
     ee = robot.ee
-    spec.body(ee.body).add_site(name="ee", pos=ee.position, quat=ee.quaternion, size=[0.004] * 3, group=4)
+    frame = {"pos": ee.position, "quat": ee.quaternion}
+    spec.body(ee.body).add_site(PLAIN.default, name="ee", size=[0.004] * 3, group=4, **frame)
     for body in spec.bodies:
         body.gravcomp = 1.0
     for finger in robot.gripper.fingers if robot.gripper.finger_mass else ():
@@ -136,12 +167,14 @@ def _keep_links_apart(spec: mujoco.MjSpec, hand: str) -> None:
 def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> None:
     """Delete joints that are neither the arm's nor the gripper's, their bodies left where the YAML says."""
     kept = {*robot.joints, *robot.gripper.joints, *linked}
-    known = {joint.name for joint in spec.joints} - kept | set(linked)
+    loose = [joint for joint in spec.joints if joint.name not in kept]
+    known = {joint.name for joint in loose if joint.type in _SCALAR} | set(linked)
     for name in robot.fixed:
         if name not in known:
             raise UnknownName(f"joint in 'fixed' of robot {robot.name}:", name, known)
-    for joint in [joint for joint in spec.joints if joint.name not in kept]:
-        _stand_at(joint, robot.fixed.get(joint.name, 0.0))
+    if robot.fixed:
+        _place_bodies(spec, robot.fixed)
+    for joint in loose:
         spec.delete(joint)
     if robot.base is not None:
         root = spec.body(robot.hand)
@@ -150,23 +183,32 @@ def _fix_joints(robot: Robot, spec: mujoco.MjSpec, linked: Sequence[str]) -> Non
         root.pos = np.array(robot.base)
 
 
-def _stand_at(joint: Any, value: float) -> None:
-    """Move a joint's body to where the joint is at `value` [rad or m]."""
-    body, axis = joint.parent, np.asarray(joint.axis, dtype=np.float64)
-    quat, turned = np.asarray(body.quat, dtype=np.float64), np.empty(3)
-    if joint.type == mujoco.mjtJoint.mjJNT_SLIDE:
-        mujoco.mju_rotVecQuat(turned, axis * value, quat)
-        body.pos = np.asarray(body.pos) + turned
-    elif value:
-        turn, both = np.empty(4), np.empty(4)
-        mujoco.mju_axisAngle2Quat(turn, axis, value)
-        mujoco.mju_mulQuat(both, quat, turn)
-        body.quat = both
+def _place_bodies(spec: mujoco.MjSpec, fixed: Mapping[str, float]) -> None:
+    """Put the bodies of joints where MuJoCo has them with the joints at `fixed` [rad or m]."""
+    twin = spec.copy()
+    model = twin.compile()
+    data = mujoco.MjData(model)
+    for name, value in fixed.items():
+        data.joint(name).qpos[0] = value
+    model.body_parentid[:] = 0  # then a pose in the world is one in the parent
+    mujoco.mj_kinematics(model, data)
+    for body, there in zip(spec.bodies, twin.bodies, strict=True):
+        if not fixed.keys() & {joint.name for joint in body.joints}:
+            continue
+        place, turn = data.xpos[there.id], data.xmat[there.id].reshape(3, 3)
+        for joint, own in zip(body.joints, there.joints, strict=True):  # those kept turn about where they are now
+            joint.axis, joint.pos = data.xaxis[own.id] @ turn, (data.xanchor[own.id] - place) @ turn
+        body.set_frame(body.parent.add_frame())
+        body.pos, body.quat = place, data.xquat[there.id]
+        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def _strip(spec: mujoco.MjSpec, kept: str = "") -> None:
-    """Delete what a model brings for a world of its own: motors, mocap bodies, sky, views, gravity and time."""
-    for one in _foreign(spec, kept):
+def _strip(spec: mujoco.MjSpec, hand: str = "", kept: str = "") -> None:
+    """Delete what a model brings for a world of its own: motors, mocap bodies, sky, views, gravity and time.
+
+    hand: what is not in one tree with that body is of the world, too: a floor, a table, what lies on it.
+    """
+    for one in _foreign(spec, hand, kept):
         spec.delete(one)
     copy_options(mujoco.MjSpec(), spec)
     for name in [name for name in dir(spec) if name.startswith("nuser_")]:
@@ -179,17 +221,24 @@ def copy_options(origin: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
         setattr(spec.option, name, getattr(origin.option, name))
 
 
-def _foreign(spec: mujoco.MjSpec, kept: str) -> Iterator[Any]:
+def _foreign(spec: mujoco.MjSpec, hand: str, kept: str) -> Iterator[Any]:
     """Yield what is to be deleted, looked up again after every kind: MuJoCo deletes what hangs on the deleted too."""
     yield from list(spec.keys)
     mocaps = {body.name for body in spec.bodies if body.mocap}
     yield from [equality for equality in spec.equalities if {equality.name1, equality.name2} & mocaps]
     yield from [body for body in spec.bodies if body.mocap]
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    yield from [geom for geom in spec.geoms if geom.type == plane or (hand and geom.parent.name == "world")]
+    geoms, site = {geom.name for geom in spec.geoms}, mujoco.mjtObj.mjOBJ_SITE
+    yield from [pair for pair in spec.pairs if not {pair.geomname1, pair.geomname2} <= geoms]
+    yield from [equality for equality in spec.equalities if equality.objtype == site]
+    trees = [(body, {one.name for one in (body, *body.find_all("body"))}) for body in spec.worldbody.bodies]
+    yield from [body for body, names in trees if hand and hand not in names]
     used = {name for material in spec.materials for name in material.textures}
     sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
     yield from [texture for texture in spec.textures if texture.type == sky or texture.name not in used]
     yield from [camera for camera in spec.cameras if not kept or camera.name != kept]
-    for kind in ("actuators", "sensors", "lights", "sites"):
+    for kind in ("actuators", "sensors", "lights", "sites", "tuples"):
         yield from list(getattr(spec, kind))
 
 

@@ -12,10 +12,11 @@ import mujoco
 import numpy as np
 
 from manip_il.errors import UsageError
-from manip_il.robots.files import ModelFiles
+from manip_il.robots.files import ModelFiles, try_models
 from manip_il.robots.geometry import nearest
 from manip_il.robots.gripper import finger_geoms
 from manip_il.robots.robot import Robot
+from manip_il.robots.spec import load
 
 _ARM_GOES_ON = 3  # joints one after another that are more than a finger has
 _JAWS = ("jaw", "finger", "grip", "claw")  # in the name of a single one's body or joint
@@ -47,12 +48,13 @@ def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
 
     Raises `UsageError` where MuJoCo cannot read them, or no hand or no fingers are found.
     """
-    spec = ModelFiles(model.absolute()).load(model.stem)
+    files = [ModelFiles(path.absolute()) for path in (model, gripper) if path is not None]
+    try_models(model.stem, *files)
+    spec, with_jaws = load(files[0], model.stem), load(files[-1], model.stem)
     if gripper is None:
-        palm, jaws = _palm(spec, model)
-        hand, with_jaws = palm, spec
+        palm, jaws = _palm(with_jaws, model)
+        hand = palm
     else:
-        with_jaws = ModelFiles(gripper.absolute()).load(gripper.stem)
         hand, (palm, jaws) = _flange(spec.worldbody), _palm(with_jaws, gripper)
     driven = _driven(with_jaws, jaws, gripper or model)
     closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.robots.motors import PLAIN
 from manip_il.robots.robot import Robot
 from manip_il.robots.spec import WRIST
 
@@ -29,7 +30,7 @@ def add_wrist_camera(spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Robot) -
     """Add the camera `wrist` to a robot's spec. model: the spec compiled."""
     site: Any = spec.site("ee")
     position, quat = best_view(model, robot)
-    site.parent.add_camera(name=WRIST, pos=position, quat=quat, fovy=_FOVY)
+    site.parent.add_camera(PLAIN.default, name=WRIST, pos=position, quat=quat, fovy=_FOVY)
 
 
 def best_view(model: mujoco.MjModel, robot: Robot) -> tuple[F64, F64]:

@@ -15,6 +15,11 @@ from manip_il.tasks.reward import DEFAULT, REWARD_HELP, TASTES, Reward
 
 DT_SIM = 0.002  # longest step of physics [s]
 LIMITS_HZ = 20  # control steps a second that the tasks' own limits are for; at another rate they last as long
+ROBOT_HELP = (
+    f"{', '.join(ROBOTS)}, the path of the YAML of an arm of your own, or {stock.ROBOT}: "
+    "gymnasium-robotics' own Fetch environments, unmodified"
+)
+TASK_HELP = f"{', '.join(NAMES)}; of {stock.ROBOT} {', '.join(stock.STOCK)}"
 MOST_HZ = round(1 / DT_SIM)
 
 
@@ -26,8 +31,8 @@ class EnvConfig:
     as `Reward.parse` reads it, kept as its numbers wherever it came from; empty for the task's own.
     """
 
-    robot: str = option("panda", " or ".join([*ROBOTS, stock.ROBOT]))
-    task: str = option("pick_place", ", ".join(NAMES))
+    robot: str = option("panda", ROBOT_HELP)
+    task: str = option("pick_place", TASK_HELP)
     control_hz: int = option(0, "control steps a second; 0: the robot's own, 30 of so101, 20 of others")
     tolerance: float = option(0.0, "distance to the goal that counts as success [m]; 0: the task's own")
     success_steps: int = option(

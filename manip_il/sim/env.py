@@ -288,6 +288,11 @@ class ManipEnv(gymnasium.Env[dict[str, Any], NDArray[Any]]):
         return gymnasium.spaces.Dict(spaces)
 
 
+def make_env(robot: str = "panda", task: str = "pick_place", **settings: Any) -> ManipEnv:
+    """Return the environment of a robot, by its name or its YAML's path, and a task. settings: see `ManipEnv`."""
+    return ManipEnv(robot, task, **settings)
+
+
 def joint_state(world: World) -> F32:
     """Return measured joint positions and gripper opening in the units of the robot's actions, float32 (n,)."""
     scene, data = world.scene, world.data

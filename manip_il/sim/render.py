@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from manip_il.errors import RenderError
 from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
-from manip_il.sim.gl import PACKAGES
+from manip_il.sim.gl import context_class, remedy
 from manip_il.sim.props import Prop, props
 from manip_il.sim.scene import build_scene, camera_id
 from manip_il.sim.view import ViewModel
@@ -55,7 +55,7 @@ def pictures(
 
     shape: of the task's object, as `EnvConfig.object`. A picture depends on `qpos`, the goal and what the episode draws
     alone: it has the same bytes in any order.
-    Raises `RenderError`, naming Debian's packages, where there is no off-screen OpenGL.
+    Raises `RenderError`, which says what to unset or install, where there is no off-screen OpenGL.
     """
     renderer = _process.renderer(robot, task, cameras.look, shape)
     renderer.pose(data, drawn)
@@ -195,9 +195,7 @@ class _Process:
                 self._close_renderer()
                 self._renderer, self._key = _Renderer(*key), key
         except Exception as error:  # mujoco raises many kinds, from ImportError to its own
-            raise RenderError(
-                f"no off-screen OpenGL ({type(error).__name__}: {error}); on Debian: apt-get install -y {PACKAGES}"
-            ) from error
+            raise RenderError(f"no off-screen OpenGL ({type(error).__name__}: {error}); {remedy()}") from error
         return self._renderer
 
     def close(self) -> None:
@@ -210,10 +208,9 @@ class _Process:
 
     def _make_current(self) -> None:
         if self._gl is None:
-            from mujoco.gl_context import GLContext  # where there is no OpenGL, not even this can be imported
-
-            setattr(GLContext, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
-            self._gl = GLContext(1, 1)  # its size does not matter, pictures have a buffer of their own
+            context = context_class()  # without OpenGL not even this can be imported
+            setattr(context, "_context", None)  # noqa: B010 - its destructor wants it even where its constructor failed
+            self._gl = context(1, 1)  # its size does not matter, pictures have a buffer of their own
             self._pid = os.getpid()
             atexit.register(self.close)
         self._gl.make_current()

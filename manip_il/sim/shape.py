@@ -21,6 +21,11 @@ _SIZES = {
 KINDS = tuple(_SIZES)
 ANY = "any"  # of those kinds, one for each episode
 _SIZES[ANY] = "WIDTH"
+_MESHES = (".stl", ".obj", ".msh", ".ply", ".dae", ".glb")
+NO_MESH = (
+    "expected a box, cylinder, sphere or capsule; in a task of your own a visual mesh may cover one, a second geom of "
+    "the body with contype=0, conaffinity=0 and mass=0"
+)
 SHAPE_HELP = (
     "box, cylinder, sphere, capsule or any (one of these in each episode), with lengths [m] as in "
     "cylinder:0.04x0.08, box:0.06x0.03x0.03"
@@ -52,6 +57,8 @@ class Shape:
     def parse(cls, text: str) -> Shape:
         """Return the shape that a text means; raises `UnknownName` or `UsageError`."""
         kind, colon, size = text.partition(":")
+        if kind == "mesh" or kind.lower().endswith(_MESHES):
+            raise UsageError(f"{shorten(text)} is a mesh; {NO_MESH}")
         if kind not in _SIZES:
             raise UnknownName("shape", kind, _SIZES)
         try:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from manip_il.errors import ManipError, MismatchError
 from manip_il.sim.config import CAMERAS
-from manip_il.sim.shape import Shape, contact
+from manip_il.sim.shape import NO_MESH, Shape, contact
 
 F64 = NDArray[np.float64]
 GEOMS = {
@@ -251,7 +251,8 @@ def extents(kind: int, size: F64) -> F64:
         return 2 * np.array([size[0], size[0], size[1]])
     if kind == int(geom.mjGEOM_CAPSULE):
         return 2 * np.array([size[0], size[0], size[1] + size[0]])
-    raise ManipError(f"an object of MuJoCo's geom type {kind}; expected a box, sphere, cylinder or capsule")
+    what = "mesh" if kind == int(geom.mjGEOM_MESH) else f"geom of MuJoCo's type {kind}"
+    raise ManipError(f"the first geom of an object is a {what}; {NO_MESH}")
 
 
 def widest_grasp(kind: int, size: F64) -> float:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import mujoco
 import numpy as np
@@ -105,6 +105,15 @@ class World:
         self._poses: dict[str, Pose] = {}  # until the data change their identity
         self._ee: Pose | None = None
         self._shapes: dict[str, tuple[int, tuple[float, ...]]] = {}  # until the model changes
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> World:
+        """Return another world of the same scene in the same state: what points into these data is not copied."""
+        other = World(self.scene)
+        other.restore(self.physics(), self.variation)
+        return other
+
+    def __reduce__(self) -> NoReturn:
+        raise ManipError("an environment cannot be pickled; pickle its configuration and get_state() instead")
 
     # Physics
 

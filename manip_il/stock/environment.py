@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import mujoco
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
-from manip_il.errors import MismatchError
+from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Observation, State
 from manip_il.robots.action_space import ActionSpace
 from manip_il.stock.table import STATE_NAMES, TOLERANCE, StockTask, get_stock
@@ -48,6 +48,9 @@ class StockEnv:
         self._size = mujoco.mj_stateSize(self.model, _WHOLE)
         self._env._mujoco_step = self._run_physics
         self.start(0)
+
+    def __reduce__(self) -> NoReturn:
+        raise ManipError("an environment of gymnasium-robotics cannot be copied or pickled; use get_state()")
 
     def start(self, seed: int) -> None:
         """Begin the episode of a seed, as the environment's `reset(seed=...)` does."""

@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from manip_il import checks
 from manip_il.store.errors import HashError, NoSpaceError, RemoteError, TransientError
 from manip_il.store.manifest import FileEntry
 from manip_il.store.remote import Advance
@@ -28,7 +29,7 @@ _WORTH_A_SYNC = 2**25  # that the kernel is asked at once to bring to the disk [
 
 def hash_file(path: Path, digest: HASH) -> int:
     """Feed a file's bytes to `digest`; return their number."""
-    with path.open("rb", buffering=0) as file:
+    with open(checks.open_regular(path), "rb", buffering=0) as file:
         hashlib.file_digest(file, lambda: digest)
         return file.tell()
 
@@ -110,9 +111,10 @@ class Download:
         fetch: writes the bytes from an offset on.
         """
         entry, part = self._entry, self._part
-        with part.open("ab", buffering=0) as self._file, ThreadPoolExecutor(2) as self._helper:
-            if part.stat().st_size > entry.size:
-                part.write_bytes(b"")
+        handle = checks.open_regular(part, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        with open(handle, "ab", buffering=0) as self._file, ThreadPoolExecutor(2) as self._helper:
+            if os.fstat(handle).st_size > entry.size:
+                self._file.truncate(0)
             self._digest, self._hashed = _digest_for(entry), None
             self._position = hash_file(part, self._digest)
             self._syncing = self._position  # up to here the kernel was asked to bring bytes to the disk

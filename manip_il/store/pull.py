@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manip_il.data import atomic
+from manip_il.data.lerobot_read import check_all_pictures
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.disk import HASHERS, Download, is_whole, sync_disk
 from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
@@ -25,6 +26,7 @@ from manip_il.store.manifest import (
     without_root_copies,
 )
 from manip_il.store.object_store import in_threads
+from manip_il.store.push import datasets_in
 from manip_il.store.remote import Progress, Remote, RemoteUrl, Snapshot
 
 RESTARTS = 3  # a remote that is pushed to more often while one pull runs is given up
@@ -51,7 +53,8 @@ def pull(
     """Fetch what readers of the remote see now into `target`, whole, or leave `target` as it is.
 
     overwrite: replace what is there, in one step. Raises `FolderExistsError` if something is there and may not be
-    replaced, `NotFoundError` if the remote holds nothing, and the errors of `manip_il.store.errors`.
+    replaced, `NotFoundError` if the remote holds nothing, `ManipError` for a dataset whose pictures are not in its
+    files, and the errors of `manip_il.store.errors`.
     """
     target = target.absolute()
     snapshot = _read(url, remote)
@@ -71,6 +74,8 @@ def pull(
                 snapshot = now  # pushed to twice meanwhile: files that are the same stay
         else:
             raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
+        for dataset in datasets_in(staging / "tree"):
+            check_all_pictures(dataset)
         _move_to(staging / "tree", target, snapshot.manifest, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
     return Pulled(snapshot.manifest, kept)
@@ -82,13 +87,13 @@ def _fill(staging: Path, remote: Remote, snapshot: Snapshot, retry: Retry, progr
     In `staging`, `parts` holds unfinished files, by hash, and `tree` verified ones, as they will be.
     """
     manifest, tree, parts = snapshot.manifest, staging / "tree", staging / "parts"
-    if staging.is_symlink():
-        staging.unlink()
-    for folder in (tree, parts):
+    for folder in (staging, tree, parts):
+        if folder.is_symlink():
+            folder.unlink()
         folder.mkdir(parents=True, exist_ok=True)
     missing = _missing(tree, manifest)
     for path in parts.iterdir():
-        if path.name not in missing or path.is_symlink():
+        if path.name not in missing or path.is_symlink() or not path.is_file():
             path.unlink()
     wanted = sum(entries[0].size * len(entries) for entries in missing.values())
     had = sum(path.stat().st_size for path in parts.iterdir())

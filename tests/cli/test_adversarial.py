@@ -63,7 +63,7 @@ def test_a_run_ends_with_a_policy_metrics_and_a_page_and_goes_on(here, capsys):
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "validation success" in out
-    assert "next: manip-il eval --policy.path=run" in out
+    assert "manip-il eval --policy.path=run" in out
     [line] = (here / "run" / "metrics.jsonl").read_text().splitlines()
     record = json.loads(line)
     assert {"steps", "success", "kl", "return", "discriminator_accuracy_expert", "log_std"} <= record.keys()

@@ -199,7 +199,8 @@ def rounds(*successes: int, n: int) -> list[Any]:
 @pytest.mark.parametrize(
     ("successes", "n", "verdict"),
     [
-        ((0, 0), 4, r"DAgger, round 1 is chosen of 2, with 0\.0 % .* on 4 validation episodes; no difference from "
+        ((0, 0), 4, r"No round of 2 succeeds in any of 4 validation episodes\."),
+        ((1, 1), 4, r"DAgger, round 1 is chosen of 2, with 25\.0 % .* on 4 validation episodes; no difference from "
          r"cloning \(round 0\) is shown\."),
         ((2, 1), 4, r".*no difference from DAgger, round 1 is shown.*"),
         ((0, 2), 4, r".*no difference.*"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import COMMANDS, Command, main
+from manip_il.robots import ROBOTS
 
 HERE = Path(__file__).parent
 PREPARE = f"""
@@ -107,6 +108,20 @@ def test_a_reader_that_goes_away_is_no_error():
     process.stderr.close()
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_stream_that_the_shell_closed_is_no_error(closed, tmp_path):
+    code = PREPARE + (
+        "from manip_il.cli import main as program, progress\n"
+        "def work(words):\n"
+        "    with open('made', 'w') as file, progress.progress(1, 'work') as bar:\n"
+        "        bar.advance(); progress.warn('none'); progress.say('said'); file.write('done')\n"
+        "program._dispatch = work\n"
+        "program.script()\n"
+    )
+    done = subprocess.run(["sh", "-c", f'exec "$0" -c "$1" {closed}', sys.executable, code], cwd=tmp_path, check=False)
+    assert (done.returncode, (tmp_path / "made").read_text()) == (0, "done")
+
+
 BUSY = """
 import os, signal, sys, threading, time
 from manip_il.cli import main as program
@@ -125,3 +140,11 @@ program.script()
 def test_ctrl_c_does_not_wait_for_what_threads_send():
     done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (130, "manip-il: interrupted\n")
+
+
+@pytest.mark.parametrize("command", ["record", "eval"])
+def test_help_says_every_kind_of_robot_and_the_stock_tasks(command, capsys):
+    assert main([command, "--help"]) == 0
+    [robot] = [line for line in capsys.readouterr().out.splitlines() if line.strip().startswith("--robot.type")]
+    for words in (*ROBOTS, "path of the YAML of an arm of your own", "fetch_stock: gymnasium-robotics' own Fetch"):
+        assert words in robot

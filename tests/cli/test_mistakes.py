@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+import manip_il
 from manip_il import __version__
 from manip_il.cli.main import COMMANDS, load, main
 from manip_il.cli.options import options_of
@@ -246,6 +248,17 @@ def test_the_environments_are_registered_in_whatever_order_one_imports(imports: 
     assert done.stdout.startswith("manip_il.sim.env:ManipEnv <_frozen_importlib_external.SourceFileLoader")
 
 
-def test_the_package_alone_loads_no_gymnasium():
-    code = "import sys, manip_il; assert not {'gymnasium', 'numpy'} & sys.modules.keys()"
-    subprocess.run([sys.executable, "-c", code], check=True)
+def test_the_package_shows_what_a_user_wants_and_alone_loads_neither_gymnasium_nor_numpy():
+    code = "import sys, manip_il; print(dir(manip_il)); assert not {'gymnasium', 'numpy'} & sys.modules.keys()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "['Expert', '__version__', 'make_env', 'record']\n"
+    env = manip_il.make_env("fetch", "reach")
+    assert (env.config.robot, env.config.task) == ("fetch", "reach")
+    assert manip_il.Expert(env.scene).label(env.get_state()).valid
+    assert callable(manip_il.record)
+
+
+def test_the_package_has_types():
+    assert (Path(manip_il.__file__).parent / "py.typed").is_file()
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "py.typed" in settings["tool"]["setuptools"]["package-data"]["manip_il"]

@@ -46,6 +46,21 @@ def test_a_new_or_empty_folder_is_fine_and_a_full_one_is_refused_with_the_ways_o
         prepare_output(tmp_path / "x", resume=True, overwrite=False)
 
 
+@pytest.mark.parametrize("name", ["x" * 240, "é" * 120, "x" * 300, "x/" * 2_000 + "y"])
+def test_a_name_that_leaves_no_room_for_names_beside_and_inside_it_is_refused_first(
+    name, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    for words in (
+        f"record --dataset.root={name}",
+        f"eval --policy.type=expert --output_dir={name}",
+        f"view --output={name}.rrd",
+    ):
+        assert main([*words.split(), "--quiet"]) == 2
+        assert "bytes; expected at most" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_resume_removes_what_a_killed_writer_left_of_a_file(ours):
     (ours / ".fingerprint.json.x.partial").touch()
     prepare_output(ours, resume=True, overwrite=False)

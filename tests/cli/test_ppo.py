@@ -67,7 +67,7 @@ def test_a_run_ends_with_a_policy_metrics_and_a_page(here, cloned, capsys):
     small = "--steps=1 --episodes=2 --episode_steps=4 --warmup=0 --ppo.minibatches=1 --ppo.epochs=1"
     words = ["ppo", f"--init={cloned}", "--reward=reward", *small.split(), "--validation_episodes=1"]
     assert main([*words, "--output_dir=run", "--quiet"]) == 0
-    assert "next: manip-il eval --policy.path=run" in capsys.readouterr().out
+    assert "manip-il eval --policy.path=run" in capsys.readouterr().out
     start, record = map(json.loads, (here / "run" / "metrics.jsonl").read_text().splitlines())
     assert (start["iteration"], start["steps"], start["validation_episodes"]) == (0, 0, 1), "the clone itself"
     assert record["steps"] == 8, "episodes go on after success"

@@ -4,11 +4,13 @@ import os
 import pty
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from manip_il.cli import progress as module
-from manip_il.cli.progress import progress, say, set_quiet, warn
+from manip_il.cli.progress import progress, say, say_policy, set_quiet, warn
+from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 
 
 @pytest.fixture(autouse=True)
@@ -80,6 +82,28 @@ def test_a_terminal_gets_a_bar_and_a_pipe_beside_it_gets_the_output():
     assert done.stdout == b"result\n"
     assert b"2/2" in shown
     assert b"loss 0.5" in shown
+
+
+@pytest.mark.parametrize(
+    ("success", "lines"),
+    [
+        (True, ["best policy: runs/best", "next: manip-il eval"]),
+        (
+            False,
+            [
+                "DAgger round 2 fails in all 1 unseen episodes of panda reach: 0.0 % [0.0, 79.3]; "
+                "its one failure ends in the phase approach.",
+                "try in a new run: more --steps",
+                "failures by phase, with films: manip-il eval",
+            ],
+        ),
+    ],
+)
+def test_a_run_that_never_succeeded_says_what_to_try(success, lines, capsys):
+    episode = EpisodeResult(0, success, success, 5, 0.0, phase_at_end="approach")
+    found = EvalResult("DAgger round 2", "panda", "reach", {}, (episode,), EvalSettings(100, 0.02))
+    say_policy(Path("runs/best"), found, "manip-il eval", "more --steps")
+    assert capsys.readouterr().out.splitlines() == lines
 
 
 def test_each_warning_is_one_line(capsys):

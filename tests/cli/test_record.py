@@ -158,7 +158,7 @@ def test_without_opengl_what_was_there_stays(demos, error, monkeypatch):
         raise ImportError("cannot load libEGL.so.1")
 
     render.close()
-    monkeypatch.setattr("mujoco.gl_context.GLContext", broken)
+    monkeypatch.setattr("mujoco.egl.GLContext", broken)
     shutil.copytree("demos", "x")
     before = files(Path())
     assert main(["render", "demos", "x", "--workers=1", "--overwrite=true", "--quiet"]) == 1

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.lerobot_read import dataset_info, read_provenance, read_spec, read_table
 
 from ..damage import digests
@@ -51,7 +51,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
     assert read_table(redrawn, ["label_valid"])["label_valid"].all()
     assert not redrawn.with_name("new.journals").exists()
     assert main(["doctor", str(redrawn)]) == 0
-    dataset: Any = lerobot_windows(redrawn, "local/new", None)
+    dataset: Any = LeRobotDataset("local/new", root=redrawn)
     assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
     inputs = dataset_to_policy_features(dataset.meta.features)
     assert not any("keypoints" in name for name in inputs)

@@ -12,7 +12,8 @@ import pytest
 from manip_il.collect import record as recording
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import check_journals, collect, collect_successes, record
-from manip_il.collect.workers import Engine, Job
+from manip_il.collect.task import Job
+from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, build
 from manip_il.data.journal import Journal, list_episodes, read_episode, read_header, read_journal
 from manip_il.data.lerobot_read import read_table

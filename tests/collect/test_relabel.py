@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_fingerprint, env_spec
@@ -17,7 +18,6 @@ from manip_il.collect.relabel import Changes, label_states, relabel_dataset
 from manip_il.collect.source import open_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
-from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.lerobot_read import read_provenance, read_table
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.rewrite import rewrite_columns
@@ -129,7 +129,7 @@ def test_videos_are_copied_and_lerobot_reads_all(tmp_path):
     )
     relabel(bare, tmp_path / "again")
     assert content(tmp_path / "again") == content(whole)
-    dataset: Any = lerobot_windows(tmp_path / "again", "local/new", None)
+    dataset: Any = LeRobotDataset("local/new", root=tmp_path / "again")
     np.testing.assert_array_equal(dataset[5][schema.ACTION], episodes[0].columns[schema.ACTION][5])
     assert main(["doctor", str(tmp_path / "again")]) == 0
 

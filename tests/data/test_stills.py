@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
 from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.frame_source import find_frames
-from manip_il.data.lerobot_library import lerobot_windows
 from manip_il.data.lerobot_read import camera_keys, read_episodes, read_frames, read_spec
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.pictures import decode_picture, to_png
@@ -73,7 +73,7 @@ def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):
     assert frames is not None
     whole = np.concatenate([episode.columns[FRONT] for episode in seen])
     np.testing.assert_array_equal(frames[FRONT], whole.transpose(0, 3, 1, 2))
-    dataset: Any = lerobot_windows(root, "local/stills", None)
+    dataset: Any = LeRobotDataset("local/stills", root=root)
     picture = dataset[8][FRONT]
     exact = picture if picture.dtype == torch.uint8 else (picture * 255).round()
     np.testing.assert_array_equal(exact.numpy(), whole[8].transpose(2, 0, 1))
@@ -105,9 +105,9 @@ def test_a_grey_picture_is_refused_and_one_in_colour_comes_back():
 
 
 def test_damage_is_one_line(root, monkeypatch):
-    def damaged(_: bytes | None) -> np.ndarray:
+    def damaged(_: Any) -> np.ndarray:
         raise ValueError("it is not a PNG or JPEG")
 
-    monkeypatch.setattr("manip_il.data.lerobot_read.decode_picture", damaged)
+    monkeypatch.setattr("manip_il.data.lerobot_read.decode_cell", damaged)
     with pytest.raises(ManipError, match=r"cannot read the pictures observation\.images\.front in .*stills: it is not"):
         next(read_episodes(root))

@@ -59,6 +59,12 @@ def test_a_curve_with_labels_alone_is_drawn_once():
     assert [one.series.shift for one in CurveCharts.of(CURVE).charts[0].series] == [5, -5]  # they share 1,230 labels
 
 
+def test_thousands_of_one_axis_are_written_alike():
+    points = tuple(CurvePoint(labels, Proportion(10, 40), "") for labels in (4_000, 18_000))
+    [chart] = CurveCharts((Series("a", "arm", {"": points}),)).charts
+    assert [label for label, _ in chart.x_ticks] == ["5k", "10k", "15k"]
+
+
 def test_a_mark_lies_at_its_cost_and_rate_with_its_interval():
     [chart] = CurveCharts.of(replace(CURVE, cloning=())).charts
     [drawn] = chart.series

@@ -13,7 +13,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
 
-from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec, features
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import JointTarget, conversion, conversion_for, same_width
@@ -23,7 +23,6 @@ from manip_il.learn.export import export_torchscript
 from manip_il.learn.fit_config import ACTION_SPACES, EE_DELTA, JOINT_DELTA, JOINT_TARGET, FitConfig
 from manip_il.learn.fit_policy import PolicyTrainer
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.samples import WithActions
 from manip_il.learn.train import fit
 from manip_il.robots import robot as robots
 from manip_il.robots.ik import ArmIK
@@ -169,11 +168,6 @@ def test_every_action_of_a_plan_is_measured_from_its_own_frame(panda, table, roo
     [batch] = trainer.samples.source.batches([np.array([3, 10])])
     np.testing.assert_array_equal(batch[ACTION][0], targets[3:7])
     np.testing.assert_array_equal(batch[ACTION][1], targets[[10, 11, 11, 11]])  # the episode ends
-    memory: Any = trainer.samples.source
-    ahead = {ACTION: [delta / panda.fps for delta in memory.windows.deltas[ACTION].tolist()]}
-    read = WithActions(lerobot_windows(root, "local/dataset", ahead), memory.windows, targets)
-    for place, row in enumerate((3, 10)):
-        torch.testing.assert_close(read[row][ACTION], batch[ACTION][place])
 
 
 def test_a_run_in_another_space_goes_on_to_the_same_weights_and_not_in_lerobot_train(panda, root, tmp_path, weights):

@@ -13,10 +13,11 @@ import pandas as pd
 import pytest
 import torch
 from huggingface_hub import ModelCard
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
-from manip_il.data.lerobot_library import lerobot_windows, read_metadata
+from manip_il.data.lerobot_library import read_metadata
 from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
 from manip_il.learn import fit_policy, train
@@ -27,7 +28,7 @@ from manip_il.learn.fit_policy import PolicyTrainer
 from manip_il.learn.lerobot_config import policy_config, set_features
 from manip_il.learn.lerobot_policy import usable_statistics
 from manip_il.learn.policy import LearnedPolicy
-from manip_il.learn.samples import LibrarySource, MemorySource, Samples, load_samples
+from manip_il.learn.samples import Samples, load_samples
 
 from .tiny_policies import ACT, DIFFUSION
 
@@ -196,11 +197,11 @@ def test_a_batch_from_memory_and_the_cache_is_lerobots(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     root = request.getfixturevalue(dataset)
     meta, source = read_metadata(root), loaded(root, config(settings), observation).source
-    assert isinstance(source, MemorySource)
     ahead = {key: [delta / meta.fps for delta in deltas.tolist()] for key, deltas in source.windows.deltas.items()}
-    library = LibrarySource(lerobot_windows(root, meta.repo_id, ahead), workers=0)
+    lerobots: Any = LeRobotDataset(meta.repo_id, root=root, delta_timestamps=ahead or None)
     rows = [np.array([0, 3, 20, meta.total_frames - 1]), np.array([7])]
-    for ours, theirs in zip(source.batches(rows), library.batches(rows), strict=True):
+    for ours, own in zip(source.batches(rows), rows, strict=True):
+        theirs = torch.utils.data.default_collate([lerobots[int(row)] for row in own])
         for key, value in ours.items():
             if key == "task":
                 assert list(value) == list(theirs[key])
@@ -214,19 +215,19 @@ def test_a_batch_from_memory_and_the_cache_is_lerobots(
 
 @pytest.mark.slow
 @pytest.mark.gl
-def test_an_image_policy_trains_from_the_cache_and_from_lerobots_loader(pictures, tmp_path, monkeypatch) -> None:
+def test_an_image_policy_trains_from_the_cache_and_without_it(pictures, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     one = {"observation": "images", "batch_size": 4, "steps": 2, "image_augment": False}
     fit(pictures, tmp_path / "cached", VISION, **one)
     assert list((tmp_path / "cache").rglob("*"))
     fit(pictures, tmp_path / "loaded", VISION, **one, image_cache_gb=0.0, num_workers=0)
     ours, theirs = ([record["loss"] for record in records(tmp_path / name)] for name in ("cached", "loaded"))
-    assert ours == pytest.approx(theirs, rel=1e-5)
+    assert ours == theirs
 
 
 @pytest.mark.slow
 @pytest.mark.gl
-def test_several_datasets_with_pictures_are_one_in_the_cache_and_in_lerobots_loader(pictures, tmp_path, monkeypatch):
+def test_several_datasets_with_pictures_are_one_in_the_cache_and_without_it(pictures, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     other = tmp_path / "other"
     words = ["--cameras=front,wrist", "--image.height=64", "--image.width=64", "--task.type=reach", "--seed=1"]
@@ -234,7 +235,7 @@ def test_several_datasets_with_pictures_are_one_in_the_cache_and_in_lerobots_loa
     edit_tasks(other, "Touch the ball.")
     roots, settings = [pictures, other], {"type": "cnn", "width": 16, "device": "cpu"}
     both = [loaded_all(roots, config(settings, image_cache_gb=limit, num_workers=0)) for limit in (1.0, 0.0)]
-    assert [type(one.source) for one in both] == [MemorySource, LibrarySource]
+    assert [one.source.workers for one in both] == [None, 0]
     frames = [read_metadata(root).total_frames for root in roots]
     rows = np.array([0, frames[0] - 1, frames[0], sum(frames) - 1])
     ours, theirs = (next(one.source.batches([rows])) for one in both)

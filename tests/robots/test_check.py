@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -162,6 +163,26 @@ def test_what_cannot_be_done_is_said_with_what_to_change(case: str, own: Robot):
     assert task_table(check).kinds == ("expert" if done else "cloning",)
     assert task.name in check_report(check, "manip-il robot check", {}).render()
     assert check.to_json()["tasks"][0]["done"] == done
+
+
+def test_a_task_that_random_actions_spoil_is_said_beside_what_can_be_done(own: Robot):
+    spoiled, steady = (
+        TaskCheck(name, {}, "", FOUND, SOLVED, noisy) for name, noisy in (("lift", FAILED), ("reach", SOLVED))
+    )
+    said = "with a tenth of the steps random the expert solves lift in 7 of 10 episodes"
+    assert said in verdict(a_check(own, spoiled, steady))
+    assert verdict(a_check(own, steady)) == "own can do reach."
+
+
+def test_the_label_of_an_opening_of_more_than_100_mm_fits_beside_its_curve(own: Robot):
+    hand = hand_facts(own)
+    hand = replace(hand, openings=tuple(0.114 / hand.most * opening for opening in hand.openings))
+    page = check_report(
+        replace(a_check(own, TaskCheck("reach", {}, "", FOUND)), hand=hand), "manip-il robot check", {}
+    ).render()
+    found = re.search(r'<text class="tick" x="(\d+)" y="20" text-anchor="end">114 mm</text>', page)
+    assert found is not None
+    assert int(found[1]) > 45  # of text that wide [px]
 
 
 def test_a_workspace_beyond_reach_gets_a_width_that_is_within(own: Robot):

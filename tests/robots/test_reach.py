@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,13 @@ from hypothesis import strategies as st
 from manip_il.robots import HERE, reach
 from manip_il.robots.ik import ArmIK
 from manip_il.robots.meeting import Body
-from manip_il.robots.reach import ARRIVES, STRETCH, Reach, reach_of
+from manip_il.robots.reach import ARRIVES, STRETCH, Reach, kept_reach, reach_of
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.rotations import angle_between, hand_down, off_yaw
 from manip_il.tasks.grasp import LEAN
 
 from ..tables import every_robot
-from .own import write
+from .own import ARM, JAWS, tree_of, write
 
 CELL = 0.05  # of a map [m]
 rng = np.random.default_rng(0)
@@ -136,8 +137,16 @@ def test_a_map_that_is_kept_is_what_would_be_worked_out_now(robot: str):
 @every_robot
 def test_a_robot_that_ships_has_its_map_beside_it(robot: str):
     the_robot = get_robot(robot)
-    assert (HERE / f"{robot}.reach.{reach._key(the_robot)}.npz").is_file()
-    assert len(list(HERE.glob(f"{robot}.reach.*.npz"))) == 1
+    assert reach._place(the_robot) == HERE / f"{robot}.reach.npz"
+    kept = kept_reach(the_robot)
+    assert kept is not None
+    origin, shape = reach._grid(the_robot)
+    np.testing.assert_array_equal(kept.origin, origin)
+    assert kept.errors.shape == shape
+
+
+def test_a_robot_that_ships_changed_in_anything_has_a_map_of_its_own():
+    assert reach._place(replace(get_robot("panda"), base=(0.1, 0.0, 0.0))).parent != HERE
 
 
 @every_robot
@@ -186,23 +195,52 @@ def test_a_map_is_the_same_whether_it_is_worked_out_or_read(own: Robot, monkeypa
 @pytest.mark.parametrize(
     ("file", "change", "maps"),
     [
-        ("own.xml", lambda text: f"{text}<!-- later -->", 2),
+        ("own.xml", lambda text: text.replace("-2.9 2.9", "-2.9 2.8"), 2),
         ("own.yaml", lambda text: text.replace("- 2000", "- 1999", 1), 2),
-        ("parts.xml", lambda text: "<mujoco><asset/></mujoco>", 2),
+        ("own.yaml", lambda text: f"{text}mend: {{'-1.5 2.2': '-1.5 2.1'}}\n", 2),
+        ("parts/wrist.xml", lambda text: text.replace("0.02", "0.03"), 2),
+        ("parts/foot.obj", lambda text: text.replace("v 1", "v 2"), 2),
+        ("parts/pad.xml", lambda text: text.replace("0.004", "0.005"), 2),
         ("pictures/vase.stl", lambda text: "what lies beside it is none of its", 1),
+        ("own.xml", lambda text: f"{text}<!-- later -->", 1),
         ("own.xml", lambda text: text, 1),  # the same robot elsewhere
     ],
 )
 def test_another_model_or_yaml_has_a_map_of_its_own(file: str, change, maps: int, solved: list[str], tmp_path: Path):
     for folder in (tmp_path / "one", tmp_path / "other"):
-        (folder / "pictures").mkdir(parents=True)
-        (folder / "parts.xml").write_text("<mujoco/>")
-        path = write(folder)
+        path = in_parts(folder)
         if folder.name == "other":
             (folder / file).write_text(change((folder / file).read_text() if (folder / file).is_file() else ""))
         read_again(get_robot(str(path)))
     assert solved == ["own"] * maps
     assert len(kept(tmp_path)) == maps
+
+
+def in_parts(folder: Path) -> Path:
+    """Write an arm whose model includes a file, which names a mesh, and whose gripper has a model of its own."""
+    for name in ("parts", "pictures"):
+        (folder / name).mkdir(parents=True)
+    corners = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "v 0 0 1"]
+    triangles = ["f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
+    (folder / "parts" / "foot.obj").write_text("\n".join([*corners, *triangles]))
+    wrist, mesh = '<geom type="sphere" size="0.02" mass="0.2"/>', '<mesh name="foot" file="foot.obj" scale=".1 .1 .1"/>'
+    arm, fingers = ARM.replace("FINGERS", ""), JAWS["slides"][0]
+    arm = arm.replace("</asset>", f"</asset><asset>{mesh}</asset>").replace(wrist, '<include file="wrist.xml"/>')
+    arm = arm.replace('<body name="base">', '<body name="base"><geom type="mesh" mesh="foot" contype="0"/>')
+    (folder / "parts" / "wrist.xml").write_text(f"<mujoco>{wrist}</mujoco>")
+    (folder / "parts" / "pad.xml").write_text(f"<mujoco><worldbody>{fingers}</worldbody></mujoco>")
+    gripper = tree_of()["gripper"] | {"model": "parts/pad.xml"}
+    return write(folder, tree=tree_of() | {"gripper": gripper, "includes": "parts"}, model=arm)
+
+
+def test_a_link_in_place_of_a_map_is_not_written_to(own: Robot, solved: list[str], tmp_path: Path):
+    path, letter = reach._place(own), tmp_path / "letter"
+    path.parent.mkdir(parents=True)
+    letter.write_text("dear reader")
+    path.symlink_to(letter)
+    path.with_suffix(f".{os.getpid()}").symlink_to(letter)
+    assert read_again(own) is MAP
+    assert letter.read_text() == "dear reader"
 
 
 @pytest.mark.parametrize("broken", [b"", b"no map", b"PK\x03\x04 cut", "half"])

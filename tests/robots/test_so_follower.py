@@ -105,11 +105,6 @@ def test_robots_with_a_name_of_lerobots_are_known_by_it():
     assert ManipILEnv(task="Reach-v0", robot="so101").fps == 30
 
 
-def test_a_robot_named_otherwise_moves_alike_and_keeps_its_map_of_reach():
-    robot = get_robot("so101")
-    assert replace(robot, lerobot=None).content() == robot.content()
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

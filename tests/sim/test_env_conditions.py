@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
 from manip_il.collect.expert import Expert
+from manip_il.errors import ManipError
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.stock.environment import StockEnv
 
-from ..scenes import started
+from ..scenes import bits, started
 from ..tables import every_robot, every_scene, every_scene_with_a_cube
 
 HEAVY = Condition("heavy", mass=(0.3, 0.3), size=(0.06, 0.06), friction=(0.7, 0.7))
 LATE = Condition("late", delay=(3, 3))
 ANY_COLOUR = Condition("any", colour=(0, 1))
+BUMPED = Condition("bumped", action_noise=(0.1, 0.1), knock=(0.06, 0.06))
 NOISY = Condition("noisy", joint_noise=(0.01, 0.01), position_noise=(0.02, 0.02))
 
 
@@ -46,6 +52,27 @@ def test_the_cube_has_the_drawn_mass_size_and_friction(robot: str, task: str):
     assert model.geom("object").size == pytest.approx([0.03] * 3)
     assert env.data.qpos[q + 2] == 0.03
     assert model.geom("object").friction[0] == 0.7
+
+
+@pytest.mark.filterwarnings("ignore:.*share an object.*:UserWarning")
+@pytest.mark.parametrize("condition", [NOMINAL, HEAVY, LATE, NOISY, BUMPED], ids=lambda one: one.name)
+def test_a_deep_copy_goes_on_by_itself_and_in_the_same_way(condition: Condition):
+    env = gymnasium.make("manip_il/PandaPickPlace-v0", conditions=[condition])
+    env.reset(seed=1)
+    actions = env.get_wrapper_attr("observe")().state + np.random.default_rng(0).normal(0, 0.05, (30, 8))
+    for action in actions[:10]:
+        env.step(action)
+    other, before = copy.deepcopy(env), bits(env.unwrapped)
+    theirs = [str(other.step(action)) for action in actions[10:]]
+    assert bits(env.unwrapped) == before
+    assert [str(env.step(action)) for action in actions[10:]] == theirs
+    assert str(other.reset()) == str(env.reset())
+
+
+@pytest.mark.parametrize("env", [ManipEnv(), StockEnv("FetchReach-v4")], ids=["own", "stock"])
+def test_an_environment_is_not_pickled(env: ManipEnv | StockEnv):
+    with pytest.raises(ManipError, match=r"cannot be .*pickled"):
+        pickle.dumps(env)
 
 
 @every_scene

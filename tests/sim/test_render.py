@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pkgutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
@@ -17,7 +20,7 @@ from manip_il.robots.robot import ROBOTS
 from manip_il.sim import render
 from manip_il.sim.config import CAMERAS, CameraConfig, Look
 from manip_il.sim.env import ManipEnv
-from manip_il.sim.gl import choose_backend, require_known_backend
+from manip_il.sim.gl import PACKAGES, choose_backend, remedy, require_known_backend
 from manip_il.sim.world import GOAL
 from manip_il.tasks.starts import UPRIGHT
 
@@ -177,7 +180,7 @@ ONE_CONTEXT = [("panda", Look()), ("fetch", Look()), ("panda", Look(shadows=True
 @pytest.mark.parametrize(
     ("context", "drawn"),
     [
-        ("mujoco.gl_context.GLContext", [{"robot": robot, "look": look} for robot, look in ONE_CONTEXT]),
+        ("mujoco.egl.GLContext", [{"robot": robot, "look": look} for robot, look in ONE_CONTEXT]),
         ("mujoco.MjrContext", 3 * [{"image_size": (128, 128)}, {"image_size": (240, 320)}]),  # the scene, uploaded
     ],
 )
@@ -216,7 +219,7 @@ def test_without_opengl_the_error_names_debians_packages(monkeypatch):
     def broken(*_: object) -> None:
         raise ImportError("cannot load libEGL.so.1")
 
-    monkeypatch.setattr("mujoco.gl_context.GLContext", broken)
+    monkeypatch.setattr("mujoco.egl.GLContext", broken)
     env = started("panda", "reach", cameras=("front",))
     with pytest.raises(RenderError, match=r"libEGL\.so\.1.*apt-get install -y libegl1 libegl-mesa0") as caught:
         env.observe()
@@ -241,6 +244,40 @@ def test_a_backend_that_mujoco_does_not_know_is_refused(monkeypatch):
         require_known_backend()
     monkeypatch.setenv("MUJOCO_GL", "EGL ")
     require_known_backend()
+
+
+def test_a_backend_whose_library_is_missing_is_refused(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    with pytest.raises(RenderError, match="MUJOCO_GL is 'osmesa', whose library is not installed; unset it"):
+        require_known_backend()
+
+
+@pytest.mark.parametrize(
+    ("variables", "advice"),
+    [
+        ({"MUJOCO_GL": "glfw"}, "unset MUJOCO_GL=glfw"),
+        ({"MUJOCO_GL": "off"}, "unset MUJOCO_GL=off"),
+        ({"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "glx"}, "unset PYOPENGL_PLATFORM=glx"),
+        ({"MUJOCO_GL": "EGL", "PYOPENGL_PLATFORM": "egl"}, f"on Debian: apt-get install -y {PACKAGES}"),
+        ({"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "7"}, "unset MUJOCO_EGL_DEVICE_ID=7"),
+    ],
+)
+def test_the_remedy_names_the_variable_that_is_in_the_way(variables, advice, monkeypatch):
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: f"lib{name}.so")
+    for name in ("PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID", "__EGL_VENDOR_LIBRARY_FILENAMES"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert remedy() == advice
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_mujoco_may_be_imported_first():
+    drawn = "from manip_il.sim.env import ManipEnv\nassert ManipEnv(render_mode='rgb_array').render().std() > 1"
+    environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    subprocess.run([sys.executable, "-c", f"import mujoco\n{drawn}"], env=environment, check=True)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 from manip_il.evaluation.maps import MAP_HEIGHT, MARGIN, WIDTH, View, fit_view
 from manip_il.evaluation.report import Report
 from manip_il.evaluation.robot_check.advice import advice
-from manip_il.evaluation.robot_check.check import RobotCheck, TaskCheck
+from manip_il.evaluation.robot_check.check import SOLVES, RobotCheck, TaskCheck
 from manip_il.evaluation.robot_check.joints import LOAD, JointFacts
 from manip_il.evaluation.tables import Table
 
@@ -39,12 +39,23 @@ def verdict(check: RobotCheck) -> str:
     asked = any(task.clean is not None for task in check.tasks)
     if not failed:
         which = f"all {count} tasks" if count > 1 else check.tasks[0].name
-        return f"{name} can do {which}." if asked else f"{name} has starts for {which}; the expert was not asked."
+        return (
+            f"{name} can do {which}{_noisy(check)}."
+            if asked
+            else f"{name} has starts for {which}; the expert was not asked."
+        )
     names, rest = _listed([task.name for task in failed]), count - len(failed)
     if not asked:
         others = f"; it has starts for the other {f'{rest} tasks' if rest > 1 else 'one'}, the expert was not asked"
         return f"{name} cannot do {names}{others if rest else ''}."
-    return f"{name} can do {rest} of {count} task{'s' if count > 1 else ''}; it cannot do {names}."
+    return f"{name} can do {rest} of {count} task{'s' if count > 1 else ''}{_noisy(check)}; it cannot do {names}."
+
+
+def _noisy(check: RobotCheck) -> str:
+    """Return which of the tasks that can be done the expert does not solve under random actions, and how often."""
+    done = [(task.name, task.noisy.success) for task in check.tasks if task.done and task.noisy is not None]
+    poor = [f"{name} in {one.successes} of {one.n} episodes" for name, one in done if one.rate < SOLVES]
+    return f", but with a tenth of the steps random the expert solves {_listed(poor)}" if poor else ""
 
 
 def joint_table(check: RobotCheck) -> Table:

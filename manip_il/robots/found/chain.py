@@ -39,7 +39,8 @@ def motor_limits(
     robot: str, files: ModelFiles, spec: mujoco.MjSpec, joints: Sequence[str]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the greatest torques [N m] and the armatures [kg m^2] of joints, as the model has them."""
-    motors = {one.target: one for one in files.load(robot).actuators}
+    whole = files.load(robot)  # held: what MuJoCo gives of a model does not keep it
+    motors = {one.target: one for one in whole.actuators}
     forces = [_greatest_torque(motors.get(name), spec.joint(name)) for name in joints]
     armature = [float(spec.joint(name).armature) or ARMATURE for name in joints]
     return tuple(forces), tuple(armature)

@@ -1,0 +1,111 @@
+"""Pictures that are decoded when they are read are the cache's and LeRobot's. It imports torch: some seconds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from manip_il.data import schema as s
+from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_read import camera_keys
+from manip_il.data.video_config import VideoConfig
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mdp import Episode
+
+from ..damage import edit_json
+from ..pictures import numbered_episodes, write
+
+pytestmark = pytest.mark.slow
+FRONT, WRIST = "observation.images.front", "observation.images.wrist"
+RECORDED = ("video", "image")
+
+
+@pytest.fixture(scope="module")
+def roots(
+    tmp_path_factory: pytest.TempPathFactory, make_episode: Callable[..., Episode], two: s.RobotTaskSpec
+) -> dict[str, Path]:
+    """Ours with either codec, in several files; what LeRobot records; what it makes of two by aggregating."""
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    from .record_lerobot import main as record
+
+    folder = tmp_path_factory.mktemp("datasets")
+    for codec in ("h264", "libsvtav1"):
+        five = numbered_episodes(make_episode, two, 5)
+        write(five, folder / codec, two, video=VideoConfig(codec), video_files_size_in_mb=0.001)
+    os.environ.setdefault("SVT_LOG", "1")  # or the encoder tells its life
+    for kind in RECORDED:
+        record(folder / kind, kind, 3, "finalize")
+    pair = [folder / "video", folder / "video"]
+    aggregate_datasets(["a/one", "a/two"], "a/all", roots=pair, aggr_root=folder / "aggregated")
+    return {path.name: path for path in folder.iterdir()}
+
+
+def cached(root: Path, folder: Path) -> dict[str, np.ndarray]:
+    frames = open_frame_cache(root, camera_keys(root), max_bytes=10**9, folder=folder)
+    assert frames is not None
+    return frames
+
+
+@pytest.mark.parametrize("name", ["h264", "libsvtav1", *RECORDED, "aggregated"])
+def test_the_cache_and_what_is_read_late_are_bit_equal_to_what_lerobot_gives(roots, name, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from manip_il.data.lazy_frames import LazyFrames
+
+    root = roots[name]
+    frames = cached(root, tmp_path)
+    plain: Any = LeRobotDataset("a/b", root=root)
+    assert list(frames) == [FRONT, WRIST]
+    assert len(plain) == len(frames[FRONT]) > 20
+    rows = np.random.default_rng(0).integers(0, len(plain), (4, 3))
+    for key, values in frames.items():
+        late = LazyFrames(root, key)
+        assert late.shape == values.shape
+        np.testing.assert_array_equal(late[rows], values[rows], strict=True)
+    for row in range(len(plain)):
+        theirs = plain[row]
+        assert int(theirs["index"]) == row
+        for key, values in frames.items():
+            assert theirs[key].dtype.is_floating_point
+            np.testing.assert_array_equal((theirs[key] * 255).numpy(), values[row].astype(np.float32))
+
+
+def test_processes_of_their_own_read_the_same(roots, tmp_path):
+    import torch
+
+    from manip_il.learn.samples import SampleSource, Windows, read_later
+
+    root = roots["video"]
+    whole = cached(root, tmp_path)[WRIST]
+    rows = np.arange(len(whole))
+    numbers = {"task_index": torch.zeros(len(rows), dtype=torch.int64)}
+    windows = Windows(np.zeros(len(rows), np.int64), {WRIST: np.array([-1, 0])})
+    source = SampleSource(windows, numbers, read_later([root], [WRIST]), ("a",), workers=1)
+    batches = list(source.batches(np.array_split(rows, 4)))
+    pictures = torch.cat([batch[WRIST] for batch in batches]).numpy()
+    np.testing.assert_array_equal(pictures, whole[np.stack([np.maximum(rows - 1, 0), rows], axis=1)])
+    assert batches[0][f"{WRIST}_is_pad"][:2].tolist() == [[True, False], [False, False]]
+
+
+def test_what_is_not_there_is_one_line(roots, tmp_path, two):
+    import shutil
+
+    from manip_il.data.lazy_frames import LazyFrames
+
+    for name, change in (("h264", "cut"), ("image", "size")):
+        root = tmp_path / name
+        shutil.copytree(roots[name], root)
+        late = LazyFrames(root, FRONT)
+        if change == "cut":
+            shutil.rmtree(root / "videos")
+        else:
+            edit_json(root / "meta/info.json", lambda info: info["features"][FRONT].update(shape=[8, 8, 3]))
+            late = LazyFrames(root, FRONT)
+        with pytest.raises((ManipError, MismatchError), match=r"cannot read .*\.mp4|shape of observation"):
+            _ = late[np.array([3])]

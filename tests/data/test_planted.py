@@ -1,0 +1,67 @@
+"""What is planted under the name of a file of ours: a link leads to no other file, a pipe holds nobody up."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from manip_il.cli.outputs import append_jsonl
+from manip_il.data.atomic import exclusive
+from manip_il.data.frame_cache import _exclusive  # pyright: ignore[reportPrivateUsage]
+from manip_il.errors import ManipError
+from manip_il.learn.metrics import json_lines
+from manip_il.store.disk import Download
+from manip_il.store.manifest import FileEntry
+
+HELD = b"of the user\n"
+
+
+def lock(folder: Path) -> None:
+    with exclusive(folder / "run"):
+        pass
+
+
+def lock_pictures(folder: Path) -> None:
+    with _exclusive(folder):
+        pass
+
+
+def write_metrics(folder: Path) -> None:
+    with json_lines(folder / "metrics.jsonl", 0) as write:
+        (folder / "metrics.jsonl").unlink()
+        (folder / "planted").rename(folder / "metrics.jsonl")
+        write({"step": 1})
+
+
+def download(folder: Path) -> None:
+    entry = FileEntry("a", 3, "0" * 64)
+    Download(entry, folder / "part", lambda count: None).attempt(lambda sink, offset: sink.write(b"abc"))
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    ".run.lock": lock,
+    ".lock": lock_pictures,
+    "records.jsonl": lambda folder: append_jsonl(folder / "records.jsonl", {"a": 1}),
+    "planted": write_metrics,
+    "part": download,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("kind", ["a link", "a link to nothing", "a pipe"])
+def test_nothing_is_written_through_what_is_planted(tmp_path: Path, name: str, kind: str):
+    victim, folder = tmp_path / "victim", tmp_path / "folder"
+    folder.mkdir()
+    if kind == "a link":
+        victim.write_bytes(HELD)
+    if kind == "a pipe":
+        os.mkfifo(folder / name)
+    else:
+        (folder / name).symlink_to(victim)
+    with pytest.raises((OSError, ManipError), match="not a regular file"):
+        WRITERS[name](folder)
+    assert victim.exists() == (kind == "a link")
+    assert kind != "a link" or victim.read_bytes() == HELD

@@ -1,0 +1,132 @@
+"""Where a model's files are found, and that a model from anyone neither hangs the program nor takes all memory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manip_il.errors import UsageError
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.spec import arm_spec
+
+from .own import model_of, tree_of, write
+
+MODEL = model_of()
+
+
+@pytest.fixture
+def tried_here() -> None:
+    """Nothing: here models are tried in a child process, as they are for a user."""
+
+
+def refusal(path: Path) -> str:
+    """The one line that a robot's YAML is refused with."""
+    with pytest.raises(UsageError) as caught:
+        get_robot(str(path))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+MODELS = {
+    "a place that is none": (MODEL.replace('pos="0 0 0.1"', 'pos="0 nan 0.1"'), ["body_pos of", "own.xml has nan"]),
+    "a place beyond all bounds": (
+        MODEL.replace('pos="0 0 0.1"', 'pos="0 1e300 0.1"'),
+        ["body_pos of", "own.xml has 1e+300", "expected finite numbers"],
+    ),
+    "a field of gigabytes": (
+        MODEL.replace("</asset>", '<hfield name="hills" nrow="30000" ncol="30000" size="1 1 1 1"/></asset>'),
+        ["the model of robot own needs more than 4 GB of memory"],
+    ),
+    "an arena of gigabytes": (MODEL.replace("<size ", '<size memory="100G" '), ["robot own", "allocate memory"]),
+    "a mesh without end": (
+        MODEL.replace("</asset>", '<mesh name="shell" file="/dev/zero"/></asset>'),
+        ["/dev/zero is not a regular file"],
+    ),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_model_with_broken_numbers_or_of_gigabytes_is_one_line(model: str, tmp_path: Path):
+    text, words = MODELS[model]
+    line = refusal(write(tmp_path, model=text))
+    assert all(word in line for word in words)
+
+
+YAMLS = {
+    "a model without end": (dict(model="/dev/zero"), ["cannot read /dev/zero", "not a regular file"]),
+    "a text that grows without end": (dict(mend={"o": "o" * 9999, "oo": "o" * 9999}), ["own.xml mended has more than"]),
+}
+
+
+@pytest.mark.parametrize("said", YAMLS)
+def test_a_text_without_end_is_one_line(said: str, tmp_path: Path):
+    more, words = YAMLS[said]
+    line = refusal(write(tmp_path, tree=tree_of() | more))
+    assert all(word in line for word in words)
+
+
+@pytest.mark.parametrize("name", ["own.yaml", "own.xml"])
+def test_a_pipe_for_a_file_is_one_line(name: str, tmp_path: Path):
+    path = write(tmp_path)
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    assert f"cannot read {tmp_path / name}: not a regular file" in refusal(path)
+
+
+def shaped(folder: Path, file: str, mesh: str, **more: Any) -> Robot:
+    """An arm in a folder whose base has a mesh, `file` on the disk, `mesh` in the model."""
+    (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    corners = ["v 0 0 0", "v .1 0 0", "v 0 .1 0", "v 0 0 .1"]
+    triangles = ["f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
+    (folder / file).write_text("\n".join([*corners, *triangles]))
+    model = MODEL.replace("</asset>", f'<mesh name="foot" file="{mesh}"/></asset>')
+    model = model.replace('<body name="base">', '<body name="base"><geom type="mesh" mesh="foot" contype="0"/>')
+    for old, new in more.pop("text", {}).items():
+        assert old in model
+        model = model.replace(old, new)
+    return get_robot(str(write(folder, tree=tree_of() | more, model=model)))
+
+
+PLACES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "beside the model": ("foot.obj", "foot.obj", {}),
+    "with capitals": ("Foot.OBJ", "Foot.OBJ", {"mend": {"steel": "iron"}}),
+    "in a folder below": ("parts/foot.obj", "parts/foot.obj", {"mend": {"steel": "iron"}}),
+    "in the model's folder of meshes": (
+        "parts/foot.obj",
+        "foot.obj",
+        {"mend": {'angle="radian"': 'angle="radian" meshdir="parts"'}},
+    ),
+    "in its folder of all assets": (
+        "parts/foot.obj",
+        "foot.obj",
+        {"mend": {'angle="radian"': 'angle="radian" assetdir="parts"'}},
+    ),
+    "in the YAML's folder of meshes": ("parts/sub/foot.obj", "sub/foot.obj", {"meshes": "parts"}),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_mesh_is_found_as_mujoco_finds_it(place: str, tmp_path: Path):
+    file, mesh, said = PLACES[place]
+    assert arm_spec(shaped(tmp_path, file, mesh, **said)).compile().nmeshvert == 4
+
+
+def test_what_a_model_includes_is_found_where_the_yaml_says_and_what_lies_beside_it_does_not_matter(tmp_path: Path):
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    (parts / "look.xml").write_text('<mujoco><asset><mesh name="foot" file="foot.obj"/></asset></mujoco>')
+    (parts / "LOOK.xml").write_text("what has the same name but for capitals")
+    include = {'<mesh name="foot" file="foot.obj"/></asset>': '</asset><include file="look.xml"/>'}
+    robot = shaped(tmp_path, "parts/foot.obj", "foot.obj", includes="parts", text=include)
+    assert arm_spec(robot).compile().nmeshvert == 4
+    (parts / "foot.obj").rename(tmp_path / "foot.obj")
+    again = write(
+        tmp_path,
+        "again",
+        tree=tree_of() | {"includes": "parts", "meshes": "."},
+        model=(tmp_path / "own.xml").read_text(),
+    )
+    assert arm_spec(get_robot(str(again))).compile().nmeshvert == 4

@@ -1,0 +1,253 @@
+"""Models as others write them: in degrees, as URDF, with bodies turned in every way, with a scene around them."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.errors import UnknownName
+from manip_il.robots.robot import Robot, get_robot
+from manip_il.robots.spec import arm_model, arm_spec
+from manip_il.robots.suggest import suggest
+
+from .own import EXAMPLES, model_of, tree_of, write
+
+# Angles are in [rad] here, as `A(...)`; the wrist has a joint whose zero is not where the model has it.
+TURNED = (
+    model_of("hinges")
+    .replace('<compiler angle="radian"/>', "<compiler UNIT/>")
+    .replace('name="turn" axis="0 0 1" range="-2.9 2.9"', 'name="turn" axis="0 0 1" range="A(-2.9 2.9)" ref="A(0.3)"')
+    .replace('<body name="upper" pos="0 0 0.1">', '<body name="upper" pos="0 0 0.1" axisangle="0 0 1 A(0.2)">')
+    .replace(
+        '<body name="base">',
+        '<body name="base"><inertial pos="0 0 0" euler="A(0.4 0 0)" mass="1" diaginertia="1 2 3"/>',
+    )
+    .replace('<body name="fore" pos="0 0 0.3">', '<body name="fore" pos="0 0 0.3" euler="A(0 0.1 0.2)">')
+    .replace('<site name="grip"/>', '<geom type="box" size="0.01 0.02 0.03" euler="A(0.3 0 0)" mass="0.1"/>')
+    .replace(
+        '<joint name="roll" axis="0 0 1"/>', '<joint name="roll" axis="0 0 1" springref="A(0.5)" stiffness="0.1"/>'
+    )
+)
+ENDS = re.compile(r'(name="(?:shoulder|elbow|wrist|left|right)" axis="[^"]*" range=)"([^"]*)"')
+LINK = """<link name="{0}"><inertial><mass value="0.2"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0"
+  iyz="0"/></inertial><collision><origin xyz="{1}"/><geometry><box size="{2}"/></geometry></collision></link>"""
+JOINT = """<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{3}"/><origin xyz="{4}"/><axis xyz="{5}"/>
+  <limit lower="{6}" upper="{7}" effort="{8}" velocity="1"/></joint>"""
+
+
+def in_unit(unit: str) -> str:
+    """The arm's MJCF with its angles in `radian` or `degree`."""
+    scale = math.degrees(1) if unit == "degree" else 1.0
+    text = ENDS.sub(r'\1"A(\2)"', TURNED).replace("UNIT", f'angle="{unit}"')
+    return re.sub(r"A\((.*?)\)", lambda found: " ".join(repr(float(one) * scale) for one in found[1].split()), text)
+
+
+def urdf() -> str:
+    """An arm of five joints with two fingers; what a fixed joint carries is a link of its own."""
+    links = [("base", "0 0 0.05", "0.1 0.1 0.1"), ("tower", "0 0 0.05", "0.06 0.06 0.05")]
+    links += [(name, "0 0 0.15", "0.05 0.05 0.2") for name in ("upper", "fore")]
+    links += [
+        ("wrist", "0 0 0", "0.03 0.03 0.03"),
+        ("tool", "0 0 0", "0.03 0.03 0.02"),
+        ("hand", "0 0 0", "0.04 0.1 0.02"),
+    ]
+    links += [(name, "0 0 0.03", "0.02 0.008 0.06") for name in ("left", "right")]
+    axes = {"turn": "0 0 1", "roll": "0 0 1"}
+    chain = [("turn", "base", "tower", 0.1), ("shoulder", "tower", "upper", 0.1), ("elbow", "upper", "fore", 0.3)]
+    chain += [("bend", "fore", "wrist", 0.3), ("roll", "wrist", "tool", 0.05)]
+    joints = [
+        JOINT.format(name, "revolute", one, other, f"0 0 {up}", axes.get(name, "0 1 0"), -2.5, 2.5, 30)
+        for name, one, other, up in chain
+    ]
+    joints.append(JOINT.format("bolts", "fixed", "tool", "hand", "0 0 0.02", "0 0 1", 0, 0, 0))
+    for name, side in (("left", 1), ("right", -1)):
+        at = f"0 {0.005 * side} 0.01"
+        joints.append(JOINT.format(f"{name}_slide", "prismatic", "hand", name, at, f"0 {side} 0", 0, 0.04, 20))
+    return f'<robot name="bolted">{"".join(LINK.format(*one) for one in links)}{"".join(joints)}</robot>'
+
+
+def short(jaws: str = "slides") -> dict[str, Any]:
+    return {name: tree_of(jaws)[name] for name in ("model", "gripper", "workspace")} | {"hand": "hand"}
+
+
+def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    names = ("body_pos", "body_quat", "body_inertia", "body_iquat", "geom_pos", "geom_quat", "jnt_range", "qpos0")
+    names += ("qpos_spring", "actuator_ctrlrange", "actuator_gainprm", "actuator_forcerange", "dof_armature")
+    return {name: getattr(model, name) for name in names}
+
+
+def test_an_arm_in_degrees_is_the_arm_in_radians(tmp_path: Path):
+    found, models, suggested = list[Robot](), [], []
+    for unit in ("radian", "degree"):
+        (tmp_path / unit).mkdir()
+        path = write(tmp_path / unit, tree=short("hinges"), model=in_unit(unit))
+        found.append(get_robot(str(path)))
+        models.append(arrays(arm_spec(found[-1]).compile()))
+        suggested.append(suggest(path.with_name("own.xml")))
+    for name in ("home", "gains", "forces", "armature"):
+        np.testing.assert_allclose(getattr(found[1], name), getattr(found[0], name), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found[1].ee.position, found[0].ee.position, atol=1e-6)
+    for name, values in models[0].items():
+        np.testing.assert_allclose(models[1][name], values, atol=1e-6, err_msg=name)
+    for name in ("closed", "open", "centre"):
+        np.testing.assert_allclose(getattr(suggested[1], name), getattr(suggested[0], name), atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [-0.5, 0.0, 0.7])
+@pytest.mark.parametrize("joint", ["turn", "elbow"])
+def test_a_fixed_joint_is_where_mujoco_has_it(joint: str, value: float, tmp_path: Path):
+    # Bodies turned by euler inside a turned frame, an anchor beside the body, a skew axis, a zero that is elsewhere,
+    # and a second joint of the same body that goes on turning.
+    model = (
+        in_unit("degree")
+        .replace('<body name="fore"', '<frame pos="0.01 0 0" euler="0 0 20"><body name="fore"')
+        .replace('<body name="wrist"', '<body name="wrist" euler="10 0 0"', 1)
+        .replace('<joint name="elbow" axis="0 1 0"', '<joint name="elbow" axis="0.1 1 0.2" pos="0 0.02 0.01" ref="15"')
+        .replace('<joint name="wrist"', '<joint name="second" pos="0.01 0 0" axis="1 0 0.3"/><joint name="wrist"')
+    )
+    model = re.sub(
+        r"(</body>\s*</body>\s*</body>\s*)(</body>\s*</body>\s*</body>\s*</worldbody>)", r"\1</frame>\2", model
+    )
+    joints = ["turn", "shoulder", "elbow", "second", "wrist", "roll"]
+    tree = short("hinges") | {"ee": tree_of()["ee"], "joints": joints, "home": [0.1] * 6, "gains": [100] * 6}
+    whole = get_robot(str(write(tmp_path, "whole", tree=tree, model=model)))
+    apart = [name for name in joints if name != joint]
+    fixed = replace(
+        whole,
+        joints=tuple(apart),
+        home=(0.1,) * 5,
+        gains=(100.0,) * 5,
+        forces=(9.0,) * 5,
+        armature=(0.1,) * 5,
+        fixed={joint: value},
+    )
+    poses = []
+    for robot in (whole, fixed):
+        compiled = arm_model(robot)
+        data = mujoco.MjData(compiled)
+        for name, at in {name: 0.4 for name in apart}.items() | ({joint: value}.items() if robot is whole else ()):
+            data.joint(name).qpos[0] = at
+        mujoco.mj_kinematics(compiled, data)
+        poses.append(np.concatenate([data.site("ee").xpos, data.site("ee").xmat]))
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
+
+
+def test_the_first_of_two_joints_of_a_body_goes_on_turning_where_it_did(tmp_path: Path):
+    both = '<joint name="wrist" axis="0 1 0"/><joint name="skew" pos="0 0.01 0" axis="1 0.2 0"/>'
+    model = model_of().replace('<joint name="wrist" axis="0 1 0" range="-0.5 2.8"/>', both)
+    whole = get_robot(str(write(tmp_path, tree=tree_of() | {"fixed": {"skew": 0.6}}, model=model)))
+    held = arm_model(whole)
+    spec = mujoco.MjSpec.from_string(model)
+    free = spec.compile()
+    poses = []
+    for compiled in (held, free):
+        data = mujoco.MjData(compiled)
+        data.joint("wrist").qpos[0] = 0.8
+        if compiled is free:
+            data.joint("skew").qpos[0] = 0.6
+        mujoco.mj_kinematics(compiled, data)
+        poses.append(np.concatenate([data.body("hand").xpos, data.body("hand").xmat]))
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
+
+
+def test_a_free_joint_cannot_be_fixed_at_a_number(tmp_path: Path):
+    model = model_of().replace('<body name="base">', '<body name="base"><freejoint name="float"/>')
+    with pytest.raises(UnknownName, match=r"joint in 'fixed' of robot own: 'float'"):
+        arm_spec(get_robot(str(write(tmp_path, tree=tree_of() | {"fixed": {"float": 1.0}}, model=model))))
+
+
+@pytest.mark.parametrize("kind", ["urdf", "mjcf"])
+def test_what_is_bolted_on_keeps_its_name(kind: str, tmp_path: Path):
+    fused = '<compiler angle="radian" fusestatic="true" discardvisual="true" settotalmass="50"/>'
+    model = urdf() if kind == "urdf" else model_of().replace('<compiler angle="radian"/>', fused)
+    path = tmp_path / "arm.xml"
+    path.write_text(model)
+    found = suggest(path)
+    assert (found.hand, set(found.fingers)) == ("hand", {"left", "right"})
+    gripper = {"joints": list(found.joints), "closed": list(found.closed), "open": list(found.open)}
+    tree = {"hand": "hand", "gripper": gripper | {"fingers": ["left", "right"]}}
+    robot = get_robot(str(write(tmp_path, tree=tree_of() | tree | {"joints": list(suggest_joints(kind))}, model=model)))
+    bodies = [arm_spec(robot).compile().body(name).id for name in ("base", "hand")]
+    assert bodies[0] == 1
+    assert arm_model(robot).body("hand").id > bodies[0]
+    assert float(arm_model(robot).body_mass.sum()) < 10
+
+
+def suggest_joints(kind: str) -> list[str]:
+    return ["turn", "shoulder", "elbow", "bend" if kind == "urdf" else "wrist", "roll"]
+
+
+def test_of_a_scene_around_a_robot_only_the_robot_is_taken(tmp_path: Path):
+    around = """<worldbody><site name="ground"/><geom name="floor" type="plane" size="2 2 1"/>
+      <geom name="desk" type="box" size="1 1 0.01" pos="0 0 -0.1"/>
+      <body name="cube" pos="0.4 0 0.05"><freejoint/><geom name="cube" size="0.02 0.02 0.02" type="box"/></body>
+      <body name="shelf" pos="0.4 0 0.05"><geom size="0.02 0.02 0.02" type="box"/></body>"""
+    rest = """<contact><pair geom1="floor" geom2="cube"/></contact>
+      <equality><weld site1="ground" site2="grip"/></equality>
+      <custom><tuple name="all"><element objtype="body" objname="cube"/></tuple></custom></mujoco>"""
+    scene = model_of().replace("<worldbody>", around, 1).replace("</mujoco>", rest)
+    scene = scene.replace('mquat="1 0 0 0"', 'mquat="1 0 0 0" qpos="0 0 0 0 0 0 0 1 0 0 0 0 0 0"')
+    (tmp_path / "around").mkdir()
+    alone, inside = (
+        arm_spec(get_robot(str(write(folder, model=model)))).compile()
+        for folder, model in ((tmp_path, model_of()), (tmp_path / "around", scene))
+    )
+    assert [inside.body(i).name for i in range(inside.nbody)] == [alone.body(i).name for i in range(alone.nbody)]
+    assert inside.ngeom == alone.ngeom
+    assert inside.npair == 0
+    assert suggest(tmp_path / "around" / "own.xml") == suggest(tmp_path / "own.xml")
+
+
+def test_a_models_defaults_are_not_for_what_is_added(tmp_path: Path):
+    defaults = """<default><site material="steel" rgba="1 0 0 1"/><general gear="7" ctrlrange="-9 9"/>
+      <camera fovy="5"/>
+      <default class="robot"><site material="steel"/></default></default><asset>"""
+    model = (
+        model_of().replace("<asset>", defaults).replace('<body name="base">', '<body name="base" childclass="robot">')
+    )
+    (tmp_path / "plain").mkdir()
+    plain = arm_spec(get_robot(str(write(tmp_path / "plain")))).compile()
+    ours = arm_spec(get_robot(str(write(tmp_path, model=model)))).compile()
+    assert ours.site("ee").matid[0] == -1
+    for name in ("site_rgba", "actuator_gear", "actuator_ctrlrange"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
+
+
+FREED = """
+from manip_il.checks import read_yaml
+from manip_il.errors import ManipError
+from manip_il.robots import ROBOTS
+from manip_il.robots.found import complete
+from manip_il.robots.robot import FOUND, Robot
+import pathlib, sys
+
+def found(path):
+    said = Robot._said(path, read_yaml(path, ""))
+    said = {name: value for name, value in said.items() if name not in (*FOUND, "costs", "yaw", "lerobot")}
+    try:
+        return repr([complete(said)[name] for name in FOUND])
+    except ManipError as error:
+        return str(error)
+
+for path in map(pathlib.Path, [*ROBOTS.values(), *sys.argv[1:]]):
+    seen = {found(path) for _ in range(20)}
+    assert len(seen) == 1, (path, seen)
+"""
+
+
+@pytest.mark.slow
+def test_what_is_found_reads_no_freed_memory():
+    command = [sys.executable, "-c", FREED, *map(str, EXAMPLES)]
+    environment = os.environ | {"PYTHONMALLOC": "debug", "MALLOC_PERTURB_": "165"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
