@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import shutil
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, override
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -22,9 +24,18 @@ from numpy.typing import NDArray
 
 from datasets import Dataset
 from manip_il import checks
+from manip_il.data.atomic import PARTIAL, writing
 from manip_il.data.info import NUMBERS, PICTURES, Feature, read_info, read_object
 from manip_il.data.lazy_frames import without_progress_bars
-from manip_il.data.lerobot_layout import EPISODES_FILES, QUANTILES, STAT_NAMES, STATS, TASK_INDEX
+from manip_il.data.lerobot_layout import (
+    DATA_FILES,
+    EPISODES_FILES,
+    QUANTILES,
+    STAT_NAMES,
+    STATS,
+    TASK_INDEX,
+    write_json,
+)
 from manip_il.data.lerobot_read import check_all_pictures, check_dataset, read_instructions
 from manip_il.data.parquet_files import find_shards, read_file
 from manip_il.data.scheduling import scheduling_kept
@@ -69,6 +80,7 @@ def write_with_library(
         raise
     dataset.finalize()
     shutil.rmtree(root / "images", ignore_errors=True)  # empty folders: the pictures are in the data by now
+    _remove_chance(root)
 
 
 def _save(dataset: LeRobotDataset) -> None:
@@ -87,16 +99,35 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
         check_all_pictures(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
+        with writing(root), contextlib.redirect_stderr(io.StringIO()):  # its progress bars
             aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+            _remove_chance(root)
+    except ManipError:
+        raise
     except Exception as error:  # of every kind: it takes what the files say
-        if isinstance(error, OSError) and error.filename:  # the disk's refusal names its file
-            raise
         told = checks.shorten(" ".join(str(error).split()))
         joined = ", ".join(map(str, roots))
         raise ManipError(
             f"LeRobot cannot join {joined} ({type(error).__name__}: {told}); see `manip-il doctor`"
         ) from error
+
+
+def _remove_chance(root: Path) -> None:
+    """Order the statistics, which LeRobot leaves in a set's order, and drop the random fingerprint of data files."""
+    stats = read_object(root / STATS)
+    write_json(root / STATS, {key: stats[key] for key in read_info(root).features if key in stats})
+    for path in sorted(root.glob(DATA_FILES)):
+        with pq.ParquetFile(path) as file:
+            schema = file.schema_arrow
+            about = json.loads((schema.metadata or {}).get(b"huggingface", b"{}"))
+            if about.pop("fingerprint", None) is None:
+                continue
+            named = schema.with_metadata({**(schema.metadata or {}), b"huggingface": json.dumps(about).encode()})
+            new = path.with_suffix(PARTIAL)
+            with pq.ParquetWriter(new, named, compression="snappy", use_dictionary=True) as writer:  # as LeRobot's
+                for group in range(file.num_row_groups):
+                    writer.write_table(file.read_row_group(group).cast(named))
+        new.replace(path)
 
 
 class Metadata(LeRobotDatasetMetadata):
