@@ -34,6 +34,7 @@ from manip_il.data.lerobot_layout import (
     STAT_NAMES,
     STATS,
     TASK_INDEX,
+    TASKS,
     write_json,
 )
 from manip_il.data.lerobot_read import check_all_pictures, check_dataset, read_instructions
@@ -147,18 +148,25 @@ class Metadata(LeRobotDatasetMetadata):
     def _load_metadata(self) -> None:
         """Read the files with this program's readers: LeRobot's decode what the files' own metadata asks for."""
         self.info = load_info(self.root)
-        tasks = sorted(read_instructions(self.root).items())
-        self.tasks = pd.DataFrame(
-            {TASK_INDEX: [number for number, _ in tasks]}, index=pd.Index([text for _, text in tasks], name="task")
-        )
+        texts = read_instructions(self.root)
+        if sorted(texts) != list(range(len(texts))):
+            found = checks.shorten(sorted(texts))
+            raise ManipError(
+                f"{self.root / TASKS}: task_index holds {found}; expected 0 to {len(texts) - 1}, each once"
+            )
+        self.tasks = _tasks([texts[number] for number in range(len(texts))])
         self.episodes = _episodes(self.root)
         self.stats = read_stats(self.root)
 
     def joint_tasks(self, own: I64) -> I64:
-        """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""
-        if len(self.roots) == 1:
-            return own
+        """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,).
+
+        Raises `ManipError` for a number without a text.
+        """
         pieces = np.split(own, np.cumsum(self.frames)[:-1])
+        for root, numbers, piece in zip(self.roots, self.task_numbers, pieces, strict=True):
+            if len(unknown := piece[(piece < 0) | (piece >= len(numbers))]):
+                raise ManipError(f"{root}: rows have the task {unknown[0]}, which {TASKS} does not hold")
         return np.concatenate([numbers[piece] for numbers, piece in zip(self.task_numbers, pieces, strict=True)])
 
 
@@ -182,8 +190,8 @@ def read_metadata(*roots: Path) -> Metadata:
     first.roots = roots
     first.frames = tuple(meta.total_frames for meta in metas)
     first.episodes_of = tuple(meta.total_episodes for meta in metas)
+    _join_tasks(first, metas)
     if len(metas) > 1:
-        _join_tasks(first, metas)
         alike = {key for key in first.features if all(_shape(meta, key) == _shape(first, key) for meta in metas)}
         first.info.features = {key: value for key, value in first.features.items() if key in alike}
     stats: list[dict[str, Any]] = [meta.stats or {} for meta in metas]
@@ -220,7 +228,12 @@ def _join_tasks(first: Metadata, metas: Sequence[Metadata]) -> None:
     own = [_instructions(meta) for meta in metas]
     joint = {text: number for number, text in enumerate(dict.fromkeys(text for texts in own for text in texts))}
     first.task_numbers = tuple(np.array([joint[text] for text in texts], np.int64) for texts in own)
-    first.tasks = first.tasks.reindex(list(joint)).assign(task_index=list(joint.values()))
+    first.tasks = _tasks(list(joint))
+
+
+def _tasks(texts: Sequence[str]) -> pd.DataFrame:
+    """Tasks as LeRobot has them, numbered in this order."""
+    return pd.DataFrame({TASK_INDEX: range(len(texts))}, index=pd.Index(texts, name="task"))
 
 
 def _instructions(meta: Metadata) -> list[str]:
