@@ -19,7 +19,7 @@ from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
-MAX_DEATHS = 3  # of workers that one seed may cost before it is left out
+MAX_DEATHS = 3  # of workers that ran one seed alone, before it is left out
 Backend = Literal["local", "ray"]
 _EVERY_JOB, _LEARNED_JOB = ("manip_il.collect.job",), ("manip_il.collect.job", "manip_il.learn.policy")
 
@@ -107,9 +107,11 @@ class Engine:
         deaths: Counter[int] = Counter()
         in_a_row = 0
         while tasks or alone or running:
-            while (alone and not running) or (tasks and not alone and len(running) < pool.count):
-                task = alone.popleft() if alone else tasks.popleft()
-                running[pool.submit(job, task, journal)] = task
+            is_alone = bool(alone) and not running
+            if is_alone:
+                running[pool.submit(job, alone[0], journal)] = alone.popleft()
+            while tasks and not alone and not is_alone and len(running) < pool.count:
+                running[pool.submit(job, tasks[0], journal)] = tasks.popleft()
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 task = running.pop(future)
@@ -122,7 +124,8 @@ class Engine:
                             f"{in_a_row} rollout workers died one after the other ({death}); out of memory? Finished "
                             "episodes are kept"
                         ) from death
-                    deaths.update(task)
+                    if is_alone:  # else another seed may have killed the worker
+                        deaths.update(task)
                     self.given_up += [seed for seed in task if deaths[seed] >= MAX_DEATHS]
                     alone.extend((seed,) for seed in task if deaths[seed] < MAX_DEATHS)
                     continue
