@@ -108,10 +108,10 @@ class Engine:
         in_a_row = 0
         while tasks or alone or running:
             is_alone = bool(alone) and not running
-            if is_alone:
-                running[pool.submit(job, alone[0], journal)] = alone.popleft()
-            while tasks and not alone and not is_alone and len(running) < pool.count:
-                running[pool.submit(job, tasks[0], journal)] = tasks.popleft()
+            start = [alone.popleft()] if is_alone else []
+            while tasks and not alone and not is_alone and len(running) + len(start) < pool.count:
+                start.append(tasks.popleft())
+            running |= {pool.submit(job, task, journal): task for task in start}
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 task = running.pop(future)
