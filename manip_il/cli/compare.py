@@ -65,7 +65,7 @@ class CompareOptions:
             raise UsageError(f"{self.left} is compared with itself; give two different ones")
         common.require_workers(self.workers)
         require_suite(self.suite)
-        require_output(self.output_dir, "compare", resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Evaluate what is not evaluated yet, compare, print and write the answer."""

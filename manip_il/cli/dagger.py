@@ -112,7 +112,7 @@ class DaggerOptions(common.EnvOptions):
         """Refuse what paths and values show to be wrong."""
         common.require_workers(self.workers)
         common.require_pictures(self.robot.type, self.cameras)
-        require_output(self.output_dir, "dagger", resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.dataset.root:
             check_weights(self.dataset.root, ())
         for root in self.dataset.root:

@@ -91,7 +91,7 @@ class EvalOptions:
         if self.policy.path is not None:
             self._check_space(find_policy(self.policy.path))
         require_suite(self.suite)
-        require_output(self.output_dir, "eval", resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         self.env.config(self.robot.type, self.task.type, shape=self.task.object, reward=self.task.reward)
 
     def run(self) -> None:

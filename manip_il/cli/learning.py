@@ -58,7 +58,7 @@ class LearningOptions:
     def check(self) -> None:
         """Refuse what paths and values show to be wrong."""
         common.require_workers(self.workers)
-        require_output(self.output_dir, self.name, resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         if self.init is not None:
             find_policy(self.init.expanduser())
 

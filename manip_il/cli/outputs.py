@@ -13,6 +13,7 @@ from typing import Any
 from manip_il import checks
 from manip_il.cli.options import options_of, value_of
 from manip_il.cli.parsing import CONFIG_HEADER, dump_yaml, from_yaml
+from manip_il.cli.progress import say
 from manip_il.data.atomic import PARTIAL, exclusive, write_file, writing
 from manip_il.errors import FolderExistsError, ManipError, MismatchError, NotFiniteError, UsageError
 
@@ -75,14 +76,11 @@ def require_short_path(path: Path) -> None:
             raise UsageError(f"{what} {checks.shorten(str(path))} has {size:,} bytes; expected at most {most:,}")
 
 
-def require_output(folder: Path, command: str, *, resume: bool = False, overwrite: bool = False) -> None:
-    """Raise `UsageError` where a command cannot begin to write to `folder`, or has nothing in it to resume."""
+def require_output(folder: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Raise `UsageError` if a command cannot begin to write to `folder`; say so if there is nothing to resume in it."""
     check_output(folder, resume=resume, overwrite=overwrite)
     if resume and not (folder.is_dir() and any(folder.iterdir())):
-        raise UsageError(
-            f"--resume=true: nothing to resume in {folder}; expected what an earlier manip-il {command} left there "
-            "(leave out --resume=true to start)"
-        )
+        say(f"nothing to resume in {folder}: starting from the beginning")
 
 
 def require_new(folder: Path, *, overwrite: bool = False) -> None:

@@ -83,7 +83,7 @@ class QuickstartOptions(common.EnvOptions):
         for name in ("test_episodes", "disturbed_episodes"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} is {getattr(self, name)}; expected at least 1")
-        require_output(self.output_dir, "quickstart", resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
         replace(self._dagger(), output_dir=self.output_dir, resume=self.resume, overwrite=self.overwrite).check()
 
     def run(self) -> None:

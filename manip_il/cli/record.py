@@ -80,7 +80,7 @@ class RecordOptions(common.EnvOptions):
         root, journals = self._folders()
         check_output(root, resume=self.resume, overwrite=self.overwrite)
         if not (self.resume and root.is_dir() and any(root.iterdir())):
-            require_output(journals, "record", resume=self.resume, overwrite=self.overwrite)
+            require_output(journals, resume=self.resume, overwrite=self.overwrite)
         common.require_pictures(self.robot.type, self.cameras)
         varied(self.vary, self.env_config(), sees=bool(self.cameras))
         self.image.config(self.cameras)

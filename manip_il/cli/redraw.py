@@ -60,7 +60,7 @@ class RedrawOptions:
             raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")
         check_output(self.target, resume=self.resume, overwrite=self.overwrite)
         if not self.target.is_dir():
-            require_output(self._journals(), "redraw", resume=self.resume, overwrite=self.overwrite)
+            require_output(self._journals(), resume=self.resume, overwrite=self.overwrite)
         if self.image.config(self.cameras) is None:
             raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
 

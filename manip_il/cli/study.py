@@ -68,7 +68,7 @@ class StudyOptions:
             wanted = "the YAML of a study, such as configs/studies/*.yaml"
             raise UsageError(f"{self.file} does not exist; expected {wanted}")
         common.require_workers(self.workers)
-        require_output(self.output_dir, "study", resume=self.resume, overwrite=self.overwrite)
+        require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Run what is not there yet, test it, print and write the answer."""

@@ -97,7 +97,7 @@ class TrainOptions:
         self._check_redraw()
         self._check_weights()
         if _is_first_process():
-            require_output(self.output_dir, "train", resume=self.resume, overwrite=self.overwrite)
+            require_output(self.output_dir, resume=self.resume, overwrite=self.overwrite)
 
     def run(self) -> None:
         """Read the datasets, fit, and say where the checkpoint is."""

@@ -28,7 +28,6 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
         (f"--dataset.root={SAMPLE} --ppo.gamma=2", "ppo.gamma is 2.0; expected 0 to 1", 2),
         (f"--dataset.root={SAMPLE} --discriminator.regulariser=l2", "unknown discriminator.regulariser 'l2'", 2),
         (f"--dataset.root={SAMPLE} --seed=-1", "seed is -1", 2),
-        (f"--dataset.root={SAMPLE} --resume=true", "nothing to resume", 2),
     ],
 )
 def test_bad_input_is_one_line(name, words, says, code, here, error):

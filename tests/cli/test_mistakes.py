@@ -12,8 +12,7 @@ import pytest
 
 import manip_il
 from manip_il import __version__
-from manip_il.cli.main import COMMANDS, load, main
-from manip_il.cli.options import options_of
+from manip_il.cli.main import COMMANDS, main
 
 SLOW = ["torch", "lerobot"]  # seconds
 HEAVY = [*SLOW, "mujoco", "mink", "gymnasium", "scipy", "pyarrow", "av", "PIL", "mcap", "huggingface_hub"]
@@ -123,22 +122,6 @@ def test_a_missing_path_is_said_before_anything_heavy_is_imported(tmp_path):
         },
         tmp_path,
     )
-
-
-def test_resume_with_nothing_to_resume_is_refused_before_anything_heavy_is_imported(tmp_path):
-    nothing = "--resume=true: nothing to resume in new"
-    commands = ["train --dataset.root=SAMPLE", "dagger", "eval --policy.type=expert", f"compare {ROOT} {SAMPLE}"]
-    commands += [f"study {ROOT / 'pyproject.toml'}", "quickstart", "ppo"]
-    commands += ["gail --dataset.root=SAMPLE", "airl --dataset.root=SAMPLE"]
-    cases = {f"{command} --resume=true --output_dir=new": nothing for command in commands}
-    journals = f"{nothing}.journals"
-    cases |= {"record --resume=true --dataset.root=new": journals, "redraw SAMPLE new --resume=true": journals}
-    mistakes(cases, tmp_path)
-    assert {name for name in COMMANDS if any(option.name == "resume" for option in options_of(load(name)))} == {
-        *(command.split()[0] for command in commands),
-        "record",
-        "redraw",
-    }
 
 
 def test_a_bad_value_is_said_before_torch_is_imported(tmp_path):

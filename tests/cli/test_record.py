@@ -38,6 +38,13 @@ def journals_of(root: Path) -> Path:
     return root.with_name(f"{root.name}.journals")
 
 
+def test_resuming_what_never_began_begins(recorded, tmp_path, capsys):
+    """So that one line serves a job that is queued again and again."""
+    assert main(record(tmp_path / "demos", "--dataset.repo_id=me/demos", "--resume=true")) == 0
+    assert "nothing to resume in" in capsys.readouterr().out
+    assert files(tmp_path / "demos") == files(recorded)
+
+
 def test_the_journals_give_the_datasets_bytes_again(recorded, tmp_path):
     assert main(["build", str(journals_of(recorded)), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(recorded)
