@@ -30,7 +30,7 @@ def test_a_healthy_machine_says_what_it_has(capsys):
     assert err == ""
     [line] = out.splitlines()
     assert re.match(r"healthy: \S.*, \d+\.\d ms a picture of 128 x 128; torch 2\.\d+", line)
-    assert re.search(r"graphics cards for CUDA \d+; .*memory.*; cores [1-9]", line)
+    assert re.search(r"graphics cards for CUDA \d+; cores [1-9]", line)
 
 
 def test_torch_is_not_imported_to_say_its_version():

@@ -97,6 +97,6 @@ def test_a_camera_that_cannot_render_is_one_clear_error_before_anything_is_recor
     environment = os.environ | {"MUJOCO_GL": "glfw", "DISPLAY": ""}
     error = one_line(record(tmp_path / "demos", "--cameras=front", env=environment))
     assert "OpenGL" in error
-    assert "apt-get install" in error
+    assert "MUJOCO_GL" in error
     assert not (tmp_path / "demos").exists()
     assert list_episodes(tmp_path / "demos.journals") == []
