@@ -21,7 +21,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from manip_il.data.foxglove import NANOSECONDS
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mcap.importing import features_of, frame_times, frames_of, list_files, pick, read_import
@@ -220,7 +220,7 @@ def test_our_journals_come_in_by_a_mapping_of_their_topics(
     tmp_path: Path, make_episode: MakeEpisode, spec: RobotTaskSpec
 ) -> None:
     episode = make_episode(3, 6)
-    path = write_episode(tmp_path, episode, spec, {})
+    path = Journal(tmp_path, spec, {}).write(episode)
     joints = [f"joints[name={name}].position" for name in spec.joint_names]
     places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
     mapping = load(
