@@ -40,7 +40,7 @@ _NAME = re.compile(r"episode-(\d{12,})\.mcap")
 _FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
 _MAGIC = b"\x89MCAP0\r\n"
 _END = struct.Struct("<QQI8s")  # of a file: start of the summary, start of its offsets, its checksum, magic
-_DATA_END = 13  # the record before the summary [bytes]; its last four are the checksum of all before it
+_DATA_END = b"\x0f\x04" + bytes(7)  # opcode and size of the record before the summary; then comes the data's checksum
 LARGEST_EPISODE = 2 * 1024**3  # all columns and pictures [bytes]: 21,000 frames of two cameras of 128 x 128 pixels
 
 
@@ -203,14 +203,14 @@ def _open(path: Path) -> Generator[tuple[McapReader, Header]]:
 
 def _check_sums(content: bytes) -> None:
     """Raise `ValueError` unless a file's data and its summary have the checksums that are in it."""
-    if len(content) < len(_MAGIC) + _DATA_END + _END.size or not content.startswith(_MAGIC):
+    if not content.startswith(_MAGIC) or len(content) < len(_MAGIC) + _END.size:
         raise ValueError("it is no MCAP file, or ends too early")
     view = memoryview(content)
     start, _, summary_sum, magic = _END.unpack(view[-_END.size :])
-    data_sum = int.from_bytes(view[start - 4 : start], "little")
-    if magic != _MAGIC or not _DATA_END < start < len(content):
+    end, data_sum = start - 4 - len(_DATA_END), view[start - 4 : start]
+    if magic != _MAGIC or view[end : start - 4] != _DATA_END:
         raise ValueError("it ends too early")
-    if zlib.crc32(view[: start - _DATA_END]) != data_sum or zlib.crc32(view[start:-12]) != summary_sum:
+    if zlib.crc32(view[:end]) != int.from_bytes(data_sum, "little") or zlib.crc32(view[start:-12]) != summary_sum:
         raise ValueError("it does not match its checksums")
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
@@ -23,11 +24,11 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
 from manip_il.data.lerobot_read import dataset_info, read_frames, read_instructions, read_table
-from manip_il.data.parquet_files import UNREADABLE, find_shards
+from manip_il.data.parquet_files import UNREADABLE
+from manip_il.data.parquet_limits import check_parquet
+from manip_il.data.pictures import decode_cell
 from manip_il.errors import ManipError
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values
-from manip_il.mcap.path import parse_path
-from manip_il.mcap.read import decode_picture
 from manip_il.mdp import require_finite
 
 U8 = NDArray[np.uint8]
@@ -112,9 +113,8 @@ def mapping_of(source: Source) -> Mapping:
         path = "message" if feature["dtype"] == TEXT else "scalars[:].value"
         path = "joints[:].position" if _is_joints(key, feature) else path
         shape = tuple(feature["shape"])
-        features[key] = Values(topic, *near, (parse_path(path),), feature["dtype"], feature.get("names"), shape)
-    task = Values(TASK_TOPIC, *near, (parse_path("message"),), TEXT)
-    return Mapping(source.fps, source.robot_type, task, features)
+        features[key] = Values(topic, *near, (path,), feature["dtype"], feature.get("names"), shape)
+    return Mapping(source.fps, Values(TASK_TOPIC, *near, ("message",)), features, source.robot_type)
 
 
 def _write(path: Path, source: Source, episode: int, tasks: Sequence[str], rows: dict[str, Any]) -> None:
@@ -182,13 +182,11 @@ def _read_tasks(root: Path, wanted: set[int]) -> dict[int, str]:
 
 def stored_pictures(root: Path, key: str) -> Iterator[U8]:
     """Yield every picture of an `image` column, (height, width, 3), in stored order."""
-    for shard in find_shards(root, layout.DATA_FILES):
+    for path in sorted(root.glob(layout.DATA_FILES)):
         try:
-            if shard.problem or key not in shard.columns:
-                raise ValueError(f"it {shard.problem or 'has no such column'}")
-            for batch in shard.batches(key, _BATCH):
-                for cell in batch.to_pylist():
-                    content = cell.get("bytes") if isinstance(cell, dict) else None
-                    yield decode_picture(content if isinstance(content, bytes) else b"")
-        except (*UNREADABLE, ManipError) as error:
-            raise ManipError(f"cannot read the pictures {key!r} in {shard.path}: {error}") from error
+            check_parquet([path])
+            with pq.ParquetFile(path) as file:
+                for batch in file.iter_batches(_BATCH, columns=[key], use_threads=False):
+                    yield from map(decode_cell, batch.column(0).to_pylist())
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read the pictures {key!r} in {path}: {error}") from error

@@ -5,7 +5,6 @@ An episode lasts from the latest of its topics' first messages to the earliest o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS, log_time
-from manip_il.data.schema import MOST_FRAMES
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.mcap.mapping import TEXT, Camera, Mapping, Method, Source, Values
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mcap.mapping import TASK, TEXT, Camera, Mapping, Method, Values
 from manip_il.mcap.read import Topics, read_pictures, read_topics
 
 I64 = NDArray[np.int64]
@@ -54,15 +53,18 @@ class Pick:
 
 @dataclass(frozen=True)
 class Import:
-    """One file's episode. columns: of numbers and text, T rows each; used: topic -> messages that are in a frame."""
+    """One file's episode. columns: of numbers and text, T rows each, `task` among them."""
 
     path: Path
-    frames: int
-    tasks: list[str]
     columns: dict[str, Column]
-    picks: dict[str, Pick]  # of pictures
+    picks: dict[str, Pick]  # of all columns and pictures
     counts: dict[str, int]  # messages of every topic in the file
-    used: dict[str, int]
+    used: dict[str, int]  # messages of every topic that are in a frame
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.columns[TASK])
 
 
 def list_files(source: Path) -> list[Path]:
@@ -80,16 +82,17 @@ def list_files(source: Path) -> list[Path]:
 def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Import]:
     """Write the files as a dataset that appears at `root` when all are in; yield each one's import as it is done.
 
-    Raises `FolderExistsError` where `root` holds something, and what `read_import` and `frames_of` raise.
+    Each is read in a child process first, which is limited in memory and time. Raises `FolderExistsError` where `root`
+    holds something, and what `checks.in_child`, `read_import` and `frames_of` raise.
     """
     done: list[Import] = []
-    first = read_import(paths[0], mapping)
+    first = _checked_import(paths[0], mapping)
     features = features_of(mapping, first)
     from manip_il.data.lerobot_library import write_with_library  # imports torch
 
     def episodes() -> Iterator[Iterator[dict[str, Any]]]:
         for number, path in enumerate(paths):
-            done.append(first if number == 0 else read_import(path, mapping))
+            done.append(_checked_import(path, mapping) if number else first)
             yield frames_of(done[-1], mapping, features)
 
     with new_folder(root) as folder:
@@ -102,34 +105,38 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Im
         work.rmdir()
 
 
+def _checked_import(path: Path, mapping: Mapping) -> Import:
+    checks.in_child(str(path), _read_all, path, mapping)
+    return read_import(path, mapping)
+
+
+def _read_all(path: Path, mapping: Mapping) -> None:
+    """Read everything that an import takes of a file."""
+    episode = read_import(path, mapping)
+    for _ in frames_of(episode, mapping, features_of(mapping, episode)):
+        pass
+
+
 def read_import(path: Path, mapping: Mapping) -> Import:
     """Read and resample one file, all but its pictures.
 
-    Raises `ManipError` naming file, topic and time for whatever the mapping asks for and the file does not give.
+    Raises `ManipError` naming file and topic for whatever the mapping asks for and the file does not give.
     """
-    task = {"": mapping.task} if isinstance(mapping.task, Values) else {}
-    values = {**mapping.values, **task}
-    topics = read_topics(path, mapping.topics, values)
-    times = _times(topics, mapping.fps)
-    used: dict[str, I64] = {}
-
-    def resample(source: Source) -> Pick:
+    topics = read_topics(path, mapping)
+    times = _times(path, topics, mapping.fps)
+    columns: dict[str, Column] = {TASK: [str(mapping.task)] * len(times)}
+    picks: dict[str, Pick] = {}
+    sources = mapping.values | mapping.cameras
+    for key, source in sources.items():
         who = f"{path}, topic {source.topic}"
-        picked = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
-        used[source.topic] = np.union1d(used.get(source.topic, picked.left), picked.used())
-        return picked
-
-    columns = {key: _column(path, key, source, topics.rows[key], resample(source)) for key, source in values.items()}
-    tasks = columns.pop("", None)
-    return Import(
-        path,
-        len(times),
-        [str(mapping.task)] * len(times) if tasks is None else list(tasks),
-        columns,
-        {key: resample(camera) for key, camera in mapping.cameras.items()},
-        dict(topics.counts),
-        {topic: len(numbers) for topic, numbers in used.items()},
-    )
+        picks[key] = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
+        if isinstance(source, Values):
+            columns[key] = _column(f"{who}, {key}", source.dtype, topics.rows[key], picks[key])
+    used = {
+        topic: len(np.unique(np.concatenate([picks[key].used() for key, one in sources.items() if one.topic == topic])))
+        for topic in mapping.topics
+    }
+    return Import(path, columns, picks, dict(topics.counts), used)
 
 
 def features_of(mapping: Mapping, first: Import) -> dict[str, dict[str, Any]]:
@@ -162,13 +169,13 @@ def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, A
                 raise MismatchError(f"column {key!r}", str(episode.path), width, "the first file", f"{wanted} values")
             column = column.reshape(-1, *features[key]["shape"])
         columns[key] = column
-    for number, task in enumerate(episode.tasks):
+    for number in range(episode.frames):
         frame: dict[str, Any] = {key: column[number] for key, column in columns.items()}
         for key, stream in pictures.items():
             frame[key] = next(stream)
             if frame[key].shape != (size := features[key]["shape"]):
                 raise MismatchError(f"{key!r}", f"{episode.path}", frame[key].shape, "the first file", size)
-        yield {**frame, "task": task}
+        yield frame
 
 
 def frame_times(start: int, end: int, fps: int) -> I64:
@@ -205,62 +212,33 @@ def pick(who: str, method: Method, stamps: I64, times: I64, tolerance: float) ->
     return Pick(left, right, np.where(left == right, 0.0, to_left / span))
 
 
-def _times(topics: Topics, fps: int) -> I64:
+def _times(path: Path, topics: Topics, fps: int) -> I64:
     last_to_start = max(topics.stamps, key=lambda topic: topics.stamps[topic][0])
     first_to_end = min(topics.stamps, key=lambda topic: topics.stamps[topic][-1])
     start, end = int(topics.stamps[last_to_start][0]), int(topics.stamps[first_to_end][-1])
     if end < start:
         raise ManipError(
-            f"{topics.path}: {first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts; "
+            f"{path}: {first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts; "
             "expected topics that overlap in time"
-        )
-    if (end - start) * fps > MOST_FRAMES * NANOSECONDS:
-        raise ManipError(
-            f"{topics.path}: its topics overlap for {(end - start) / NANOSECONDS:g} s, at {fps} frames a second more "
-            f"than {MOST_FRAMES:,} frames; expected one episode a file"
         )
     return frame_times(start, end, fps)
 
 
-def _column(path: Path, key: str, source: Values, rows: list[list[Any]], picked: Pick) -> Column:
-    who = f"{path}, topic {source.topic}, {key or 'task'}"
-    for number, row in enumerate(rows):
-        if len(row) != len(rows[0]):
-            raise ManipError(f"{who}: message {number} has {len(row)} values, the first one {len(rows[0])}")
-    if source.dtype == TEXT:
-        return [_text(who, rows[number]) for number in picked.left.tolist()]
-    return picked.blend(_numbers(who, rows, np.dtype(source.dtype))).astype(source.dtype)
-
-
-def _text(who: str, row: list[Any]) -> str:
-    if len(row) != 1 or not isinstance(row[0], str):
-        raise ManipError(f"{who}: got {row!r}; expected one string")
-    return row[0]
-
-
-def _numbers(who: str, rows: list[list[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return rows (N, width), as float64 for a dtype of floats, else as the dtype, which must hold every value."""
-    is_float = dtype.kind == "f"
-    low, high = _limits(dtype)
-    for number, row in enumerate(rows):
-        for value in row:
-            if not isinstance(value, int | float):
-                raise ManipError(f"{who}: message {number} holds {value!r}; expected a number")
-            if not (low <= value <= high and (is_float or int(value) == value)):  # false for NaN
-                kind = NotFiniteError if isinstance(value, float) and not math.isfinite(value) else ManipError
-                raise kind(f"{who}: message {number} holds {value!r}, which is not a valid {dtype}")
-    if is_float:
-        return np.array(rows, np.float64)
-    return np.array([[int(value) for value in row] for row in rows], dtype)
-
-
-def _limits(dtype: np.dtype[Any]) -> tuple[float, float]:
-    if dtype.kind == "b":
-        return 0, 1
-    if dtype.kind == "f":
-        limit = float(np.finfo(dtype).max)
-        return -limit, limit
-    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+def _column(who: str, dtype: str, rows: list[list[Any]], picked: Pick) -> Column:
+    """Return a column's T values. Raises `ManipError` for a number that the dtype cannot hold."""
+    if dtype == TEXT:
+        return [rows[number][0] for number in picked.left.tolist()]
+    given, is_float = np.array(rows, object), dtype.startswith("float")
+    try:
+        with np.errstate(over="ignore"):  # which the next lines see
+            values = given.astype(np.float64 if is_float else dtype)
+            good = np.isfinite(values.astype(dtype)) if is_float else values == given
+    except (OverflowError, ValueError) as error:
+        raise ManipError(f"{who}: {error}; expected {dtype}") from error
+    if not good.all():
+        number = int(np.argwhere(~good.astype(bool))[0][0])
+        raise ManipError(f"{who}: message {number} holds {rows[number]!r}; expected finite numbers of {dtype}")
+    return picked.blend(values).astype(dtype)
 
 
 def _gap(who: str, method: Method, stamps: I64, times: I64, frame: int, tolerance: float) -> ManipError:

@@ -100,20 +100,13 @@ def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> 
 
 @given(st.integers(0, 10**9), st.integers(1, 255))
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_changed_byte_anywhere_is_refused_by_name_or_without_effect(filmed, place, change):
+def test_a_changed_byte_anywhere_is_refused_by_name(filmed, place, change):
     data = bytearray(filmed.read_bytes())
     data[place % len(data)] ^= change
     changed = filmed.with_name("episode-000000000018.mcap")
     changed.write_bytes(data)
-    refusal = ""
-    try:
-        header, episode = journal.read_journal(changed)
-        assert header == journal.read_header(filmed)
-        assert_same(episode, journal.read_journal(filmed)[1])
-    except ManipError as error:
-        refusal = str(error)
-    assert refusal.count("\n") == 0
-    assert refusal.startswith(f"{changed} is not a complete episode: " if refusal else "")
+    with pytest.raises(ManipError, match=r"^.*episode-000000000018\.mcap is not a complete episode: .*$"):
+        journal.read_journal(changed)
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.9, 0.999])
