@@ -207,10 +207,10 @@ def _check_sums(content: bytes) -> None:
         raise ValueError("it is no MCAP file, or ends too early")
     view = memoryview(content)
     start, _, summary_sum, magic = _END.unpack(view[-_END.size :])
-    end, data_sum = start - 4 - len(_DATA_END), view[start - 4 : start]
-    if magic != _MAGIC or view[end : start - 4] != _DATA_END:
+    end, data_sum = start - 4 - len(_DATA_END), int.from_bytes(view[start - 4 : start], "little")
+    if magic != _MAGIC or bytes(view[end : start - 4]) != _DATA_END:
         raise ValueError("it ends too early")
-    if zlib.crc32(view[:end]) != int.from_bytes(data_sum, "little") or zlib.crc32(view[start:-12]) != summary_sum:
+    if zlib.crc32(view[:end]) != data_sum or zlib.crc32(view[start:-12]) != summary_sum:
         raise ValueError("it does not match its checksums")
 
 

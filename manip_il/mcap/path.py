@@ -1,7 +1,7 @@
 """Paths to values in a message: `pose.position.x`, `data[0]`, `scalars[:].value`, `joints[name=elbow].position`.
 
-`[:]` is every element of a list, `[name=elbow]` the one whose name is elbow. A name may hold any characters but dots and
-square brackets, a text any but a closing bracket.
+`[:]` is every element of a list, `[name=elbow]` the one whose name is elbow. A name may hold any characters but dots
+and square brackets, a text any but a closing bracket.
 """
 
 from __future__ import annotations
@@ -52,23 +52,17 @@ def _select(node: Any, selector: str) -> Sequence[Any]:
     if selector == ":":
         return node
     key, is_named, text = selector.partition("=")
-    if not is_named:
-        if int(key) >= len(node):
-            raise LookupError(f"[{key}] of a list of {len(node)} elements")
-        return [node[int(key)]]
-    known = [str(_field(element, key)) for element in node]
-    found = [element for element, one in zip(node, known, strict=True) if one == text]
+    found = [one for one in node if str(_field(one, key)) == text] if is_named else node[int(key) : int(key) + 1]
     if len(found) != 1:
-        hint = "" if found else nearest(text, known)
-        raise LookupError(f"{len(found)} elements have the {key} {text!r}{hint}; known: {', '.join(known) or 'none'}")
+        known = f"; known: {', '.join(str(_field(one, key)) for one in node)}" if is_named else ""
+        raise LookupError(f"[{selector}] fits {len(found)} of {len(node)} elements{known}")
     return found
 
 
 def _field(node: Any, name: str) -> Any:
-    if _is_list(node):
-        raise LookupError(f"no field {name!r} in a list; choose its elements by [0], [:] or [name=...]")
     if not isinstance(node, Message | dict):
-        raise LookupError(f"no field {name!r} in a plain value")
+        kind = "a list; choose its elements by [0], [:] or [name=...]" if _is_list(node) else "a plain value"
+        raise LookupError(f"no field {name!r} in {kind}")
     known = node if isinstance(node, dict) else node.DESCRIPTOR.fields_by_name
     if name not in known:
         raise LookupError(f"no field {name!r}{nearest(name, known)}; known: {', '.join(known) or 'none'}")

@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,55 +18,49 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.pictures import decode_picture
 from manip_il.errors import ManipError, nearest
-from manip_il.mcap.mapping import TEXT, Mapping, Values
+from manip_il.mcap.mapping import TEXT, Mapping, Source
 from manip_il.mcap.path import values_at
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+Rows = list[list[Any]]
 Stored = tuple[Schema | None, Channel, Message]
 
 _LARGEST_RECORD = 1024**3  # [bytes]
 _ENCODINGS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # of raw pictures -> their channels as R, G, B
 
 
-@dataclass
-class Topics:
-    """Content of a file's wanted topics. counts: messages of every topic in the file."""
+def read_topics(path: Path, mapping: Mapping) -> tuple[Counter[str], dict[str, I64], dict[str, Rows]]:
+    """Read all but the pictures, which are left to `read_pictures`.
 
-    counts: Counter[str] = field(default_factory=Counter)
-    stamps: dict[str, I64] = field(default_factory=dict)  # topic -> (N,) [ns]
-    rows: dict[str, list[list[Any]]] = field(default_factory=dict)  # column -> N rows of as many values
-
-
-def read_topics(path: Path, mapping: Mapping) -> Topics:
-    """Read the topics' stamps and the columns' rows; pictures are left to `read_pictures`.
-
-    Raises `ManipError` naming file and topic where there are no messages, they cannot be decoded, lack a field, or
-    their stamps do not ascend.
+    Returns how many messages every topic of the file has, the wanted topics' stamps, (N,) [ns], and the rows of every
+    column of numbers or text, N of as many values. Raises `ManipError` naming file and topic if there are no messages,
+    they cannot be decoded, lack a field, or their stamps do not ascend.
     """
-    found = Topics(rows={key: [] for key in mapping.values})
-    stamps: dict[str, list[int]] = {topic: [] for topic in mapping.topics}
-    columns = {topic: [key for key, one in mapping.values.items() if one.topic == topic] for topic in stamps}
+    counts: Counter[str] = Counter()
+    rows: dict[str, Rows] = {key: [] for key in mapping.sources}
+    stamps: dict[str, list[int]] = {source.topic: [] for source in mapping.sources.values()}
+    wanted: dict[str, list[tuple[str, Source]]] = {topic: [] for topic in stamps}
+    for key, source in mapping.sources.items():
+        wanted[source.topic] += [] if source.is_camera else [(key, source)]
     factory = DecoderFactory()
     for stored in _stored(path):
         topic, stamp = stored[1].topic, stored[2].log_time
-        found.counts[topic] += 1
+        counts[topic] += 1
         if topic not in stamps:
             continue
         with _naming(path, topic, stamp):
             if stamps[topic] and stamp <= stamps[topic][-1]:
                 raise ManipError(f"the message before it is stamped {stamps[topic][-1]} ns; expected ascending times")
             stamps[topic].append(stamp)
-            content = _content(factory, *stored) if columns[topic] else None
-            for key in columns[topic]:
-                rows = found.rows[key]
-                rows.append(_row(key, mapping.values[key], content, len(rows[0]) if rows else None))
+            content = _content(factory, *stored) if wanted[topic] else None
+            for key, source in wanted[topic]:
+                rows[key].append(_row(key, source, content, len(rows[key][0]) if rows[key] else None))
     for topic, times in stamps.items():
         if not times:
-            known = ", ".join(sorted(found.counts)) or "none"
-            raise ManipError(f"{path} has no messages of {topic}{nearest(topic, found.counts)}; its topics: {known}")
-        found.stamps[topic] = np.array(times, np.int64)
-    return found
+            known = ", ".join(sorted(counts)) or "none"
+            raise ManipError(f"{path} has no messages of {topic}{nearest(topic, counts)}; its topics: {known}")
+    return counts, {topic: np.array(times, np.int64) for topic, times in stamps.items()}, rows
 
 
 def read_pictures(path: Path, topic: str, numbers: I64) -> Iterator[U8]:
@@ -120,12 +113,11 @@ def _naming(path: Path, topic: str, stamp: int) -> Generator[None]:
         raise ManipError(f"{path}, topic {topic} at {stamp} ns: {str(error) or type(error).__name__}") from error
 
 
-def _row(key: str, source: Values, content: Any, width: int | None) -> list[Any]:
+def _row(key: str, source: Source, content: Any, width: int | None) -> list[Any]:
     """Return a message's values. width: of the rows before."""
-    row = [value for path in source.field for value in values_at(path, content)]
-    wanted = source.width or width
-    if wanted not in (None, len(row)):
-        raise ManipError(f"{len(row)} values; {key} has {wanted}")
+    row = [value for path in source.paths for value in values_at(path, content)]
+    if (width := source.width or width) not in (None, len(row)):
+        raise ManipError(f"{len(row)} values; {key} has {width}")
     for value in row:
         if not isinstance(value, str if source.dtype == TEXT else int | float):
             raise ManipError(f"{key} holds {checks.shorten(value)}; expected {source.dtype}")

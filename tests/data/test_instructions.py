@@ -77,7 +77,7 @@ def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
 
 def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tmp_path, root):
     assert not has_errors(examine_folder(root))
-    for path, text in zip(export_dataset(open_source(root), tmp_path), TEXTS, strict=True):
+    for path, text in zip(export_dataset(root, open_source(root), tmp_path), TEXTS, strict=True):
         assert {message.message for topic, _, message in decoded(path.read_bytes()) if topic == "/task"} == {text}
     assert dict(dataset_fields(root, "someone/data")[1]["rows"])["texts"] == f"2, such as: {RED}"
 

@@ -140,7 +140,7 @@ def _import(folder: Path) -> None:
     mapping = load_mapping(folder / "mapping.yaml")
     for path in list_files(folder / "in.mcap"):
         episode = read_import(path, mapping)
-        list(frames_of(episode, mapping, features_of(mapping, episode)))
+        list(frames_of(episode, mapping, features_of(episode, mapping)))
 
 
 def damaged_video(rng: Random, data: bytes) -> bytes:
