@@ -7,10 +7,10 @@ that a dataset takes of rollouts.
 `journal.py` writes one MCAP file for every finished episode, at once: a journal. `build.py` makes a dataset of a folder
 of journals, or one dataset of several. `lerobot_write.py` writes datasets episode by episode with pyarrow and PyAV;
 `lerobot_read.py` reads them as numpy arrays; `lerobot_library.py` is LeRobot's own writer, and its
-metadata for policies. Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), statistics
-(`lerobot_stats.py`), parquet (`parquet_files.py`, `parquet_limits.py`, `picture_columns.py`), videos (`video.py`
-writes, `pictures.py` reads, and nothing else opens a picture), and pictures for training (`frame_source.py`): in a
-cache (`frame_cache.py`), or decoded when they are drawn (`lazy_frames.py`).
+metadata for policies. Around them: LeRobot's paths and types (`lerobot_layout.py`), statistics (`lerobot_stats.py`),
+parquet (`parquet_files.py`, `parquet_limits.py`, `picture_columns.py`), videos (`video.py` writes, `pictures.py`
+reads, and nothing else opens a picture), and pictures for training (`frame_source.py`): in a cache (`frame_cache.py`),
+or decoded when they are drawn (`lazy_frames.py`).
 
 What the room promises:
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,16 +55,20 @@ class ModelFiles:
         """
         try:
             model = self._mended(checks.read_bytes(self.model, "an MJCF", _LARGEST))
-            name = str((self.includes or self.model.parent) / f"mended {self.model.name}")
+            home = self.includes or self.model.parent
+            name = str(home / f"mended {self.model.name}")
             spec = mujoco.MjSpec.from_file(name, include={name: model})
+            if self.meshes is not None:
+                # MuJoCo puts an included file's folder before what that names
+                meshes = [mesh.file.removeprefix(spec.modelfiledir) for mesh in spec.meshes if mesh.file]
+                assets = {mesh: checks.read_bytes(self.meshes / mesh, "a mesh", _LARGEST) for mesh in sorted(meshes)}
+                included = {path: (home / path).read_bytes() for path in _included(model, home)}
+                spec = mujoco.MjSpec.from_string(model.decode(), include=included, assets=assets)
+                spec.meshdir = ""
         except (ManipError, ValueError) as error:
             why = " ".join(str(error).split())
             named = "" if str(self.model) in why else f"cannot read {self.model}: "
             raise UsageError(f"robot {robot}: {named}{why}") from None
-        if self.meshes is not None:
-            for mesh in spec.meshes:  # MuJoCo puts an included file's folder before what that names
-                mesh.file = mesh.file.removeprefix(spec.modelfiledir)
-            spec.meshdir = str(self.meshes)
         return spec
 
     def _mended(self, model: bytes) -> bytes:
@@ -79,6 +84,12 @@ class ModelFiles:
                 raise ManipError(f"{self.model} mended has more than {_LARGEST} characters; expected an MJCF")
             text = text.replace(old, new)
         return text.encode()
+
+
+def _included(model: bytes, home: Path) -> set[str]:
+    """The files that a model includes, and that those do."""
+    found = {name.decode() for name in re.findall(rb"<include\s+file=\"([^\"]+)\"", model)}
+    return found.union(*(_included((home / name).read_bytes(), home) for name in found))
 
 
 def try_models(robot: str, *models: ModelFiles) -> None:

@@ -160,6 +160,15 @@ def test_statistics_of_another_type_shape_or_depth_are_one_line(root: Path, dama
             read_metadata(root)
 
 
+def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
+    meta = read_metadata(root, root)
+    own = np.zeros(sum(meta.frames), np.int64)
+    assert meta.joint_tasks(own).tolist() == own.tolist()
+    own[-1] = 7
+    with pytest.raises(ManipError, match=r"lift: rows have the task 7, which meta/tasks\.parquet does not hold"):
+        meta.joint_tasks(own)
+
+
 def test_pandas_metadata_that_names_no_column_is_not_looked_at_and_to_join_is_one_line(
     tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]
 ):
