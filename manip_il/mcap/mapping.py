@@ -44,7 +44,7 @@ TASK = "task"  # a frame's text, beside its columns
 
 @dataclass(frozen=True)
 class Source:
-    """Where a column comes from, and how it is resampled to the dataset's rate. tolerance: [s].
+    """The topic that a column comes from, and how it is resampled to the dataset's rate. tolerance: [s].
 
     Numbers or text are the values of all paths in `field`, in order; shape: (values,) where it is None. Pictures have
     `video` in place of these: encoded with loss, or PNG. Raises `UsageError` for what does not fit together.
@@ -110,7 +110,7 @@ class Mapping:
 
     @property
     def sources(self) -> dict[str, Source]:
-        """Where all columns come from, and `task` where its texts are from a topic."""
+        """All columns, and `task` if its texts come from a topic."""
         return ({TASK: self.task} if isinstance(self.task, Source) else {}) | self.features
 
     def to_yaml(self) -> str:
