@@ -57,6 +57,13 @@ class Header:
     instruction: str = ""  # of the episode, where it is not that of the spec
     drawn: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        checks.whole("an episode's seed", self.seed, 0, checks.LARGEST_SEED)
+        checks.whole("an episode's number of frames", self.frames, 1, schema.MOST_FRAMES)
+        checks.mapping("an episode's fingerprint", self.fingerprint)
+        checks.text("an episode's instruction", self.instruction)
+        checks.mapping("what an episode drew", dict(self.drawn))
+
 
 @dataclass(frozen=True)
 class Journal:
@@ -78,7 +85,9 @@ class Journal:
         Raises `ManipError` for a column that numpy can only pickle, and for an episode that is too large.
         """
         columns = episode.columns | _final_columns(episode.final)
-        _refuse_large(episode, sum(column.nbytes for column in columns.values()))
+        if (size := sum(column.nbytes for column in columns.values())) > LARGEST_EPISODE:
+            why = f"the episode with seed {episode.seed} has {size:,} bytes; expected at most {LARGEST_EPISODE:,}"
+            raise ManipError(f"{why}: record a shorter one, or smaller or fewer pictures")
         stream = BytesIO()
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
@@ -237,18 +246,11 @@ def _from_texts(texts: Mapping[str, str]) -> Header:
         raise OlderSchemaError("1", schema.VERSION)
     if found != _FORMAT:
         raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    values = {name: checks.parse_json(f"its {name}", text) for name, text in texts.items() if name != "format"}
-    spec = RobotTaskSpec.from_json(values.pop("spec"))
-    return Header(spec=spec, fingerprint=checks.mapping("its fingerprint", values.pop("fingerprint")), **values)
-
-
-def _refuse_large(episode: Episode, size: int) -> None:
-    """Raise `ManipError` for an episode of more than `MOST_FRAMES` frames, or more than `LARGEST_EPISODE` bytes."""
-    limits = ("frames", len(episode), schema.MOST_FRAMES), ("bytes", size, LARGEST_EPISODE)
-    for what, found, limit in limits:
-        if found > limit:
-            why = f"the episode with seed {episode.seed} has {found:,} {what}; expected at most {limit:,}"
-            raise ManipError(f"{why}; record shorter episodes, or smaller or fewer pictures")
+    values: dict[str, Any] = {
+        name: checks.parse_json(f"its {name}", text) for name, text in texts.items() if name != "format"
+    }
+    values["spec"] = RobotTaskSpec.from_json(values["spec"])
+    return Header(**values)
 
 
 def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:

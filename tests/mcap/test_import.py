@@ -312,9 +312,7 @@ def test_every_frame_gets_what_a_full_search_finds(
     arrays = np.array(stamps) * SECOND, np.array(times) * SECOND
     if None in wanted:
         frame = wanted.index(None)
-        why = (
-            rf"f\.mcap, topic /t: a gap at {times[frame] - times[0]} s .*frame {frame}\); {method} allows {tolerance} s"
-        )
+        why = rf"f, topic /t: a gap at {times[frame] - times[0]} s .*frame {frame}\); {method} allows {tolerance} s"
         with pytest.raises(ManipError, match=why):
             pick("f, topic /t", method, *arrays, tolerance)
         return
