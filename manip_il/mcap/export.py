@@ -63,7 +63,7 @@ def export_dataset(root: Path, info: Info, folder: Path) -> Iterator[Path]:
         require_finite(f"{root}, column {key!r}", table[key])
     index, texts = table[layout.EPISODE_INDEX], read_instructions(root)
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
-        raise ManipError(f"{root}: rows have the task {min(missing)}, which {layout.TASKS} does not hold")
+        raise ManipError(f"{root}: rows have the task {min(missing)}, which {layout.TASKS} does not hold as text")
     stored = {one.key: stored_pictures(root, one.key) for one in columns if one.dtype == "image"}
     films = [one.key for one in columns if one.dtype == "video"]
     starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()

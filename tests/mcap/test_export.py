@@ -190,20 +190,6 @@ def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(lerobots: P
 
 
 @pytest.mark.slow
-def test_a_camera_may_become_a_video(lerobots: Path, tmp_path: Path) -> None:
-    export(lerobots, tmp_path / "out")
-    text = (tmp_path / "out" / MAPPING).read_text()
-    path = tmp_path / "m.yaml"
-    place = text.index("side:")
-    path.write_text(text[:place] + text[place:].replace("video: false", "video: true"))
-    mapping = load_mapping(path)
-    assert [mapping.features[f"observation.images.{name}"].video for name in ("top", "side")] == [False, True]
-    assert len(list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))) == 2
-    assert len(list((tmp_path / "new").rglob("*.mp4"))) == 1
-    assert not (tmp_path / "new" / "images").exists()
-
-
-@pytest.mark.slow
 def test_an_import_that_fails_leaves_nothing(ours: Path, tmp_path: Path) -> None:
     paths = export(ours, tmp_path / "out")
     paths[2].write_bytes(paths[2].read_bytes()[:1000])

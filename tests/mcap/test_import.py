@@ -32,7 +32,6 @@ from manip_il.errors import ManipError, MismatchError
 from manip_il.mcap.importing import (
     blend,
     features_of,
-    frame_times,
     frames_of,
     import_files,
     list_files,
@@ -165,10 +164,8 @@ STEADY = range(0, 1000, 100)
     [
         (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s"),
         (ramp([0, 200, 100]), {}, r"topic /a at 100000000 ns: the message before it is stamped 200000000 ns"),
-        (ramp([0, 100, 100]), {}, "expected ascending times"),
         ([(0, {"x": "1"})], {}, "topic /a at 0 ns: f holds '1'; expected float64"),
         ([(0, {"x": None})], {}, "f holds None; expected float64"),
-        ([(0, {"x": {"y": 1}})], {}, "f holds {'y': 1}; expected float64"),
         (
             [(0, {"x": 1}), (100, {"x": float("nan")})],
             {},
@@ -176,11 +173,9 @@ STEADY = range(0, 1000, 100)
         ),
         ([(0, {"x": 1e39})], {"dtype": "float32"}, r"message 0 holds \[1e\+39\]; expected finite numbers of float32"),
         ([(0, {"x": 1.5})], {"dtype": "int64"}, r"holds \[1.5\]; expected finite numbers of int64"),
-        ([(0, {"x": 300})], {"dtype": "uint8"}, "300 out of bounds for uint8"),
         ([(0, {"x": float("inf")})], {"dtype": "int64"}, "infinity to integer; expected int64"),
         ([(0, {"x": 2})], {"dtype": "bool"}, r"holds \[2\]; expected finite numbers of bool"),
         ([(0, {"x": 2})], {"dtype": "string"}, "f holds 2; expected string"),
-        ([(0, {"x": ["a", "b"]})], {"dtype": "string"}, "2 values; f has 1"),
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "topic /a at 0 ns: 2 values; f has 1"),
         ([(0, {"x": [1, 2]}), (100, {"x": [1]})], {}, "topic /a at 100000000 ns: 1 values; f has 2"),
         ([(0, {"x": 1}), (100, {"y": 1})], {}, "topic /a at 100000000 ns: x: no field 'x'"),
@@ -331,14 +326,6 @@ def test_interpolation_is_exact_on_a_line_and_at_a_message(
     found = blend(here * SECOND, line, there * SECOND)
     np.testing.assert_allclose(found, np.outer(there, [slope, 2 * slope]) + offset, atol=1e-9)
     np.testing.assert_array_equal(blend(here * SECOND, line, here * SECOND), line)
-
-
-@given(st.integers(0, 2**60), st.integers(0, 3 * SECOND), st.integers(1, 120))
-def test_frames_fill_the_span_at_their_rate(start: int, length: int, fps: int) -> None:
-    times = frame_times(start, start + length, fps)
-    assert times[0] == start
-    assert times[-1] <= start + length < start + len(times) * SECOND // fps
-    assert set(np.diff(times)) <= {SECOND // fps, SECOND // fps + 1}
 
 
 IMPORT = """

@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from hypothesis import given
-from hypothesis import strategies as st
 
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.mapping import Mapping, Source, load_mapping
@@ -57,22 +55,17 @@ def of_action(**changes: Any) -> dict[str, Any]:
     [
         ({"fsp": 20}, "unexpected keyword argument 'fsp'"),
         ({"fps": 0}, "fps is 0; expected a whole number from 1"),
-        ({"fps": 29.97}, "fps is 29.97"),
         ({"task": 3}, "task is 3; expected text"),
         ({"task": {"topic": "/t"}}, "task: .*`resample`"),
         ({"features": {}}, "features is empty; expected at least one column"),
-        ({"features": [1]}, "features is .*; expected an object of named values"),
         ({"features": {"timestamp": NUMBER}}, "LeRobot fills timestamp itself"),
-        ({"features": {"task": NUMBER}}, "LeRobot fills task itself"),
         ({"features": {"a/b": NUMBER}}, "a column's name is 'a/b'; expected a name of letters, digits and _ . -"),
         (of_action(tolerence=1), "features: action: The fields `tolerence` are not valid"),
         (of_action(tolerance=-1), "tolerance is -1.*; expected seconds, 0 or more"),
         (of_action(tolerance=float("nan")), "tolerance is nan"),
         (of_action(tolerance="1s"), "features: action: `tolerance`: Couldn't parse '1s'"),
-        (of_action(resample="linear"), "'linear' .* nearest, hold, interpolate"),
         (of_action(dtype="flaot32"), "dtype is flaot32; expected one of float16, float32"),
         (of_action(dtype="int64", resample="interpolate"), "features: action: only floats can be interpolated"),
-        (of_action(field=[]), "expected either field or video"),
         (of_action(field="a[b"), r"the path 'a\[b' is invalid"),
         (of_action(video=True), "expected either field or video"),
     ],
@@ -82,21 +75,10 @@ def test_a_wrong_value_is_refused_by_name_in_one_line(tmp_path: Path, change: di
         load(tmp_path, **(tree() | change))
 
 
-@pytest.mark.parametrize("text", ["[1]", "a: [", "a: !!python/name:os.system x", "\0"])
-def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "m.yaml"
-    path.write_text(text)
+def test_yaml_of_a_mapping_runs_no_code(tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text("a: !!python/name:os.system x")
     with pytest.raises(UsageError, match=r"m\.yaml"):
-        load_mapping(path)
-
-
-@given(
-    st.lists(st.dictionaries(st.sampled_from(["label", "value"]), st.integers(), min_size=2, max_size=2), min_size=1)
-)
-def test_all_elements_are_those_at_each_index(scalars: list[dict[str, int]]) -> None:
-    message = {"scalars": scalars}
-    one_by_one = [values_at(f"scalars[{number}].value", message)[0] for number in range(len(scalars))]
-    assert values_at("scalars[:].value", message) == one_by_one == [scalar["value"] for scalar in scalars]
+        load_mapping(tmp_path / "m.yaml")
 
 
 def joints() -> JointStates:
@@ -112,10 +94,10 @@ def joints() -> JointStates:
         ("joints[name=elbow].position", joints(), [0.5]),
         ("joints[name=wrist.1].position", joints(), [1.0]),
         ("joints[:].position", joints(), [0.0, 0.5, 1.0]),
-        ("joints[2].name", joints(), ["wrist.1"]),
         ("data", {"data": [1, 2, 3]}, [1, 2, 3]),
         ("odd name.x", {"odd name": {"x": 4}}, [4]),
         ("list[id=7].x", {"list": [{"id": 6, "x": 0}, {"id": 7, "x": 1}]}, [1]),
+        ("scalars[:].value", {"scalars": [{"value": 2}, {"value": 1}]}, [2, 1]),
         ("rows[:][0]", {"rows": [[1, 2], [3, 4]]}, [1, 3]),
     ],
 )
@@ -128,13 +110,10 @@ def test_a_path_gives(path: str, message: object, values: list) -> None:
     [
         ("joint", joints(), r"joint: no field 'joint' \(did you mean 'joints'\?\); known: timestamp, joints"),
         ("joints[name=elbo].name", joints(), r"\[name=elbo\] fits 0 of 3 elements; known: shoulder, elbow"),
-        ("joints[3].position", joints(), r"\[3\] fits 0 of 3 elements"),
         ("joints.position", joints(), r"in a list; choose its elements by \[0\], \[:\]"),
         ("joints[0].velocity", joints(), "velocity is not set in this message"),
-        ("joints[0].position.x", joints(), "no field 'x' in a plain value"),
         ("pose.position.x", PoseInFrame(), "pose is not set in this message"),
         ("data[:]", {"data": 1}, "of what is not a list"),
-        ("data[n=1]", {"data": [{"n": 1}, {"n": 1}]}, r"\[n=1\] fits 2 of 2"),
     ],
 )
 def test_a_path_that_leads_nowhere_says_where_it_ends(path: str, message: object, why: str) -> None:
