@@ -32,7 +32,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, provenance
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording
-from manip_il.data.journal import list_episodes, read_episode
+from manip_il.data.journal import episode_path, list_episodes, read_journal
 from manip_il.robots.robot import ROBOTS
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig
@@ -89,7 +89,7 @@ def beside(job: RolloutJob, episodes: int, repeats: int) -> tuple[list[float], l
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder) / "demos"
             seconds = record_seconds(Engine(), job, stream_seeds("certificate", episodes), root)
-            recorded = [read_episode(path) for path in list_episodes(root.with_name("demos.journals"))]
+            recorded = [read_journal(path)[1] for path in list_episodes(root.with_name("demos.journals"))]
         frames = sum(len(episode) for episode in recorded)
         limit = sum(replay_seconds(job, one.seed, one.columns["executed_action"]) for one in recorded)
         if repeat >= 0:
@@ -105,7 +105,7 @@ def steps_per_second(job: RolloutJob, episodes: int) -> tuple[float, float]:
 
     def replay(path: Path) -> None:
         nonlocal limit, frames
-        episode = read_episode(path)
+        episode = read_journal(path)[1]
         frames += len(episode)
         limit += replay_seconds(job, episode.seed, episode.columns["executed_action"])
 
@@ -125,13 +125,13 @@ def record_seconds(
     spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
     selection = recording.selection()
     with recording.open(root, spec, fingerprint) as writer:
-        for collected in collect(engine, job, seeds, journals):
-            for episode in selection.take([collected.read()]):
+        for header, rollout in collect(engine, job, seeds, journals):
+            for episode in selection.take([(header, rollout)]):
                 writer.add(episode)
             if between is not None:
                 writer.wait()  # else what is still being encoded would slow down what comes now
                 paused -= time.perf_counter()
-                between(collected.path)
+                between(episode_path(journals, header.seed))
                 paused += time.perf_counter()
         writer.finish(recording.provenance | selection.provenance)
     return time.perf_counter() - started - paused

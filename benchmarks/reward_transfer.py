@@ -30,7 +30,7 @@ from manip_il.cli.main import main as manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.data.journal import list_episodes, read_episode
+from manip_il.data.journal import list_episodes, read_journal
 from manip_il.data.lerobot_read import read_spec
 from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
@@ -100,7 +100,7 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
         raise SystemExit("recording failed")
     names = read_spec(root).environment_state_names
     journals = root.with_name("all.journals")
-    few = [path for path in list_episodes(journals) if things(read_episode(path), names) <= FEW][:count]
+    few = [path for path in list_episodes(journals) if things(read_journal(path)[1], names) <= FEW][:count]
     kept.mkdir()
     for path in few:
         shutil.copy(path, kept)

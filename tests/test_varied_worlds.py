@@ -20,7 +20,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.build import build, merge_datasets
 from manip_il.data.draws import read_drawn
-from manip_il.data.journal import read_episode, write_episode
+from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_read import read_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
@@ -121,8 +121,8 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
     config, episodes = world
     spec, fingerprint = env_spec(config), env_fingerprint(config)
     for episode in episodes:
-        path = write_episode(tmp_path / "varied.journals", episode, spec, fingerprint)
-        assert read_episode(path).drawn == episode.drawn != {}
+        path = Journal(tmp_path / "varied.journals", spec, fingerprint).write(episode)
+        assert read_journal(path)[1].drawn == episode.drawn != {}
         state = State.from_vector(episode.columns[schema.SIM_STATE][0])
         found = drawn_in(state.variation, ManipEnv.of(config).scene.nominal)
         assert found.keys() == episode.drawn.keys() - NOT_IN_THE_WORLDS_NUMBERS

@@ -32,10 +32,9 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.query import Every, Query, Safety
 from manip_il.collect.record import (
     MAX_TRIES,
-    Collected,
-    check_journals,
     collect,
     collect_successes,
+    journal_of,
     provenance,
     record,
     redraw,
@@ -45,7 +44,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
-from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.journal import Header, list_episodes, read_header
 from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
 from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
@@ -230,7 +229,7 @@ class Run:
         had = sum(one.labels for one in self._made.values() if one.round < round_)
         return max(0, self.config.label_budget - had)
 
-    def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[Collected]:
+    def _collect(self, job: RolloutJob, count: int, disturbed: int) -> Iterator[tuple[Header, Episode]]:
         """A round's episodes, of which the first `disturbed` are."""
         seeds = stream_seeds(f"round/{job.round}", count, self.config.seed)
         journals, on_episode = self._folder(job.round) / JOURNALS, self._watch.on_episode
@@ -240,10 +239,10 @@ class Run:
             collect(self._engine, job, seeds[disturbed:], journals, on_episode),
         )
 
-    def _record(self, job: RolloutJob, episodes: Iterator[Collected], recording: Recording) -> None:
+    def _record(self, job: RolloutJob, episodes: Iterator[tuple[Header, Episode]], recording: Recording) -> None:
         """Run a round's episodes and write its dataset."""
         here = self._folder(job.round)
-        for line in check_journals(here / JOURNALS, job):
+        for line in journal_of(here / JOURNALS, job).prepare():
             _LOG.warning("%s", line)
         try:
             record(episodes, here / JOURNALS, here / DATASET, job, recording)

@@ -16,7 +16,7 @@ from manip_il.collect.record import MAX_TRIES, collect_successes, provenance, re
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
-from manip_il.data.journal import list_episodes, read_header
+from manip_il.data.journal import list_episodes
 from manip_il.data.lerobot_read import read_table
 from manip_il.data.schema import LABEL_VALID
 from manip_il.learn.columns import LEARNING_COLUMNS
@@ -55,7 +55,7 @@ def _demonstrate(config: RunConfig, labels: int, round_0: Path, folder: Path, en
     while True:
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, config.seed)
         found = list(collect_successes(engine, job, seeds, count, journals, stages.episode))
-        frames = sum(read_header(one.path).frames for one in found if one.success)
+        frames = sum(header.frames for header, _ in found if header.success)
         if frames >= labels:
             break
         count = max(count + 1, math.ceil(count * labels / frames))

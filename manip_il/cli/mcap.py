@@ -36,15 +36,13 @@ class McapExportOptions:
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
-        from manip_il.data.lerobot_read import dataset_info
         from manip_il.mcap.export import MAPPING, export_dataset, open_source
 
-        source = open_source(self.dataset)
-        total = dataset_info(self.dataset).episodes
+        info = open_source(self.dataset)
         prepare_output(self.out, resume=False, overwrite=self.overwrite)
-        with new_folder(self.out) as folder, progress(total, "export") as bar:
+        with new_folder(self.out) as folder, progress(info.episodes, "export") as bar:
             count = 0
-            for _ in export_dataset(source, folder):
+            for _ in export_dataset(self.dataset, info, folder):
                 count += 1
                 bar.advance()
             save_options(folder, self)

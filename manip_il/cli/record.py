@@ -132,14 +132,14 @@ class RecordOptions(common.EnvOptions):
         return dataset_info(root).episodes == self.dataset.num_episodes
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
-        from manip_il.collect.record import MAX_TRIES, check_journals, collect_successes, provenance, record
+        from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record
         from manip_il.data.build import Recording
         from manip_il.data.journal import list_seeds
         from manip_il.seeding import stream_seeds
 
         count = self.dataset.num_episodes
         seeds = stream_seeds("demonstrations", MAX_TRIES * count, self.seed)
-        warn(*check_journals(journals, job))
+        warn(*journal_of(journals, job).prepare())
         save_options(journals, self)
         video = asdict(self.dataset.rgb_encoder) if job.cameras else {}
         recording = Recording(self._repo_id(), True, count, provenance(job), video)

@@ -7,7 +7,7 @@ import logging
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +17,10 @@ from manip_il.collect.redraw import STATES, RedrawJob, write_states
 from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, dataset_sha256, local_id
-from manip_il.data.episodes import Header
-from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.journal import (
-    Journal,
-    clean_temporary,
-    episode_path,
-    list_episodes,
-    list_seeds,
-    read_header,
-    read_journal,
-    set_aside,
-)
+from manip_il.data.journal import Header, Journal, list_seeds
 from manip_il.data.lerobot_read import DatasetInfo
-from manip_il.data.schema import IMAGES, check_same_spec
-from manip_il.errors import ManipError, MismatchError, OlderSchemaError
+from manip_il.data.schema import IMAGES
+from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
@@ -41,71 +30,48 @@ _BETWEEN = 20  # at most so many are handed on between two that end, as there ma
 MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
 
 
-@dataclass(frozen=True)
-class Collected:
-    """One episode on disk. entry: what `read_journal` gives, where it is in memory still; else None."""
-
-    path: Path
-    success: bool
-    entry: tuple[Header, Episode] | None
-
-    def read(self) -> tuple[Header, Episode]:
-        """Return what `read_journal` gives."""
-        return self.entry or read_journal(self.path)
+def journal_of(journals: Path, job: Job) -> Journal:
+    """Return the folder that a job's episodes are stored in."""
+    return Journal(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
 
 
 def collect(
     engine: Engine, job: Job, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
-) -> Iterator[Collected]:
+) -> Iterator[tuple[Header, Episode]]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
-    Yields them in the order of the seeds, as soon as all before one are there. A journal that was there is read when
-    its turn comes; a damaged one is set aside, with a warning, and its seed runs again. A seed that kills its worker
-    again and again is left out: a warning names it. on_episode is called once an episode is on disk; what it raises
-    ends the run, and what is on disk stays.
+    Yields what `read_journal` gives of them in the order of the seeds, as soon as all before one are there. A journal
+    that was there is read when its turn comes; a damaged one is set aside, with a warning, and its seed runs again. A
+    seed that kills its worker again and again is left out: a warning names it. on_episode is called once an episode is
+    on disk; what it raises ends the run, and what is on disk stays.
     """
-    spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
-    keep, waiting = Journal(journals, spec, fingerprint), deque(seeds)
-    on_disk = dict.fromkeys(list_seeds(journals))  # seed -> whether it succeeded, of those that were run here
-    in_memory: dict[int, tuple[Header, Episode]] = {}
+    journal, waiting = journal_of(journals, job), deque(seeds)
+    on_disk = set(list_seeds(journals))
+    in_memory: dict[int, Episode] = {}
 
-    def ready() -> Iterator[Collected]:
+    def ready() -> Iterator[tuple[Header, Episode]]:
         while waiting and waiting[0] in on_disk:
-            path, success = episode_path(journals, waiting[0]), on_disk[waiting[0]]
-            entry = in_memory.pop(waiting[0], None)
-            if success is None:
-                entry = _read_or_set_aside(path)
-                if entry is None:
-                    del on_disk[waiting[0]]
-                    return
-                success = entry[0].success
+            episode = in_memory.pop(waiting[0], None)
+            entry = journal.read(waiting[0]) if episode is None else (journal.header(episode), episode)
+            if entry is None:
+                on_disk.remove(waiting[0])
+                return
             waiting.popleft()
-            yield Collected(path, success, entry)
+            yield entry
 
     while waiting:
         missing = [seed for seed in waiting if seed not in on_disk]
-        for episode in engine.run(job, missing, keep):
-            on_disk[episode.seed] = episode.success
+        for episode in engine.run(job, missing, journal):
+            on_disk.add(episode.seed)
             whole = job.cameras is None or any(key.startswith(IMAGES) for key in episode.columns)
             if whole and len(in_memory) < _IN_MEMORY:
-                in_memory[episode.seed] = Header.of(episode, spec, fingerprint), episode
+                in_memory[episode.seed] = episode
             if on_episode is not None:
                 on_episode(episode)
             yield from itertools.islice(ready(), _BETWEEN)
         yield from ready()
         if waiting and waiting[0] in missing and waiting[0] not in on_disk:
             _LOG.warning("seed %d is left out: it repeatedly killed its worker", waiting.popleft())
-
-
-def _read_or_set_aside(path: Path) -> tuple[Header, Episode] | None:
-    """A journal; None for a damaged one, which is renamed, so that its seed is free."""
-    try:
-        return read_journal(path)
-    except OlderSchemaError:
-        raise  # nothing is wrong with it
-    except ManipError as error:
-        _LOG.warning("%s (set aside as %s)", error, set_aside(path).name)
-        return None
 
 
 def collect_successes(
@@ -115,8 +81,8 @@ def collect_successes(
     count: int,
     journals: Path,
     on_episode: OnEpisode | None = None,
-) -> Iterator[Collected]:
-    """Run seeds in order until `count` episodes succeeded; yields all of them, in seed order.
+) -> Iterator[tuple[Header, Episode]]:
+    """Run seeds in order until `count` episodes succeeded; yields all of them as `collect` does.
 
     Which episodes come out depends on the seeds alone. Raises `ManipError` where too few succeed.
     """
@@ -126,13 +92,13 @@ def collect_successes(
         if tried + count - good > min(len(seeds), MAX_TRIES * count):
             raise ManipError(f"only {good} of {tried} demonstrations succeeded; {count} are needed")
         tried += len(more)
-        for collected in collect(engine, job, more, journals, on_episode):
-            good += collected.success
-            yield collected
+        for header, episode in collect(engine, job, more, journals, on_episode):
+            good += header.success
+            yield header, episode
 
 
 def record(
-    episodes: Iterable[Collected],
+    episodes: Iterable[tuple[Header, Episode]],
     journals: Path,
     root: Path,
     job: Job,
@@ -144,10 +110,9 @@ def record(
     `build(journals, root)` gives the same bytes later. replace: as in `new_folder`.
     """
     recording.write(journals)
-    spec, fingerprint = env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras)
-    selection = recording.selection()
-    with recording.open(root, spec, fingerprint, replace=replace) as writer:
-        for episode in selection.take(collected.read() for collected in episodes):
+    journal, selection = journal_of(journals, job), recording.selection()
+    with recording.open(root, journal.spec, journal.fingerprint, replace=replace) as writer:
+        for episode in selection.take(episodes):
             writer.add(episode)
         return writer.finish(recording.provenance | selection.provenance), selection.failed
 
@@ -159,7 +124,7 @@ def redraw(
 
     A job that was killed goes on from them. Raises `NothingToLearnError` where no scene has a sound label.
     """
-    for line in check_journals(job.files, job):
+    for line in journal_of(job.files, job).prepare():
         _LOG.warning("%s", line)
     if not (job.files / STATES).is_file():
         write_states(source, job.files, job.seed)
@@ -184,31 +149,3 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
         return source
     steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}
     return {**source, "label": job.label, "query": str(job.query), **steps}
-
-
-def check_journals(journals: Path, job: Job) -> list[str]:
-    """Check that a recording may continue from these journals: `MismatchError`, or a list of warnings to show.
-
-    The first that can be read speaks for all; `collect` reads the others when their turn comes.
-    """
-    clean_temporary(journals)
-    header = next(filter(None, map(_header, list_episodes(journals))), None)
-    if header is None:
-        return []
-    spec, here = env_spec(job.env, job.cameras), f"{job.env.robot} {job.env.task}"
-    check_same_spec(str(journals), header.spec, here, spec)
-    for what in ("task", "cameras", "image_size"):
-        left, right = getattr(header.spec, what), getattr(spec, what)
-        if left != right:
-            raise MismatchError(what, str(journals), left, here, right)
-    fingerprint = env_fingerprint(job.env, job.cameras)
-    return compare_fingerprints(str(journals), header.fingerprint, "this machine", fingerprint)
-
-
-def _header(path: Path) -> Header | None:
-    try:
-        return read_header(path)
-    except OlderSchemaError:
-        raise
-    except ManipError:
-        return None

@@ -58,7 +58,7 @@ def run_seeds(job: Job, seeds: Seeds, journal: Journal | None, store: bool) -> A
     found: Answer = []
     try:
         for episode in job.run(seeds):
-            packed = journal.pack(episode) if journal is not None else None
+            packed = journal.encode(episode) if journal is not None else None
             if store and journal is not None and packed is not None:
                 journal.store(episode.seed, packed)
                 packed = None

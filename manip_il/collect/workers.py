@@ -170,7 +170,7 @@ def _stored(episodes: Iterable[Episode], journal: Journal) -> Iterator[Episode]:
     with ThreadPoolExecutor(1, "store") as disk:
         before: tuple[Episode, Future[None]] | None = None
         for episode in episodes:
-            storing = episode, disk.submit(journal.store, episode.seed, journal.pack(episode))
+            storing = episode, disk.submit(journal.store, episode.seed, journal.encode(episode))
             if before is not None:
                 yield _settled(*before)
             before = storing

@@ -19,6 +19,7 @@ What the room promises:
 - Equal bytes. The same episodes in the same order give the same journals and the same dataset, videos included, whether
   it is written while episodes come or built from their journals later. `fingerprint.py` says when two environments
   promise equal episodes.
-- Everything read is checked. Datasets and journals may come from anyone: names never lead out of their folder, sizes
-  are bounded before anything is unpacked, and whatever is wrong is one `ManipError` that names the file.
+- Everything read is checked. Datasets may come from anyone: names never lead out of their folder, sizes are bounded
+  before anything is unpacked, and whatever is wrong is one `ManipError` that names the file. So it is with a journal,
+  whose checksums are compared before it is taken apart; its size is bounded when it is written.
 """

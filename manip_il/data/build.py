@@ -18,9 +18,9 @@ from typing import Any
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, write_file
-from manip_il.data.episodes import Header, Selection
+from manip_il.data.episodes import Selection
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.journal import list_episodes, read_journal
+from manip_il.data.journal import Header, list_episodes, read_journal
 from manip_il.data.lerobot_read import (
     UNKNOWN_TASK,
     DatasetInfo,

@@ -6,73 +6,21 @@ branch. Each of these parts ends with `next.done`; in a dataset each is an episo
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il import checks
 from manip_il.data import schema
 from manip_il.data.fingerprint import compare_fingerprints
-from manip_il.data.schema import RobotTaskSpec
+from manip_il.data.journal import Header
 from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.mdp import Episode, Observation, Transition
 
-_FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
 _LOG = logging.getLogger(__name__)
-_NEEDED = ("seed", "success", "success_at_end", "frames", "spec", "fingerprint")  # of a header
-_OPTIONAL = {"instruction": '""', "drawn": "{}"}
-
-
-@dataclass(frozen=True)
-class Header:
-    """An episode without its columns: how it ended, what it drew, and the environment that it comes from."""
-
-    seed: int
-    success: bool
-    success_at_end: bool
-    frames: int
-    spec: RobotTaskSpec
-    fingerprint: dict[str, Any]
-    instruction: str = ""  # of the episode, where it is not that of the spec
-    drawn: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Header:
-        """Return the header of an episode."""
-        ends = bool(episode.success), bool(episode.success_at_end)
-        return cls(episode.seed, *ends, len(episode), spec, fingerprint, episode.instruction, episode.drawn)
-
-    def to_texts(self) -> dict[str, str]:
-        """Return it as JSON by name, as a journal has it."""
-        values = {name: getattr(self, name) for name in _NEEDED} | {"spec": self.spec.to_json()}
-        optional = {"instruction": self.instruction} | ({"drawn": dict(self.drawn)} if self.drawn else {})
-        return {name: json.dumps(value) for name, value in (values | optional).items()}
-
-    @classmethod
-    def from_texts(cls, data: Mapping[str, str]) -> Header:
-        """Return the inverse of `to_texts`; journals of older versions have neither instruction nor draws.
-
-        Raises `ValueError` or `ManipError` for anything else.
-        """
-        if missing := [key for key in _NEEDED if key not in data]:
-            raise ValueError(f"its header lacks {', '.join(missing)}")
-        given = {key: data[key] for key in _NEEDED} | {key: data.get(key, plain) for key, plain in _OPTIONAL.items()}
-        values = {key: checks.parse_json(f"its {key}", text) for key, text in given.items()}
-        return cls(
-            checks.whole("its seed", values["seed"], 0, checks.LARGEST_SEED),
-            checks.truth("its success", values["success"]),
-            checks.truth("its success_at_end", values["success_at_end"]),
-            checks.whole("its number of frames", values["frames"], 1, schema.MOST_FRAMES),
-            RobotTaskSpec.from_json(values["spec"]),
-            checks.mapping("its fingerprint", values["fingerprint"]),
-            checks.text("its instruction", values["instruction"]),
-            checks.mapping("what it drew", values["drawn"]),
-        )
 
 
 def group_rollouts(transitions: Iterable[Transition]) -> Iterator[list[Transition]]:
@@ -138,40 +86,6 @@ def parts(episode: Episode) -> list[Episode]:
     starts = [0, *ends[:-1].tolist()]
     finals = [(one,) for one in episode.final] if len(episode.final) == len(ends) else [()] * len(ends)
     return [_part(episode, slice(*rows), final) for *rows, final in zip(starts, ends.tolist(), finals, strict=True)]
-
-
-def final_columns(final: Sequence[Observation]) -> dict[str, NDArray[Any]]:
-    """Return the observations after each part of an episode as named arrays, (n,), (k,) and (height, width, 3).
-
-    The inverse of `take_final`.
-    """
-    columns: dict[str, NDArray[Any]] = {}
-    for number, one in enumerate(final):
-        pictures = {schema.IMAGES + camera: picture for camera, picture in one.images.items()}
-        arrays = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
-        columns |= {f"{_FINAL}{number}/{key}": values for key, values in arrays.items()}
-    return columns
-
-
-def take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
-    """Remove from `columns` the arrays (n,), (k,), ... that `final_columns` gave, and return their observations.
-
-    Raises `ValueError` for numbers that are not counted from 0, or without joints or environment.
-    """
-    found: dict[str, dict[str, NDArray[Any]]] = {}
-    for name in [name for name in columns if name.startswith(_FINAL)]:
-        number, _, key = name.removeprefix(_FINAL).partition("/")
-        found.setdefault(number, {})[key] = columns.pop(name)
-    if sorted(found) != sorted(map(str, range(len(found)))) or any(
-        {schema.STATE, schema.ENVIRONMENT_STATE} - arrays.keys() for arrays in found.values()
-    ):
-        raise ValueError(f"it holds last observations {checks.shorten(sorted(found))}; expected them whole, from 0 on")
-    return tuple(_final(found[str(number)]) for number in range(len(found)))
-
-
-def _final(arrays: dict[str, NDArray[Any]]) -> Observation:
-    pictures = {key.removeprefix(schema.IMAGES): one for key, one in arrays.items() if key.startswith(schema.IMAGES)}
-    return Observation(arrays[schema.STATE], arrays[schema.ENVIRONMENT_STATE], pictures)
 
 
 def count_labels(episode: Episode) -> int:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,15 +20,13 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.opcode import Opcode
+from mcap.reader import McapReader
 from mcap.records import Schema
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
-from manip_il.checks import shorten
 from manip_il.data import schema as s
-from manip_il.data.mcap_records import Record, to_channel, to_message
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
@@ -171,34 +168,18 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
             writer.add_message(channel_id, time, message, time, frame)
 
 
-def read_images(records: Iterable[Record], cameras: Sequence[str], shape: tuple[int, ...]) -> dict[str, U8]:
-    """Return every camera's pictures as `images` wrote them, from a file's records in stored order.
+def read_images(reader: McapReader, cameras: Iterable[str], shape: tuple[int, ...]) -> dict[str, U8]:
+    """Return every camera's pictures as `images` wrote them; a camera without any is left out.
 
-    shape: of what each camera has, (T, height, width, 3). Raises `ValueError` for another camera, another size, and for
-    fewer or more pictures.
+    shape: of what each camera has, (T, height, width, 3).
     """
-    topics: dict[int, str] = {}
     pictures: dict[str, U8] = {}
-    counts: Counter[str] = Counter()
-    for record in records:
-        if record.opcode == Opcode.CHANNEL:
-            channel = to_channel(record.body)
-            if (camera := channel.topic.removeprefix(IMAGE_TOPICS)) != channel.topic:
-                if camera not in cameras:
-                    raise ValueError(f"it holds pictures of {shorten(camera)}; its header names {shorten(cameras)}")
-                topics[channel.id] = camera
-        elif record.opcode == Opcode.MESSAGE and (camera := topics.get(int.from_bytes(record.body[:2], "little"))):
-            message = RawImage.FromString(to_message(record.body).data)
-            if (message.height, message.width, 3) != shape[1:] or counts[camera] == shape[0]:
-                found = f"picture {counts[camera]} of {camera}, {message.height} x {message.width}"
-                raise ValueError(f"{found}, is not one of {shape[0]} of {shape[1]} x {shape[2]} pixels")
-            if camera not in pictures:
-                pictures[camera] = np.empty(shape, np.uint8)
-            pictures[camera][counts[camera]] = np.frombuffer(message.data, np.uint8).reshape(shape[1:])
-            counts[camera] += 1
-    for camera, count in counts.items():
-        if count != shape[0]:
-            raise ValueError(f"it holds {count} pictures of {camera}; expected {shape[0]}")
+    for _, channel, message in reader.iter_messages([IMAGE_TOPICS + one for one in cameras], log_time_order=False):
+        camera = channel.topic.removeprefix(IMAGE_TOPICS)
+        if camera not in pictures:
+            pictures[camera] = np.empty(shape, np.uint8)
+        data = RawImage.FromString(message.data).data
+        pictures[camera][message.sequence] = np.frombuffer(data, np.uint8).reshape(shape[1:])
     return pictures
 
 

@@ -6,127 +6,152 @@ bit: numbers as an attachment (`<column>.npy`), pictures as messages. Foxglove s
 
 from __future__ import annotations
 
-import io
-import itertools
-import math
-import os
+import json
+import logging
 import re
-from collections.abc import Callable, Generator, Iterator
+import struct
+import zlib
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Metadata
+from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
-from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import foxglove, schema
 from manip_il.data.atomic import PARTIAL, write_file
-from manip_il.data.episodes import Header, final_columns, take_final
-from manip_il.data.mcap_records import (
-    MIB,
-    Budget,
-    Record,
-    check_both_sums,
-    chunk_records,
-    read_records,
-    to_attachment,
-    unpack,
-)
-from manip_il.data.schema import IMAGES, RobotTaskSpec
-from manip_il.errors import ManipError, OlderSchemaError
-from manip_il.mdp import Episode
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
+from manip_il.errors import ManipError, MismatchError, OlderSchemaError
+from manip_il.mdp import Episode, Observation
 
+_LOG = logging.getLogger(__name__)
 _FORMAT = "2"
 _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
-LARGEST_EPISODE = 640 * MIB  # all columns and pictures [bytes]: 6,800 frames of two cameras of 128 x 128 pixels
-_LARGEST_RATIO = 256  # or so many times the file's size, where that is more: rendered frames reach about 50
-_MOST_COLUMNS = 1_000
-_LONGEST_NPY_HEADER = 20_000  # [bytes]; numpy refuses what is longer than 10,000
-_NPY_HEADERS: dict[tuple[int, int], Callable[[io.BytesIO], Any]] = {
-    (1, 0): npy.read_array_header_1_0,
-    (2, 0): npy.read_array_header_2_0,
-}
+_FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
+_MAGIC = b"\x89MCAP0\r\n"
+_END = struct.Struct("<QQI8s")  # of a file: start of the summary, start of its offsets, its checksum, magic
+_DATA_END = b"\x0f\x04" + bytes(7)  # opcode and size of the record before the summary; then comes the data's checksum
+LARGEST_EPISODE = 2 * 1024**3  # all columns and pictures [bytes]: 21,000 frames of two cameras of 128 x 128 pixels
+
+
+@dataclass(frozen=True)
+class Header:
+    """An episode without its columns: how it ended, what it drew, and the environment that it comes from."""
+
+    seed: int
+    success: bool
+    success_at_end: bool
+    frames: int
+    spec: RobotTaskSpec
+    fingerprint: dict[str, Any]
+    instruction: str = ""  # of the episode, where it is not that of the spec
+    drawn: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        checks.whole("an episode's seed", self.seed, 0, checks.LARGEST_SEED)
+        checks.whole("an episode's number of frames", self.frames, 1, schema.MOST_FRAMES)
+        checks.mapping("an episode's fingerprint", self.fingerprint)
+        checks.text("an episode's instruction", self.instruction)
+        checks.mapping("what an episode drew", dict(self.drawn))
 
 
 @dataclass(frozen=True)
 class Journal:
-    """Writes the journal of every episode that an engine runs."""
+    """A folder of the journals of episodes of one environment."""
 
     folder: Path
     spec: RobotTaskSpec
     fingerprint: dict[str, Any]
 
-    def pack(self, episode: Episode) -> bytes:
-        """Return the content of an episode's journal."""
-        return encode_episode(episode, self.spec, self.fingerprint)
+    def header(self, episode: Episode) -> Header:
+        """Return the header that an episode has here."""
+        ends = bool(episode.success), bool(episode.success_at_end)
+        about = self.spec, self.fingerprint, episode.instruction, episode.drawn
+        return Header(episode.seed, *ends, len(episode), *about)
 
-    def store(self, seed: int, packed: bytes) -> None:
-        """Write the journal to disk. Raises `ManipError` where the disk is full or may not be written."""
+    def encode(self, episode: Episode) -> bytes:
+        """Return the content of an episode's journal; the same episode gives the same bytes.
+
+        Raises `ManipError` for a column that numpy can only pickle, and for an episode that is too large.
+        """
+        columns = episode.columns | _final_columns(episode.final)
+        if (size := sum(column.nbytes for column in columns.values())) > LARGEST_EPISODE:
+            why = f"the episode with seed {episode.seed} has {size:,} bytes; expected at most {LARGEST_EPISODE:,}"
+            raise ManipError(f"{why}: record a shorter one, or smaller or fewer pictures")
+        stream = BytesIO()
+        writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        writer.start(profile="", library=_RECORD)
+        writer.add_metadata(_RECORD, {"format": _FORMAT} | _to_texts(self.header(episode)))
+        channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
+        foxglove.add_channels(writer, list(channels), times)
+        for key, column in columns.items():
+            if key.startswith(IMAGES):
+                continue  # pictures travel as messages, without loss as well
+            writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
+        writer.finish()
+        return stream.getvalue()
+
+    def store(self, seed: int, content: bytes) -> None:
+        """Write what `encode` gave to disk, in place of an earlier file of the seed.
+
+        Raises `ManipError` where the disk is full or may not be written.
+        """
         path = episode_path(self.folder, seed)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_file(path, packed)
+            write_file(path, content)
         except OSError as error:
             raise ManipError(f"cannot write {path}: {error.strerror}") from error
 
+    def write(self, episode: Episode) -> Path:
+        """Encode and store one episode; return its path."""
+        self.store(episode.seed, self.encode(episode))
+        return episode_path(self.folder, episode.seed)
 
-def write_episode(folder: Path, episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> Path:
-    """Write one episode to `folder/episode-<seed>.mcap` and return that path; the same episode gives the same bytes.
+    def read(self, seed: int) -> tuple[Header, Episode] | None:
+        """Return what `read_journal` gives for a seed.
 
-    An earlier file of the same seed is replaced. Raises `ManipError` for a column that numpy can only pickle, and
-    where the disk is full or may not be written.
-    """
-    keep = Journal(folder, spec, fingerprint)
-    keep.store(episode.seed, keep.pack(episode))
-    return episode_path(folder, episode.seed)
+        None for a damaged file, which is renamed to `<name>.damaged` with a warning, so that its seed is free. Raises
+        `OlderSchemaError` for one of an older version, with which nothing is wrong.
+        """
+        path = episode_path(self.folder, seed)
+        try:
+            return read_journal(path)
+        except OlderSchemaError:
+            raise
+        except ManipError as error:
+            aside = path.rename(path.with_name(path.name + _DAMAGED))
+            _LOG.warning("%s (set aside as %s)", error, aside.name)
+            return None
 
+    def prepare(self) -> list[str]:
+        """Check that episodes may be added to the folder; return warnings to show.
 
-def read_episode(path: Path) -> Episode:
-    """Return the episode of `read_journal`."""
-    return read_journal(path)[1]
-
-
-def read_journal(path: Path) -> tuple[Header, Episode]:
-    """Return the header and the episode as they were written, bit for bit; every checksum of the file is checked.
-
-    Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
-    """
-    with _explain(path), open(checks.open_regular(path), "rb") as stream:
-        check_both_sums(stream)
-        header = _header(stream)
-        budget = _budget(stream)
-        columns = {name: _from_npy(data) for name, data in _attachments(stream, budget)}
-        if header.spec.cameras:  # else nothing in the messages is needed
-            shape = (header.frames, *header.spec.image_size, 3)
-            pictures = foxglove.read_images(_messages(stream, header, budget), header.spec.cameras, shape)
-            columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
-        final = take_final(columns)
-        ends = header.success, header.success_at_end
-        episode = Episode(header.seed, columns, *ends, final, header.instruction, header.drawn)
-        if len(episode) != header.frames:
-            raise ValueError(f"its header counts {header.frames:,} frames, its columns {len(episode):,}")
-        return header, episode
-
-
-def read_header(path: Path, *, check_sums: bool = False) -> Header:
-    """Read the header without the columns; check_sums: and check both checksums of the file.
-
-    Raises `ManipError` naming the file.
-    """
-    with _explain(path), open(checks.open_regular(path), "rb") as stream:
-        if check_sums:
-            check_both_sums(stream)
-        return _header(stream)
+        Unfinished files of killed writers are removed, so no other writer may be at work. The first journal that can be
+        read speaks for all. Raises `MismatchError` if it is of another robot, task or cameras.
+        """
+        for leftover in self.folder.glob(f".episode-*{PARTIAL}"):
+            leftover.unlink(missing_ok=True)
+        header = next(filter(None, map(_header_or_none, list_episodes(self.folder))), None)
+        if header is None:
+            return []
+        here = f"{self.spec.robot} {self.spec.task}"
+        check_same_spec(str(self.folder), header.spec, here, self.spec)
+        for what in ("task", "cameras", "image_size"):
+            left, right = getattr(header.spec, what), getattr(self.spec, what)
+            if left != right:
+                raise MismatchError(what, str(self.folder), left, here, right)
+        return compare_fingerprints(str(self.folder), header.fingerprint, "this machine", self.fingerprint)
 
 
 def episode_path(folder: Path, seed: int) -> Path:
@@ -144,53 +169,92 @@ def list_episodes(folder: Path) -> list[Path]:
     return [episode_path(folder, seed) for seed in list_seeds(folder)]
 
 
-def set_aside(path: Path) -> Path:
-    """Rename a damaged file to `<name>.damaged`, so that its seed is free; return the new path."""
-    return path.rename(path.with_name(path.name + _DAMAGED))
+def read_journal(path: Path) -> tuple[Header, Episode]:
+    """Return the header and the episode as they were written, bit for bit.
 
-
-def clean_temporary(folder: Path) -> list[Path]:
-    """Remove unfinished files of killed writers and return them. Only for when no writer is at work in `folder`."""
-    leftovers = sorted(folder.glob(f".episode-*{PARTIAL}"))
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return leftovers
-
-
-def encode_episode(episode: Episode, spec: RobotTaskSpec, fingerprint: dict[str, Any]) -> bytes:
-    """Return a journal file's content; the same episode gives the same bytes.
-
-    Raises `ManipError` for an episode that `read_episode` would refuse for its size.
+    Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
     """
-    stream = io.BytesIO()
-    writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
-    writer.start(profile="", library=_RECORD)
-    writer.add_metadata(_RECORD, {"format": _FORMAT} | Header.of(episode, spec, fingerprint).to_texts())
-    channels, times = foxglove.episode_channels(episode, spec), foxglove.frame_times(episode, spec)
-    foxglove.add_channels(writer, list(channels), times)
-    for key, column in (episode.columns | final_columns(episode.final)).items():
-        if key.startswith(IMAGES):
-            continue  # pictures travel as messages, without loss as well
-        writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
-    writer.finish()
-    _check_limits(stream, episode.seed)
-    return stream.getvalue()
+    with _open(path) as (reader, header):
+        columns: dict[str, NDArray[Any]] = {}
+        for one in reader.iter_attachments():
+            columns[one.name.removesuffix(_NPY)] = np.load(BytesIO(one.data), allow_pickle=False)
+        if header.spec.cameras:  # else nothing in the messages is needed
+            shape = (header.frames, *header.spec.image_size, 3)
+            pictures = foxglove.read_images(reader, header.spec.cameras, shape)
+            columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
+        final = _take_final(columns)
+        ends = header.success, header.success_at_end
+        return header, Episode(header.seed, columns, *ends, final, header.instruction, header.drawn)
 
 
-def _check_limits(stream: io.BytesIO, seed: int) -> None:
-    """Raise `ManipError` where a journal is larger than what reading allows."""
+def read_header(path: Path) -> Header:
+    """Return the header alone, after the same check of the file's checksums. Raises what `read_journal` raises."""
+    with _open(path) as (_, header):
+        return header
+
+
+@contextmanager
+def _open(path: Path) -> Generator[tuple[McapReader, Header]]:
+    """Give a whole journal's reader and header; any error meanwhile becomes a `ManipError` that names the file."""
+    content = checks.read_bytes(path, "an episode's journal", LARGEST_EPISODE)
     try:
-        header, budget = _header(stream), _budget(stream)
-        parts = [_attachments(stream, budget), _messages(stream, header, budget) if header.spec.cameras else ()]
-        for _ in itertools.chain(*parts):
-            pass
-    except (ManipError, ValueError) as error:
-        advice = "record shorter episodes, or smaller or fewer pictures"
-        raise ManipError(f"the journal of the episode with seed {seed} could not be read: {error}; {advice}") from error
+        _check_sums(content)
+        reader = make_reader(BytesIO(content))
+        (texts,) = [one.metadata for one in reader.iter_metadata() if one.name == _RECORD]
+        yield reader, _from_texts(texts)
+    except OlderSchemaError as error:
+        error.args = (f"{path}: {error}",)
+        raise
+    except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
+        why = str(error) or type(error).__name__
+        raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
+
+
+def _check_sums(content: bytes) -> None:
+    """Raise `ValueError` unless a file's data and its summary have the checksums that are in it."""
+    if not content.startswith(_MAGIC) or len(content) < len(_MAGIC) + _END.size:
+        raise ValueError("it is no MCAP file, or ends too early")
+    view = memoryview(content)
+    start, _, summary_sum, magic = _END.unpack(view[-_END.size :])
+    end, data_sum = start - 4 - len(_DATA_END), int.from_bytes(view[start - 4 : start], "little")
+    if magic != _MAGIC or bytes(view[end : start - 4]) != _DATA_END:
+        raise ValueError("it ends too early")
+    if zlib.crc32(view[:end]) != data_sum or zlib.crc32(view[start:-12]) != summary_sum:
+        raise ValueError("it does not match its checksums")
+
+
+def _header_or_none(path: Path) -> Header | None:
+    try:
+        return read_header(path)
+    except OlderSchemaError:
+        raise
+    except ManipError:
+        return None
+
+
+def _to_texts(header: Header) -> dict[str, str]:
+    """Return a header as JSON by name."""
+    values = {name: getattr(header, name) for name in ("seed", "success", "success_at_end", "frames")}
+    values |= {"spec": header.spec.to_json(), "fingerprint": header.fingerprint, "instruction": header.instruction}
+    values |= {"drawn": dict(header.drawn)} if header.drawn else {}
+    return {name: json.dumps(value) for name, value in values.items()}
+
+
+def _from_texts(texts: Mapping[str, str]) -> Header:
+    """Return the inverse of `_to_texts`; journals of older versions have neither instruction nor draws."""
+    if (found := texts.get("format")) == "1":
+        raise OlderSchemaError("1", schema.VERSION)
+    if found != _FORMAT:
+        raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
+    values: dict[str, Any] = {
+        name: checks.parse_json(f"its {name}", text) for name, text in texts.items() if name != "format"
+    }
+    values["spec"] = RobotTaskSpec.from_json(values["spec"])
+    return Header(**values)
 
 
 def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
-    stream = io.BytesIO()
+    stream = BytesIO()
     try:
         np.save(stream, column, allow_pickle=False)
     except ValueError as error:
@@ -198,65 +262,25 @@ def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
     return stream.getvalue()
 
 
-def _from_npy(data: memoryview) -> NDArray[Any]:
-    """The array in a file of numpy's format; `ValueError` where its header declares another size than it has."""
-    head = io.BytesIO(data[:_LONGEST_NPY_HEADER])
-    version = npy.read_magic(head)
-    if version not in _NPY_HEADERS:
-        raise ValueError(f"a column in numpy's format {version}; expected one of {list(_NPY_HEADERS)}")
-    shape, is_fortran, dtype = _NPY_HEADERS[version](head)
-    content = data[head.tell() :]
-    if dtype.hasobject or not dtype.itemsize:
-        raise ValueError(f"a column of {dtype}; expected numbers")
-    if math.prod(shape) * dtype.itemsize != len(content):
-        raise ValueError(f"a column declares shape {checks.shorten(shape)} of {dtype} and has {len(content):,} bytes")
-    return np.ndarray(shape, dtype, bytearray(content), order="F" if is_fortran else "C")
+def _final_columns(final: Sequence[Observation]) -> dict[str, NDArray[Any]]:
+    """Return the observations after each part of an episode as named arrays, (n,), (k,) and (height, width, 3)."""
+    columns: dict[str, NDArray[Any]] = {}
+    for number, one in enumerate(final):
+        pictures = {IMAGES + camera: picture for camera, picture in one.images.items()}
+        arrays = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
+        columns |= {f"{_FINAL}{number}/{key}": values for key, values in arrays.items()}
+    return columns
 
 
-def _budget(stream: BinaryIO, times: int = 1) -> Budget:
-    return Budget(stream.seek(0, os.SEEK_END), times * LARGEST_EPISODE, times * _LARGEST_RATIO)
+def _take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
+    """Remove from `columns` the arrays that `_final_columns` gave, and return their observations."""
+    found: dict[int, dict[str, NDArray[Any]]] = {}
+    for name in [name for name in columns if name.startswith(_FINAL)]:
+        number, _, key = name.removeprefix(_FINAL).partition("/")
+        found.setdefault(int(number), {})[key] = columns.pop(name)
+    return tuple(_observation(arrays) for _, arrays in sorted(found.items()))
 
 
-def _attachments(stream: BinaryIO, budget: Budget) -> Iterator[tuple[str, memoryview]]:
-    """Names and files of the columns, without those of pictures."""
-    for count, record in enumerate(read_records(stream, Opcode.ATTACHMENT), start=1):
-        if count > _MOST_COLUMNS:
-            raise ValueError(f"it holds more than {_MOST_COLUMNS} columns")
-        budget.take(len(record.body))
-        name, data = to_attachment(record.body)
-        yield name.removesuffix(_NPY), data
-
-
-def _messages(stream: BinaryIO, header: Header, budget: Budget) -> Iterator[Record]:
-    """Channels and messages, the pictures among them."""
-    budget.take(len(header.spec.cameras) * header.frames * math.prod(header.spec.image_size) * 3)
-    packed = _budget(stream, times=2)
-    for chunk in read_records(stream, Opcode.CHUNK):
-        yield from chunk_records(unpack(chunk, packed, check=False), packed)
-
-
-def _header(stream: BinaryIO) -> Header:
-    notes = [Metadata.read(ReadDataStream(io.BytesIO(record.body))) for record in read_records(stream, Opcode.METADATA)]
-    ours = [note.metadata for note in notes if note.name == _RECORD]
-    if len(ours) != 1:
-        raise ValueError(f"it holds {len(ours)} metadata records {_RECORD!r}; expected one")
-    data = ours[0]
-    if (found := data.get("format")) != _FORMAT:
-        if found == "1":
-            raise OlderSchemaError("1", schema.VERSION)
-        raise ValueError(f"its format is {checks.shorten(found)}; this version reads {_FORMAT!r}")
-    return Header.from_texts(data)
-
-
-@contextmanager
-def _explain(path: Path) -> Generator[None]:
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise ManipError(f"no such episode file: {path}") from error
-    except OlderSchemaError as error:
-        error.args = (f"{path}: {error}",)
-        raise
-    except Exception as error:  # a damaged file can make a parser raise anything
-        why = str(error) or type(error).__name__
-        raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
+def _observation(arrays: dict[str, NDArray[Any]]) -> Observation:
+    pictures = {key.removeprefix(IMAGES): one for key, one in arrays.items() if key.startswith(IMAGES)}
+    return Observation(arrays[schema.STATE], arrays[schema.ENVIRONMENT_STATE], pictures)

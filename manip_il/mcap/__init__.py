@@ -4,12 +4,10 @@
   Only pictures that a mapping encodes as video lose detail. The same dataset gives the same files, byte for byte.
 - An import takes every value from a message that the mapping allows. It never extrapolates: a gap beyond a topic's
   tolerance, stamps that do not ascend, a missing field, a value that the column's dtype cannot hold, and NaN are errors
-  that name file, topic and time. A dataset appears whole or not at all.
-- A foreign file is hostile until checked: all checksums that it has are compared, sizes are limited before anything is
-  unpacked (a chunk to 128 MiB, a message to 64 MiB, a file to 2 GiB or 1000 times its size; see `records` and `read`),
-  and pictures are decoded by Foxglove's published schemas, whatever schema the file declares. Messages are read in
-  protobuf and JSON, chunks in zstd, lz4 or uncompressed; other encodings (ROS) are refused.
+  that name file and topic. A dataset appears whole or not at all.
+- A file is read once in a child process, with limits of memory and time, before it is imported. Messages are protobuf
+  or JSON, chunks zstd, lz4 or uncompressed; other encodings (ROS) are refused.
 
-`export` writes what `foxglove` encodes. `importing` resamples what `read` decodes from `records`, by a `mapping` of
-topics and field `path`s. Journals (`data.journal`) are MCAP files of the same channels and limits.
+`export` writes what `data.foxglove` encodes. `importing` resamples what `read` decodes, by a `mapping` of topics and of
+`path`s to their fields.
 """

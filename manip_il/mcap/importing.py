@@ -5,7 +5,6 @@ An episode lasts from the latest of its topics' first messages to the earliest o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,82 +14,57 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS, log_time
-from manip_il.data.schema import MOST_FRAMES
-from manip_il.errors import ManipError, MismatchError, NotFiniteError
-from manip_il.mcap.mapping import TEXT, Camera, Mapping, Method, Source, Values
-from manip_il.mcap.read import Topics, read_pictures, read_topics
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mcap.mapping import TASK, TEXT, Mapping, Method
+from manip_il.mcap.read import read_pictures, read_topics
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
-Column = list[str] | NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Pick:
-    """Messages of T frames: for each the one before, the one after, and the frame's place between them, 0 to 1."""
-
-    left: I64
-    right: I64  # equal to `left` where one message is taken as it is
-    weight: F64
-
-    def blend(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Interpolate values (N, ...) of the messages to values (T, ...) of the frames.
-
-        A message that is taken as it is keeps every bit.
-        """
-        left, right = values[self.left], values[self.right]
-        if (self.left == self.right).all():
-            return left
-        weight = self.weight.reshape(-1, *[1] * (values.ndim - 1))
-        between = np.clip(left + (right - left) * weight, np.minimum(left, right), np.maximum(left, right))
-        return np.where(weight == 0, left, between)
-
-    def used(self) -> I64:
-        """Return the numbers of the messages that are in some frame, ascending, (M,)."""
-        return np.union1d(self.left, self.right)
+Frame = dict[str, Any]  # column -> array or text, and `task`
 
 
 @dataclass(frozen=True)
 class Import:
-    """One file's episode. columns: of numbers and text, T rows each; used: topic -> messages that are in a frame."""
+    """One file's episode. columns: of numbers and text, T rows each, `task` among them."""
 
     path: Path
-    frames: int
-    tasks: list[str]
-    columns: dict[str, Column]
-    picks: dict[str, Pick]  # of pictures
+    columns: dict[str, list[str] | NDArray[Any]]
+    pictures: dict[str, I64]  # camera's column -> its message in each of T frames
     counts: dict[str, int]  # messages of every topic in the file
-    used: dict[str, int]
+    used: dict[str, int]  # messages of every topic that are in a frame
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.columns[TASK])
 
 
 def list_files(source: Path) -> list[Path]:
     """Return the MCAP file, or the folder's in the order of their names. Raises `ManipError` where there are none."""
-    if source.is_dir():
-        paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
-        if not paths:
-            raise ManipError(f"{source} holds no *.mcap files")
-        return paths
-    if not source.is_file():
-        raise ManipError(f"no such file or folder: {source}")
-    return [source]
+    paths = sorted(path for path in source.glob("*.mcap") if not path.name.startswith("."))
+    if not paths and not source.is_file():
+        raise ManipError(f"{source} is no file, and holds no *.mcap files")
+    return paths or [source]
 
 
 def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Import]:
     """Write the files as a dataset that appears at `root` when all are in; yield each one's import as it is done.
 
-    Raises `FolderExistsError` where `root` holds something, and what `read_import` and `frames_of` raise.
+    Each is read in a child process first, which is limited in memory and time. Raises `FolderExistsError` where `root`
+    holds something, and what `checks.in_child`, `read_import` and `frames_of` raise.
     """
-    done: list[Import] = []
-    first = read_import(paths[0], mapping)
-    features = features_of(mapping, first)
+    done = [_checked_import(paths[0], mapping)]
+    features = features_of(done[0], mapping)
     from manip_il.data.lerobot_library import write_with_library  # imports torch
 
-    def episodes() -> Iterator[Iterator[dict[str, Any]]]:
-        for number, path in enumerate(paths):
-            done.append(first if number == 0 else read_import(path, mapping))
-            yield frames_of(done[-1], mapping, features)
+    def episodes() -> Iterator[Iterator[Frame]]:
+        for path in paths:
+            if not done:
+                done.append(_checked_import(path, mapping))
+            yield frames_of(done[0], mapping, features)
 
     with new_folder(root) as folder:
         work = folder / root.name  # LeRobot makes its folder itself
@@ -102,73 +76,72 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[Im
         work.rmdir()
 
 
+def _checked_import(path: Path, mapping: Mapping) -> Import:
+    checks.in_child(str(path), _read_all, path, mapping)
+    return read_import(path, mapping)
+
+
+def _read_all(path: Path, mapping: Mapping) -> None:
+    """Read everything that an import takes of a file."""
+    episode = read_import(path, mapping)
+    for _ in frames_of(episode, mapping, features_of(episode, mapping)):
+        pass
+
+
 def read_import(path: Path, mapping: Mapping) -> Import:
     """Read and resample one file, all but its pictures.
 
-    Raises `ManipError` naming file, topic and time for whatever the mapping asks for and the file does not give.
+    Raises `ManipError` naming file and topic for whatever the mapping asks for and the file does not give.
     """
-    task = {"": mapping.task} if isinstance(mapping.task, Values) else {}
-    values = {**mapping.values, **task}
-    topics = read_topics(path, mapping.topics, values)
-    times = _times(topics, mapping.fps)
-    used: dict[str, I64] = {}
-
-    def resample(source: Source) -> Pick:
-        who = f"{path}, topic {source.topic}"
-        picked = pick(who, source.resample, topics.stamps[source.topic], times, source.tolerance)
-        used[source.topic] = np.union1d(used.get(source.topic, picked.left), picked.used())
-        return picked
-
-    columns = {key: _column(path, key, source, topics.rows[key], resample(source)) for key, source in values.items()}
-    tasks = columns.pop("", None)
-    return Import(
-        path,
-        len(times),
-        [str(mapping.task)] * len(times) if tasks is None else list(tasks),
-        columns,
-        {key: resample(camera) for key, camera in mapping.cameras.items()},
-        dict(topics.counts),
-        {topic: len(numbers) for topic, numbers in used.items()},
-    )
+    counts, stamps, rows = read_topics(path, mapping)
+    times = _times(path, stamps, mapping.fps)
+    columns: dict[str, list[str] | NDArray[Any]] = {TASK: [str(mapping.task)] * len(times)}
+    pictures: dict[str, I64] = {}
+    used: dict[str, set[int]] = {}
+    for key, source in mapping.sources.items():
+        who = f"{path}, topic {source.topic}, {key}"
+        left, right = pick(who, source.resample, stamps[source.topic], times, source.tolerance)
+        used.setdefault(source.topic, set()).update(left.tolist(), right.tolist())
+        if source.is_camera:
+            pictures[key] = left
+        elif source.dtype == TEXT:
+            columns[key] = [rows[key][number][0] for number in left.tolist()]
+        else:
+            values = _numbers(who, rows[key], source.dtype)
+            chosen = values[left] if source.resample != "interpolate" else blend(stamps[source.topic], values, times)
+            columns[key] = chosen.astype(source.dtype).reshape(len(times), *(source.shape or values.shape[1:]))
+    return Import(path, columns, pictures, dict(counts), {topic: len(numbers) for topic, numbers in used.items()})
 
 
-def features_of(mapping: Mapping, first: Import) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's feature table, shapes that the mapping leaves open as the first file has them."""
+def features_of(first: Import, mapping: Mapping) -> dict[str, dict[str, Any]]:
+    """Return LeRobot's feature table, with the shapes that the first file has."""
+    frame = next(frames_of(first, mapping, {}))
     features: dict[str, dict[str, Any]] = {}
     for key, source in mapping.features.items():
-        if isinstance(source, Camera):
-            shape = next(read_pictures(first.path, source.topic, first.picks[key].left[:1])).shape
-            dtype = "video" if source.video else "image"
-            features[key] = {"dtype": dtype, "shape": shape, "names": ["height", "width", "channels"]}
-        else:
-            column = first.columns[key]
-            shape = (1,) if isinstance(column, list) else source.shape or column.shape[1:]
-            features[key] = {"dtype": source.dtype, "shape": shape, "names": source.names}
+        shape, names = np.shape(frame[key]) or (1,), source.names
+        if source.is_camera:
+            names = ["height", "width", "channels"]
+        dtype = source.dtype if not source.is_camera else "video" if source.video else "image"
+        features[key] = {"dtype": dtype, "shape": shape, "names": names}
     return features
 
 
-def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def frames_of(episode: Import, mapping: Mapping, features: dict[str, dict[str, Any]]) -> Iterator[Frame]:
     """Yield frames as LeRobot's writer takes them, pictures read as they are needed.
 
-    Raises `MismatchError` where a column's width or a picture's size is not that of the first file.
+    Raises `MismatchError` if a column's or a picture's shape is not that in `features`.
     """
-    cameras, picks = mapping.cameras, episode.picks
-    pictures = {key: read_pictures(episode.path, one.topic, picks[key].left) for key, one in cameras.items()}
-    columns: dict[str, Column] = {}
-    for key, column in episode.columns.items():
-        if not isinstance(column, list):
-            width, wanted = column.shape[1], int(np.prod(features[key]["shape"]))
-            if width != wanted:
-                raise MismatchError(f"column {key!r}", str(episode.path), width, "the first file", f"{wanted} values")
-            column = column.reshape(-1, *features[key]["shape"])
-        columns[key] = column
-    for number, task in enumerate(episode.tasks):
-        frame: dict[str, Any] = {key: column[number] for key, column in columns.items()}
-        for key, stream in pictures.items():
-            frame[key] = next(stream)
-            if frame[key].shape != (size := features[key]["shape"]):
-                raise MismatchError(f"{key!r}", f"{episode.path}", frame[key].shape, "the first file", size)
-        yield {**frame, "task": task}
+    topics = {key: source.topic for key, source in mapping.features.items()}
+    pictures = {key: read_pictures(episode.path, topics[key], numbers) for key, numbers in episode.pictures.items()}
+    for number in range(episode.frames):
+        frame = {key: column[number] for key, column in episode.columns.items()}
+        frame |= {key: next(stream) for key, stream in pictures.items()}
+        for key, feature in features.items():
+            if (shape := np.shape(frame[key]) or (1,)) != feature["shape"]:
+                raise MismatchError(
+                    f"the shape of {key!r}", str(episode.path), shape, "the first file", feature["shape"]
+                )
+        yield frame
 
 
 def frame_times(start: int, end: int, fps: int) -> I64:
@@ -177,8 +150,10 @@ def frame_times(start: int, end: int, fps: int) -> I64:
     return np.array([start + log_time(frame, fps) for frame in range(count)], dtype=np.int64)
 
 
-def pick(who: str, method: Method, stamps: I64, times: I64, tolerance: float) -> Pick:
+def pick(who: str, method: Method, stamps: I64, times: I64, tolerance: float) -> tuple[I64, I64]:
     """Pick messages with `stamps` (N,) for frames at `times` (T,), both [ns] and ascending, `stamps` strictly.
+
+    Returns the numbers of the messages before and after each frame, (T,) each, equal where one alone is taken.
 
     nearest: the one with the smallest distance in time, the earlier of two; at most `tolerance` [s] away.
     hold: the last one not later than the frame; at most `tolerance` old.
@@ -186,89 +161,52 @@ def pick(who: str, method: Method, stamps: I64, times: I64, tolerance: float) ->
     Raises `ManipError` with `who`, the gap's place and the tolerance for the first frame that has none.
     """
     limit = tolerance * NANOSECONDS
-    before = np.searchsorted(stamps, times, side="right") - 1  # -1: none
-    after = np.minimum(before + 1, len(stamps) - 1)
-    left = np.maximum(before, 0)
-    to_left, to_right = np.abs(times - stamps[left]), np.abs(stamps[after] - times)
-    right = left
+    left = np.maximum(np.searchsorted(stamps, times, side="right") - 1, 0)
+    right = np.minimum(np.searchsorted(stamps, times), len(stamps) - 1)
+    before, after = times - stamps[left], stamps[right] - times  # negative where there is no such message
     if method == "nearest":
-        left = right = np.where(to_left <= to_right, left, after)
-        bad = np.minimum(to_left, to_right) > limit
+        left = right = np.where(before <= after, left, right)
+        bad = np.abs(times - stamps[left]) > limit
     elif method == "hold":
-        bad = (before < 0) | (to_left > limit)
+        right = left
+        bad = (before < 0) | (before > limit)
     else:
-        right = np.where(to_left == 0, left, after)
-        bad = (before < 0) | (stamps[right] - stamps[left] > limit) | (stamps[right] < times)
+        bad = (before < 0) | (after < 0) | (before + after > limit)
     if bad.any():
-        raise _gap(who, method, stamps, times, int(np.argmax(bad)), tolerance)
-    span = np.maximum(stamps[right] - stamps[left], 1)
-    return Pick(left, right, np.where(left == right, 0.0, to_left / span))
+        frame = int(np.argmax(bad))
+        raise ManipError(
+            f"{who}: a gap at {(times[frame] - times[0]) / NANOSECONDS:g} s (stamp {times[frame]} ns, frame {frame}); "
+            f"{method} allows {tolerance:g} s: raise its tolerance in the mapping, or leave out this file"
+        )
+    return left, right
 
 
-def _times(topics: Topics, fps: int) -> I64:
-    last_to_start = max(topics.stamps, key=lambda topic: topics.stamps[topic][0])
-    first_to_end = min(topics.stamps, key=lambda topic: topics.stamps[topic][-1])
-    start, end = int(topics.stamps[last_to_start][0]), int(topics.stamps[first_to_end][-1])
+def blend(stamps: I64, values: NDArray[Any], times: I64) -> F64:
+    """Interpolate values (N, width) of messages to frames, (T, width)."""
+    places, found = (times - stamps[0]).astype(np.float64), (stamps - stamps[0]).astype(np.float64)
+    return np.stack([np.interp(places, found, column) for column in values.T], axis=1)
+
+
+def _times(path: Path, stamps: dict[str, I64], fps: int) -> I64:
+    last_to_start = max(stamps, key=lambda topic: stamps[topic][0])
+    first_to_end = min(stamps, key=lambda topic: stamps[topic][-1])
+    start, end = int(stamps[last_to_start][0]), int(stamps[first_to_end][-1])
     if end < start:
-        raise ManipError(
-            f"{topics.path}: {first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts; "
-            "expected topics that overlap in time"
-        )
-    if (end - start) * fps > MOST_FRAMES * NANOSECONDS:
-        raise ManipError(
-            f"{topics.path}: its topics overlap for {(end - start) / NANOSECONDS:g} s, at {fps} frames a second more "
-            f"than {MOST_FRAMES:,} frames; expected one episode a file"
-        )
+        late = f"{first_to_end} ends {(start - end) / NANOSECONDS:g} s before {last_to_start} starts"
+        raise ManipError(f"{path}: {late}; expected topics that overlap in time")
     return frame_times(start, end, fps)
 
 
-def _column(path: Path, key: str, source: Values, rows: list[list[Any]], picked: Pick) -> Column:
-    who = f"{path}, topic {source.topic}, {key or 'task'}"
-    for number, row in enumerate(rows):
-        if len(row) != len(rows[0]):
-            raise ManipError(f"{who}: message {number} has {len(row)} values, the first one {len(rows[0])}")
-    if source.dtype == TEXT:
-        return [_text(who, rows[number]) for number in picked.left.tolist()]
-    return picked.blend(_numbers(who, rows, np.dtype(source.dtype))).astype(source.dtype)
-
-
-def _text(who: str, row: list[Any]) -> str:
-    if len(row) != 1 or not isinstance(row[0], str):
-        raise ManipError(f"{who}: got {row!r}; expected one string")
-    return row[0]
-
-
-def _numbers(who: str, rows: list[list[Any]], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return rows (N, width), as float64 for a dtype of floats, else as the dtype, which must hold every value."""
-    is_float = dtype.kind == "f"
-    low, high = _limits(dtype)
-    for number, row in enumerate(rows):
-        for value in row:
-            if not isinstance(value, int | float):
-                raise ManipError(f"{who}: message {number} holds {value!r}; expected a number")
-            if not (low <= value <= high and (is_float or int(value) == value)):  # false for NaN
-                kind = NotFiniteError if isinstance(value, float) and not math.isfinite(value) else ManipError
-                raise kind(f"{who}: message {number} holds {value!r}, which is not a valid {dtype}")
-    if is_float:
-        return np.array(rows, np.float64)
-    return np.array([[int(value) for value in row] for row in rows], dtype)
-
-
-def _limits(dtype: np.dtype[Any]) -> tuple[float, float]:
-    if dtype.kind == "b":
-        return 0, 1
-    if dtype.kind == "f":
-        limit = float(np.finfo(dtype).max)
-        return -limit, limit
-    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
-
-
-def _gap(who: str, method: Method, stamps: I64, times: I64, frame: int, tolerance: float) -> ManipError:
-    time = times[frame]
-    around = [f"{(time - stamps[stamps <= time][-1]) / NANOSECONDS:g} s before"] if (stamps <= time).any() else []
-    around += [f"{(stamps[stamps > time][0] - time) / NANOSECONDS:g} s after"] if (stamps > time).any() else []
-    return ManipError(
-        f"{who}: a gap at {(time - times[0]) / NANOSECONDS:g} s (stamp {time} ns, frame {frame}): "
-        f"the messages next to it are {' and '.join(around)}, {method} allows {tolerance:g} s; "
-        "raise its tolerance in the mapping, or leave out this file"
-    )
+def _numbers(who: str, rows: list[list[Any]], dtype: str) -> NDArray[Any]:
+    """Return rows (N, width), floats as float64. Raises `ManipError` for a number that the dtype cannot hold."""
+    given, is_float = np.array(rows, object), dtype.startswith("float")
+    try:
+        with np.errstate(over="ignore"):  # which the next line sees
+            values = given.astype(np.float64 if is_float else dtype)
+            good = np.isfinite(values.astype(dtype)) if is_float else (values == given).astype(bool)
+    except (OverflowError, ValueError) as error:
+        raise ManipError(f"{who}: {error}; expected {dtype}") from error
+    if not good.all():
+        number = int(np.argwhere(~good)[0][0])
+        raise ManipError(f"{who}: message {number} holds {rows[number]}; expected finite numbers of {dtype}")
+    return values

@@ -11,7 +11,7 @@ from manip_il.cli.main import main
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import build
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.sim.env import EnvConfig
 
 from ..damage import edit_json
@@ -23,8 +23,8 @@ ENV = EnvConfig("panda", "reach", 20)
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for seed in (1, 2):
-        write_episode(
-            tmp_path / "d.journals", make_episode(env_spec(ENV), seed, 6), env_spec(ENV), env_fingerprint(ENV)
+        Journal(tmp_path / "d.journals", env_spec(ENV), env_fingerprint(ENV)).write(
+            make_episode(env_spec(ENV), seed, 6)
         )
     build(tmp_path / "d.journals", tmp_path / "d")
     return tmp_path / "d"

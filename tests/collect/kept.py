@@ -45,11 +45,11 @@ class DeadlyKeep:
         (folder / "deaths").mkdir()
         return cls(journal(folder / "journals", job), folder / "deaths", seeds, times)
 
-    def pack(self, episode: Episode) -> bytes:
+    def encode(self, episode: Episode) -> bytes:
         if episode.seed in self.seeds and self.deaths(episode.seed) < self.times:
             (self.folder / f"{episode.seed}-{os.getpid()}").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return self.journals.pack(episode)
+        return self.journals.encode(episode)
 
     def store(self, seed: int, packed: bytes) -> None:
         self.journals.store(seed, packed)
@@ -62,7 +62,7 @@ class DeadlyKeep:
 class FailingKeep:
     """Cannot store anything."""
 
-    def pack(self, episode: Episode) -> bytes:
+    def encode(self, episode: Episode) -> bytes:
         return b"x"
 
     def store(self, seed: int, packed: bytes) -> None:

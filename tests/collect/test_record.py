@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.collect import record as recording
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.record import check_journals, collect, collect_successes, record
+from manip_il.collect.record import collect, collect_successes, journal_of, record
 from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
+from manip_il.data import journal as journals
 from manip_il.data.build import Recording, build
-from manip_il.data.journal import Journal, list_episodes, read_episode, read_header, read_journal
+from manip_il.data.journal import Journal, list_episodes, read_header, read_journal
 from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
@@ -43,7 +43,7 @@ class Recorded(Engine):
                 lost = episode.columns | {"next.success": np.zeros_like(episode.columns["next.success"])}
                 episode = Episode(episode.seed, lost, False, False)
             if journal is not None:
-                journal.store(episode.seed, journal.pack(episode))
+                journal.store(episode.seed, journal.encode(episode))
             yield episode
 
 
@@ -51,14 +51,17 @@ def names(folder: Path) -> list[int]:
     return [read_header(path).seed for path in list_episodes(folder)]
 
 
+def contents(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in list_episodes(folder)]
+
+
 def test_every_seed_becomes_a_file_that_holds_its_episode(tmp_path):
     seen: list[Episode] = []
-    paths = [one.path for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append)]
-    assert paths == list_episodes(tmp_path)
-    assert names(tmp_path) == list(SEEDS[:3])
+    given = [header.seed for header, _ in collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append)]
+    assert given == names(tmp_path) == list(SEEDS[:3])
     by_seed = {episode.seed: episode for episode in seen}
     for path in list_episodes(tmp_path):
-        episode = read_episode(path)
+        episode = read_journal(path)[1]
         for key, column in by_seed[episode.seed].columns.items():
             assert episode.columns[key].tobytes() == column.tobytes()
 
@@ -82,8 +85,8 @@ def test_an_episode_is_on_disk_before_anybody_hears_of_it(tmp_path):
 
 def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
     failing = [SEEDS[0], SEEDS[2], SEEDS[4]]
-    paths = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
-    assert [read_header(one.path).seed for one in paths] == list(SEEDS[:7])
+    found = collect_successes(Recorded(failing), JOB, SEEDS, 4, tmp_path)
+    assert [header.seed for header, _ in found] == list(SEEDS[:7])
 
 
 def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_path):
@@ -91,8 +94,9 @@ def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_pat
     first = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "a"))
     list(collect(Recorded(failing), JOB, SEEDS[2:8], tmp_path / "b"))
     second = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "b"))
-    assert [one.path.read_bytes() for one in first] == [one.path.read_bytes() for one in second]
-    assert [one.success for one in first] == [one.success for one in second] == [True, False, True, True]
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")[: len(first)]
+    assert [one for one, _ in first] == [one for one, _ in second]
+    assert [one.success for one, _ in first] == [True, False, True, True]
 
 
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
@@ -108,32 +112,34 @@ class Shuffled(Recorded):
 
 
 def test_journals_come_in_the_order_of_the_seeds_and_a_lost_one_is_named(tmp_path, caplog):
-    paths = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
-    assert [read_header(one.path).seed for one in paths] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
+    found = list(collect(Shuffled(), JOB, SEEDS[:5], tmp_path))
+    assert [header.seed for header, _ in found] == [SEEDS[0], SEEDS[1], SEEDS[3], SEEDS[4]]
     assert [record.getMessage() for record in caplog.records] == [
         f"seed {SEEDS[2]} is left out: it repeatedly killed its worker"
     ]
 
 
 def test_journals_of_another_environment_are_not_gone_on_with(tmp_path):
-    assert check_journals(tmp_path, JOB) == []
+    assert journal_of(tmp_path, JOB).prepare() == []
     list(collect(Recorded(), JOB, SEEDS[:1], tmp_path))
-    assert check_journals(tmp_path, JOB) == []
+    assert journal_of(tmp_path, JOB).prepare() == []
     with pytest.raises(MismatchError, match=r"robot.*fetch.*panda"):
-        check_journals(tmp_path, RolloutJob(EnvConfig("panda", "reach")))
+        journal_of(tmp_path, RolloutJob(EnvConfig("panda", "reach"))).prepare()
     with pytest.raises(MismatchError, match=r"cameras.*\(\).*front"):
-        check_journals(tmp_path, replace(JOB, cameras=CameraConfig(("front",))))
-    warnings = check_journals(tmp_path, RolloutJob(EnvConfig("fetch", "reach", tolerance=0.05)))
+        journal_of(tmp_path, replace(JOB, cameras=CameraConfig(("front",)))).prepare()
+    warnings = journal_of(tmp_path, RolloutJob(EnvConfig("fetch", "reach", tolerance=0.05))).prepare()
     assert len(warnings) == 1
 
 
 def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog):
-    whole = [one.path.read_bytes() for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
+    list(collect(Recorded(), JOB, SEEDS[:3], tmp_path))
+    whole = contents(tmp_path)
     damaged = list_episodes(tmp_path)[1]
     damaged.write_bytes(whole[1][:5000])
-    assert check_journals(tmp_path, JOB) == []
+    assert journal_of(tmp_path, JOB).prepare() == []
     engine = Recorded()
-    assert [one.path.read_bytes() for one in collect(engine, JOB, SEEDS[:4], tmp_path)][:3] == whole
+    assert [header.seed for header, _ in collect(engine, JOB, SEEDS[:4], tmp_path)] == list(SEEDS[:4])
+    assert contents(tmp_path)[:3] == whole
     assert engine.asked == [SEEDS[3], SEEDS[1]]
     [record] = caplog.records
     assert f"{damaged} is not a complete episode" in record.getMessage()
@@ -141,26 +147,26 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog
 
 
 def test_new_episodes_run_before_all_that_are_there_have_been_read(tmp_path, monkeypatch):
-    before = [one.path.read_bytes() for one in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
+    before = [header.seed for header, _ in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
     steps: list[str] = []
-    monkeypatch.setattr(recording, "read_journal", lambda path: steps.append(path.name) or read_journal(path))
-    assert check_journals(tmp_path, JOB) == []
+    monkeypatch.setattr(journals, "read_journal", lambda path: steps.append(path.name) or read_journal(path))
+    assert journal_of(tmp_path, JOB).prepare() == []
     episodes = collect(Recorded(), JOB, SEEDS[:4], tmp_path, lambda _: steps.append("new"))
-    assert next(episodes).path.read_bytes() == before[0]
+    assert next(episodes)[0].seed == before[0]
     assert steps == ["new", list_episodes(tmp_path)[0].name]
-    assert [one.path.read_bytes() for one in episodes][:2] == before[1:]
+    assert [header.seed for header, _ in episodes][:2] == before[1:]
     assert len(steps) == 4
 
 
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
     failing = [SEEDS[1]]
-    journals = tmp_path / "journals"
+    folder = tmp_path / "journals"
     rule = Recording("local/x", only_successes=True, episodes=3, provenance={"driver": "expert"})
-    episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, journals)
-    info, failed = record(episodes, journals, tmp_path / "dataset", JOB, rule)
+    episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, folder)
+    info, failed = record(episodes, folder, tmp_path / "dataset", JOB, rule)
     assert (info.episodes, failed) == (3, 1)
     seeds = read_table(tmp_path / "dataset", ["seed"])["seed"]
     assert sorted(set(seeds.tolist())) == [SEEDS[0], SEEDS[2], SEEDS[3]]
-    result = build(journals, tmp_path / "again")
+    result = build(folder, tmp_path / "again")
     assert (result.info.episodes, result.failed, result.damaged) == (3, 1, ())
     assert digests(tmp_path / "again") == digests(tmp_path / "dataset")

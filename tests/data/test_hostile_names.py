@@ -54,8 +54,7 @@ def attack(tmp_path: Path, make_episode: MakeEpisode, seen: s.RobotTaskSpec, mon
     with monkeypatch.context() as patch:  # a spec that another program made up: nothing checks it
         patch.setattr(s.RobotTaskSpec, "__post_init__", lambda self: None)
         spec = replace(seen, cameras=(HOSTILE,))
-    monkeypatch.setattr(journal, "_check_limits", lambda stream, seed: None)  # nor does an attacker's writer look again
-    journal.write_episode(tmp_path / "lift.journals", replace(plain, columns=columns), spec, {})
+    journal.Journal(tmp_path / "lift.journals", spec, {}).write(replace(plain, columns=columns))
     return tmp_path / "lift.journals"
 
 
@@ -148,8 +147,7 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
     real = json.dumps
     wrong = {"fingerprint": {"mark": 1}, "spec": spec.to_json()}[field]
     monkeypatch.setattr(json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
-    monkeypatch.setattr(journal, "_check_limits", lambda stream, seed: None)
-    path = journal.write_episode(tmp_path, episodes[0], spec, {"mark": 1})
+    path = journal.Journal(tmp_path, spec, {"mark": 1}).write(episodes[0])
     for read in (journal.read_header, journal.read_journal):
         with pytest.raises(ManipError, match=r"None; expected an object"):
             read(path)

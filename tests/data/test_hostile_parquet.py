@@ -221,7 +221,7 @@ def test_every_reader_refuses_what_no_data_file_is(root, tmp_path, harm, words, 
         check_dataset,
         lambda root: read_tables([root], [s.SEED]),
         lambda root: list(read_episodes(root)),
-        lambda root: list(export_dataset(open_source(root), tmp_path)),
+        lambda root: list(export_dataset(root, open_source(root), tmp_path)),
     ):
         with pytest.raises(ManipError, match=words) as error:
             read(root)
@@ -248,7 +248,7 @@ def test_a_camera_is_not_looked_for_in_a_bomb(root):
 def test_a_row_whose_task_has_no_name_is_told(root, tmp_path):
     pq.write_table(pa.table({"task_index": [5], "task": ["x"]}), root / layout.TASKS)
     with pytest.raises(ManipError, match=r"rows have the task 0, which meta/tasks\.parquet does not hold as text"):
-        list(export_dataset(open_source(root), tmp_path))
+        list(export_dataset(root, open_source(root), tmp_path))
 
 
 _MEASURED = """

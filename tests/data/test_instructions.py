@@ -13,7 +13,7 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import build, merge_datasets
-from manip_il.data.journal import read_episode, write_episode
+from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_read import dataset_info, read_episodes, read_table
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder, has_errors
@@ -60,8 +60,8 @@ def test_an_episode_without_a_text_has_the_specs(tmp_path, episodes, spec):
 
 
 def test_journals_keep_the_text_and_build_the_same_dataset(tmp_path, told, spec, root):
-    paths = [write_episode(tmp_path / "journals", episode, spec, {}) for episode in told]
-    assert [read_episode(path).instruction for path in paths] == TEXTS
+    paths = [Journal(tmp_path / "journals", spec, {}).write(episode) for episode in told]
+    assert [read_journal(path)[1].instruction for path in paths] == TEXTS
     build(tmp_path / "journals", tmp_path / "built")
     assert texts(tmp_path / "built") == TEXTS
     for name in (layout.TASKS, layout.INFO):
@@ -77,7 +77,7 @@ def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
 
 def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tmp_path, root):
     assert not has_errors(examine_folder(root))
-    for path, text in zip(export_dataset(open_source(root), tmp_path), TEXTS, strict=True):
+    for path, text in zip(export_dataset(root, open_source(root), tmp_path), TEXTS, strict=True):
         assert {message.message for topic, _, message in decoded(path.read_bytes()) if topic == "/task"} == {text}
     assert dict(dataset_fields(root, "someone/data")[1]["rows"])["texts"] == f"2, such as: {RED}"
 

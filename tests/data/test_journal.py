@@ -15,9 +15,10 @@ from typing import Any
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from manip_il.data import journal
@@ -26,6 +27,7 @@ from manip_il.data.foxglove import SCALARS
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
+from ..pictures import numbered_episodes, with_cameras
 from ..synthetic import MakeEpisode
 
 FINGERPRINT = {"mujoco": "3.11.0", "model_sha256": "ab" * 32}
@@ -63,24 +65,23 @@ def assert_same(left: Episode, right: Episode) -> None:
 def test_any_columns_come_back_bit_for_bit(episode):
     spec = s.RobotTaskSpec("r", "t", 30, ("a", "b", "%s"), ("ee.x", "ee.y", "ee.z"), 1, "")
     with tempfile.TemporaryDirectory() as folder:
-        path = journal.write_episode(Path(folder), episode, spec, {})
-        assert_same(journal.read_episode(path), episode)
+        path = journal.Journal(Path(folder), spec, {}).write(episode)
+        assert_same(journal.read_journal(path)[1], episode)
 
 
 def test_an_episode_comes_back_with_its_header_and_gives_the_same_bytes_again(tmp_path, episodes, spec):
     for count, episode in enumerate(episodes, start=1):
-        path = journal.write_episode(tmp_path / "new" / "folder", episode, spec, FINGERPRINT)
-        assert_same(journal.read_episode(path), episode)
-        header = journal.read_header(path)
-        assert header == journal.Header.of(episode, spec, FINGERPRINT)
-        again = journal.write_episode(tmp_path / "again", episode, spec, FINGERPRINT)
+        path = journal.Journal(tmp_path / "new" / "folder", spec, FINGERPRINT).write(episode)
+        assert_same(journal.read_journal(path)[1], episode)
+        assert journal.read_header(path) == journal.Journal(tmp_path, spec, FINGERPRINT).header(episode)
+        again = journal.Journal(tmp_path / "again", spec, FINGERPRINT).write(episode)
         assert again.read_bytes() == path.read_bytes()
         assert len(list((tmp_path / "again").iterdir())) == count
 
 
 def test_files_are_listed_in_the_order_of_their_seeds(tmp_path, make_episode, spec):
     seeds = [110_000_000_000, 7, 3, 1_000_000]
-    paths = {seed: journal.write_episode(tmp_path, make_episode(seed, 2), spec, {}) for seed in seeds}
+    paths = {seed: journal.Journal(tmp_path, spec, {}).write(make_episode(seed, 2)) for seed in seeds}
     assert paths[7].name == "episode-000000000007.mcap"
     assert journal.list_episodes(tmp_path) == [paths[seed] for seed in sorted(seeds)]
     assert journal.list_episodes(tmp_path / "nothing") == []
@@ -88,39 +89,63 @@ def test_files_are_listed_in_the_order_of_their_seeds(tmp_path, make_episode, sp
 
 @pytest.fixture
 def path(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
-    return journal.write_episode(tmp_path, make_episode(17, 4), spec, FINGERPRINT)
+    return journal.Journal(tmp_path, spec, FINGERPRINT).write(make_episode(17, 4))
+
+
+@pytest.fixture
+def filmed(tmp_path: Path, make_episode: MakeEpisode, spec: s.RobotTaskSpec) -> Path:
+    spec = with_cameras(spec, "front", "wrist")
+    return journal.Journal(tmp_path / "filmed", spec, FINGERPRINT).write(numbered_episodes(make_episode, spec)[0])
+
+
+@given(st.integers(0, 10**9), st.integers(1, 255))
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_changed_byte_anywhere_is_refused_by_name(filmed, place, change):
+    data = bytearray(filmed.read_bytes())
+    data[place % len(data)] ^= change
+    changed = filmed.with_name("episode-000000000018.mcap")
+    changed.write_bytes(data)
+    with pytest.raises(ManipError, match=r"^.*episode-000000000018\.mcap is not a complete episode: .*$"):
+        journal.read_journal(changed)
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused_by_name(path, keep):
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * keep)])
-    with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
-        journal.read_episode(path)
-
-
-def test_a_changed_byte_anywhere_is_refused_by_name(path, tmp_path):
-    data = path.read_bytes()
-    changed = tmp_path / "episode-000000000018.mcap"
-    for place in [*range(0, len(data), 97), *range(len(data) - 60, len(data))]:
-        changed.write_bytes(data[:place] + bytes([data[place] ^ 0x10]) + data[place + 1 :])
-        with pytest.raises(ManipError, match=r"episode-000000000018\.mcap"):
-            journal.read_episode(changed)
+def test_a_file_cut_short_is_refused_and_set_aside_so_that_its_seed_is_free(path, caplog, spec, keep):
+    data = path.read_bytes()[: int(path.stat().st_size * keep)]
+    path.write_bytes(data)
+    for read in (journal.read_header, journal.read_journal):
+        with pytest.raises(ManipError, match=r"episode-000000000017\.mcap is not a complete episode"):
+            read(path)
+    assert journal.Journal(path.parent, spec, FINGERPRINT).read(17) is None
+    assert journal.list_seeds(path.parent) == []
+    assert path.with_name("episode-000000000017.mcap.damaged").read_bytes() == data
+    assert "(set aside as episode-000000000017.mcap.damaged)" in caplog.text
 
 
 def test_another_mcap_and_a_missing_file_are_refused(tmp_path):
     other = tmp_path / "episode-000000000001.mcap"
-    other.write_bytes(b"something else")
+    with other.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
     with pytest.raises(ManipError, match="not a complete episode"):
-        journal.read_episode(other)
-    with pytest.raises(ManipError, match="no such episode file"):
+        journal.read_journal(other)
+    with pytest.raises(ManipError, match=r"cannot read .*episode-000000000002\.mcap: No such file"):
         journal.read_header(tmp_path / "episode-000000000002.mcap")
 
 
-def test_a_column_of_objects_is_refused(tmp_path, spec):
+def test_what_cannot_be_read_again_is_not_written(tmp_path, spec, make_episode, monkeypatch):
     episode = Episode(1, {"x": np.array([{}, {}], dtype=object)}, True, True)
     with pytest.raises(ManipError, match="column 'x' of dtype object"):
-        journal.write_episode(tmp_path, episode, spec, {})
+        journal.Journal(tmp_path, spec, {}).write(episode)
+    for module, limit, words in (
+        (journal, "LARGEST_EPISODE", r"the episode with seed 7 has [\d,]+ bytes; expected at most 8: record a shorter"),
+        (s, "MOST_FRAMES", "an episode's number of frames is 9; expected a whole number from 1 to 8"),
+    ):
+        monkeypatch.setattr(module, limit, 8)
+        with pytest.raises(ManipError, match=words):
+            journal.Journal(tmp_path, spec, {}).write(make_episode(7))
+        monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,7 +164,7 @@ def test_foxglove_sees_joints_frames_and_scalars(tmp_path, make_episode, spec):
     turned = [0, 1, 0, -1, 0, 0]  # the hand's y axis along world y, its z axis along world -x
     episode.columns[s.ENVIRONMENT_STATE][:, 3:9] = turned
     episode.columns[s.ENVIRONMENT_STATE][:, 12:14] = [np.cos(0.4), np.sin(0.4)]  # a yaw of 0.1 rad
-    topics = messages(journal.write_episode(tmp_path, episode, spec, {}))
+    topics = messages(journal.Journal(tmp_path, spec, {}).write(episode))
     assert sorted(topics) == ["/action", "/executed_action", "/joint_states", "/scalars", "/tf"]
     assert [time for time, _ in topics["/tf"]] == [0, 50_000_000, 100_000_000]
     _, last = topics["/joint_states"][2]
@@ -184,7 +209,7 @@ from manip_il.mdp import Episode
 spec = schema.RobotTaskSpec("r", "t", 20, ("a", "b"), ("ee.x",), 1, "")
 for seed in range(100_000):
     columns = {schema.ACTION: np.full((50, 2), seed, np.float32), schema.SIM_STATE: np.full((50, 60), seed, np.float64)}
-    journal.write_episode(Path(sys.argv[1]), Episode(seed, columns, True, True), spec, {})
+    journal.Journal(Path(sys.argv[1]), spec, {}).write(Episode(seed, columns, True, True))
     print(seed, flush=True)
 """
 
@@ -200,15 +225,15 @@ def test_a_killed_recorder_loses_no_finished_episode(tmp_path, delay):
         os.kill(process.pid, signal.SIGKILL)
         told = [0, *(int(line) for line in process.stdout.read().split())]
     found = journal.list_episodes(tmp_path)
-    assert [journal.read_episode(path).seed for path in found] == list(range(len(found)))
+    assert [journal.read_journal(path)[1].seed for path in found] == list(range(len(found)))
     assert len(found) >= len(told)
-    journal.clean_temporary(tmp_path)
+    journal.Journal(tmp_path, journal.read_header(found[0]).spec, {}).prepare()
     assert sorted(tmp_path.iterdir()) == found
 
 
-def test_leftovers_are_cleared_and_finished_files_kept(path):
+def test_leftovers_are_cleared_and_finished_files_kept(path, spec):
     leftover = path.with_name(f".{path.name}.x1y2.partial")
     leftover.write_bytes(b"half")
     assert journal.list_episodes(path.parent) == [path]
-    assert journal.clean_temporary(path.parent) == [leftover]
+    assert journal.Journal(path.parent, spec, FINGERPRINT).prepare() == []
     assert list(path.parent.iterdir()) == [path]

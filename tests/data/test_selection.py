@@ -10,8 +10,8 @@ import pytest
 
 from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
-from manip_il.data.episodes import Header, count_labels, first_labels, parts
-from manip_il.data.journal import write_episode
+from manip_il.data.episodes import count_labels, first_labels, parts
+from manip_il.data.journal import Journal
 from manip_il.data.lerobot_read import read_table
 from manip_il.errors import NothingToLearnError
 from manip_il.mdp import Episode
@@ -38,11 +38,12 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
     """The dataset as it is written while rollouts come; their journals beside it."""
     journals, root = folder / "d.journals", folder / "d"
     recording.write(journals)
+    journal = Journal(journals, spec, {})
     for episode in rollouts:
-        write_episode(journals, episode, spec, {})
+        journal.write(episode)
     selection = recording.selection()
     with recording.open(root, spec, {}) as writer:
-        for episode in selection.take((Header.of(episode, spec, {}), episode) for episode in rollouts):
+        for episode in selection.take((journal.header(episode), episode) for episode in rollouts):
             writer.add(episode)
         writer.finish(recording.provenance | selection.provenance)
     return root

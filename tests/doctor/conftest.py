@@ -10,7 +10,7 @@ import pytest
 from manip_il.data import schema as s
 from manip_il.data.build import build
 from manip_il.data.fingerprint import environment_fingerprint
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.mdp import Episode
 
 from ..pictures import numbered_episodes, with_cameras
@@ -21,7 +21,7 @@ __all__ = ["alone", "episodes", "journals", "make_episode", "offline", "root", "
 
 def build_from_journals(folder: Path, episodes: list[Episode], spec: s.RobotTaskSpec) -> Path:
     for episode in episodes:
-        write_episode(folder / "lift.journals", episode, spec, environment_fingerprint(b"", {}))
+        Journal(folder / "lift.journals", spec, environment_fingerprint(b"", {})).write(episode)
     build(folder / "lift.journals", folder / "lift")
     return folder
 

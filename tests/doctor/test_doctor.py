@@ -20,7 +20,7 @@ from manip_il.data import schema as s
 from manip_il.data.atomic import descriptor, try_lock
 from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine, examine_folder, has_errors, verdict
@@ -351,15 +351,15 @@ def test_a_journal_cut_or_changed_anywhere_is_named(root, journals):
 
 
 def test_journals_that_the_dataset_does_not_hold(root, journals, make_episode, spec):
-    write_episode(journals, make_episode(77), spec, FINGERPRINT)
+    Journal(journals, spec, FINGERPRINT).write(make_episode(77))
     (journals / ".episode-000000000078.mcap.x.partial").write_bytes(b"x")
     lacks = "the dataset lacks 1 episode of the journals (seed 77)"
     assert said(root, lacks, ".episode-000000000078.mcap.x.partial", kind="warning")
 
 
 def test_failed_episodes_that_the_recording_leaves_out_are_not_missed(root, journals, make_episode, spec):
-    write_episode(journals, make_episode(77, success=False), spec, FINGERPRINT)
-    write_episode(journals, make_episode(6, 1, success=True), spec, FINGERPRINT)
+    Journal(journals, spec, FINGERPRINT).write(make_episode(77, success=False))
+    Journal(journals, spec, FINGERPRINT).write(make_episode(6, 1, success=True))
     Recording("a/b", only_successes=True).write(journals)
     assert lines(root) == []
 

@@ -14,7 +14,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import exclusive
 from manip_il.data.fingerprint import environment_fingerprint
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.doctor import examine as module
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
@@ -49,7 +49,7 @@ def test_a_second_repair_keeps_a_second_copy(root):
 
 
 def test_episodes_that_only_the_journals_hold_are_added(root, journals, make_episode, spec):
-    write_episode(journals, make_episode(99), spec, FINGERPRINT)
+    Journal(journals, spec, FINGERPRINT).write(make_episode(99))
     mend(root)
     assert json.loads((root / layout.INFO).read_text())["total_episodes"] == 4
     assert lines(root) == []

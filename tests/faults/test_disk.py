@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.data.journal import list_episodes, read_episode
+from manip_il.data.journal import list_episodes, read_journal
 
 from .full_disk import the_error
 from .killed import contents
@@ -90,7 +90,7 @@ def test_a_second_recorder_is_refused_by_the_firsts_process_id(tmp_path):
         first.kill()
         first.wait()
     for path in list_episodes(tmp_path / "demos.journals"):
-        read_episode(path)
+        read_journal(path)
 
 
 def test_a_camera_that_cannot_render_is_one_clear_error_before_anything_is_recorded(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manip_il.data.journal import list_episodes, read_episode
+from manip_il.data.journal import list_episodes, read_journal
 from manip_il.doctor.examine import examine_folder
 from manip_il.doctor.finding import Severity
 
@@ -55,4 +55,4 @@ def test_no_kill_loses_a_finished_episode_or_leaves_a_dataset_that_cannot_be_rea
         assert [one for one in examine_folder(root) if one.severity is Severity.ERROR] == []
         assert sorted(path.name for path in again.folder.iterdir()) == ["demos", "demos.journals", "log"]
     for path in list_episodes(calm.kept):
-        read_episode(path)
+        read_journal(path)

@@ -59,7 +59,7 @@ def make_journals(folder: Path) -> None:
     """`demos.journals`: two episodes and their recording.json."""
     spec, fingerprint = read_spec(SAMPLE), read_fingerprint(SAMPLE)
     for episode, _ in zip(read_episodes(SAMPLE), range(2), strict=False):
-        journal.write_episode(folder / "demos.journals", episode, spec, fingerprint)
+        journal.Journal(folder / "demos.journals", spec, fingerprint).write(episode)
     Recording("local/demos", True, 2, {"driver": "expert"}).write(folder / "demos.journals")
 
 
@@ -77,7 +77,7 @@ def make_pictured_journals(folder: Path) -> None:
         pictures[:] = np.random.default_rng(seed).integers(0, 256, pictures.shape)
         columns[s.SEED][:] = seed
         columns[s.SUCCESS][-1] = columns[s.DONE][-1] = True
-        journal.write_episode(folder / "demos.journals", Episode(seed, columns, True, True), spec, {"mujoco": "3.11.0"})
+        journal.Journal(folder / "demos.journals", spec, {"mujoco": "3.11.0"}).write(Episode(seed, columns, True, True))
     Recording("local/demos", True, 2).write(folder / "demos.journals")
 
 
@@ -140,7 +140,7 @@ def _import(folder: Path) -> None:
     mapping = load_mapping(folder / "mapping.yaml")
     for path in list_files(folder / "in.mcap"):
         episode = read_import(path, mapping)
-        list(frames_of(episode, mapping, features_of(mapping, episode)))
+        list(frames_of(episode, mapping, features_of(episode, mapping)))
 
 
 def damaged_video(rng: Random, data: bytes) -> bytes:

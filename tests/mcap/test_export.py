@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
 
@@ -86,7 +84,7 @@ def lerobot_frame(rng: np.random.Generator, frame: int) -> dict[str, Any]:
 
 def export(root: Path, folder: Path) -> list[Path]:
     folder.mkdir()
-    return list(export_dataset(open_source(root), folder))
+    return list(export_dataset(root, open_source(root), folder))
 
 
 def test_an_export_read_by_mcap_holds_the_datasets_values(ours: Path, tmp_path: Path) -> None:
@@ -115,17 +113,8 @@ def test_an_exports_metadata_says_what_the_dataset_was(ours: Path, tmp_path: Pat
     path = export(ours, tmp_path / "out")[2]
     with path.open("rb") as stream:
         (record,) = make_reader(stream).iter_metadata()
-    info = json.loads((ours / layout.INFO).read_text())
-    kept = {key: feature for key, feature in info["features"].items() if key not in INDEX_FEATURES}
-    assert (record.name, json.loads(record.metadata.pop("features"))) == ("lerobot", kept)
-    assert record.metadata == {
-        "codebase_version": "v3.0",
-        "fps": "20",
-        "robot_type": "panda",
-        "episode_index": "2",
-        "frames": "12",
-        "tasks": '["Lift the cube, 100 %."]',
-    }
+    info = (ours / layout.INFO).read_text()
+    assert (record.name, record.metadata) == ("lerobot", {"info": info, "episode_index": "2"})
 
 
 def test_the_same_dataset_gives_the_same_bytes(ours: Path, tmp_path: Path) -> None:
@@ -158,14 +147,6 @@ def test_a_column_without_a_place_in_mcap_is_refused(
     edit_json(root / layout.INFO, lambda info: info["features"].update(odd=odd))
     with pytest.raises(ManipError, match=f"column 'odd' .*{why}"):
         open_source(root)
-
-
-@pytest.mark.parametrize("numbers", [[[0]], ["0"], [None], [{"a": 1}]])
-def test_tasks_without_numbers_are_refused(ours: Path, tmp_path: Path, numbers: list[Any]) -> None:
-    root = shutil.copytree(ours, tmp_path / "d")
-    pq.write_table(pa.table({layout.TASK_INDEX: numbers, "task": ["Lift."]}), root / layout.TASKS)
-    with pytest.raises(ManipError, match=r"cannot read .*tasks\.parquet: column 'task_index' is .*; expected integers"):
-        export(root, tmp_path / "out")
 
 
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path) -> None:
@@ -209,23 +190,10 @@ def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(lerobots: P
 
 
 @pytest.mark.slow
-def test_a_camera_may_become_a_video(lerobots: Path, tmp_path: Path) -> None:
-    export(lerobots, tmp_path / "out")
-    text = (tmp_path / "out" / MAPPING).read_text()
-    path = tmp_path / "m.yaml"
-    path.write_text(text.replace("side\n    video: false", "side\n    video: true"))
-    mapping = load_mapping(path)
-    assert mapping.cameras["observation.images.side"].video
-    assert len(list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))) == 2
-    assert len(list((tmp_path / "new").rglob("*.mp4"))) == 1
-    assert not (tmp_path / "new" / "images").exists()
-
-
-@pytest.mark.slow
 def test_an_import_that_fails_leaves_nothing(ours: Path, tmp_path: Path) -> None:
     paths = export(ours, tmp_path / "out")
     paths[2].write_bytes(paths[2].read_bytes()[:1000])
     mapping = load_mapping(tmp_path / "out" / MAPPING)
-    with pytest.raises(ManipError, match=r"cannot read .*episode_000002\.mcap"):
+    with pytest.raises(ManipError, match=r"cannot read .*episode_000002\.mcap: .*; expected a complete MCAP file"):
         list(import_files(paths, tmp_path / "new", mapping))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]

@@ -33,4 +33,4 @@ def load(folder: Path, features: Any, **more: Any) -> Mapping:
 
 def imported(path: Path, mapping: Mapping) -> list[dict[str, Any]]:
     episode = read_import(path, mapping)
-    return list(frames_of(episode, mapping, features_of(mapping, episode)))
+    return list(frames_of(episode, mapping, features_of(episode, mapping)))

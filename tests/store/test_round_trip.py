@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.data.build import build
-from manip_il.data.journal import write_episode
+from manip_il.data.journal import Journal
 from manip_il.data.lerobot_layout import TASKS
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
@@ -29,7 +29,7 @@ from .trees import content, impatient, make_run, silent, unwatched
 @pytest.fixture
 def dataset(tmp_path: Path, spec: RobotTaskSpec, make_episode: Callable[..., Episode]) -> Path:
     for seed in (1, 2):
-        write_episode(tmp_path / "d.journals", make_episode(seed), spec, {})
+        Journal(tmp_path / "d.journals", spec, {}).write(make_episode(seed))
     build(tmp_path / "d.journals", tmp_path / "d")
     return tmp_path / "d"
 
