@@ -36,11 +36,11 @@ class McapExportOptions:
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
-        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.dataset import Dataset
         from manip_il.mcap.export import MAPPING, export_dataset, open_source
 
         source = open_source(self.dataset)
-        total = dataset_info(self.dataset).episodes
+        total = Dataset.open(self.dataset).info.episodes
         prepare_output(self.out, resume=False, overwrite=self.overwrite)
         with new_folder(self.out) as folder, progress(total, "export") as bar:
             count = 0

@@ -19,6 +19,7 @@ from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, dataset_sha256, local_id
 from manip_il.data.episodes import Header
 from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import (
     Journal,
     clean_temporary,
@@ -29,7 +30,6 @@ from manip_il.data.journal import (
     read_journal,
     set_aside,
 )
-from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.schema import IMAGES, check_same_spec
 from manip_il.errors import ManipError, MismatchError, OlderSchemaError
 from manip_il.mdp import Episode

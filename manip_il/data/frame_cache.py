@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from manip_il.child_processes import open_pool
 from manip_il.data.atomic import PARTIAL, WriteError, descriptor, new_folder, try_lock
-from manip_il.data.frame_source import FrameSource, Part, find_frames
+from manip_il.data.camera import Camera, Part
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, UsageError
 
 FRAMES = "frames.npy"
@@ -60,10 +61,11 @@ def open_frame_cache(
     another process that builds in `folder`.
 
     Returns None where the pictures would take more than `max_bytes`, alone or with what other processes have open: read
-    them as `LazyFrames` then. Raises what `find_frames` raises, `UsageError` for a folder in the dataset,
+    them by `Camera` then. Raises what `Dataset.camera` raises, `UsageError` for a folder in the dataset,
     `ManipError` where the disk is full or cannot be written.
     """
-    sources = {key: find_frames(root, key) for key in image_keys}
+    dataset = Dataset.open(root)
+    sources = {key: dataset.camera(key) for key in image_keys}
     if sum(source.nbytes for source in sources.values()) > max_bytes:
         return None
     folder = cache_folder() if folder is None else folder
@@ -88,7 +90,7 @@ def open_frame_cache(
     return {key: frames for key, frames in opened.items() if frames is not None}
 
 
-def _open(folder: Path, source: FrameSource) -> Frames | None:
+def _open(folder: Path, source: Camera) -> Frames | None:
     """Map an entry, and count that as its use; None where it is not there."""
     path = folder / source.fingerprint / FRAMES
     try:
@@ -111,9 +113,7 @@ def _open(folder: Path, source: FrameSource) -> Frames | None:
             return None
 
 
-def _build(
-    folder: Path, source: FrameSource, workers: int | None, on_frames: Callable[[int], None] | None
-) -> Frames | None:
+def _build(folder: Path, source: Camera, workers: int | None, on_frames: Callable[[int], None] | None) -> Frames | None:
     with new_folder(folder / source.fingerprint, replace=True) as new:
         write = partial(_write_part, source, new / FRAMES, _reserve(source, new / FRAMES))
         with contextlib.closing(_written(write, source, workers)) as counts:
@@ -122,7 +122,7 @@ def _build(
                     on_frames(count)
         about = {"dataset": str(source.root.resolve()), "camera": source.key, "shape": source.shape}
         (new / ABOUT).write_text(json.dumps(about, indent=4) + "\n", encoding="utf-8")
-        if find_frames(source.root, source.key).fingerprint != source.fingerprint:
+        if Dataset.open(source.root).camera(source.key).fingerprint != source.fingerprint:
             raise ManipError(f"{source.root} changed while it was being read; try again when nothing writes to it")
     return _open(folder, source)
 
@@ -183,7 +183,7 @@ def _unused(path: Path) -> Generator[bool]:
             yield True
 
 
-def _reserve(source: FrameSource, path: Path) -> int:
+def _reserve(source: Camera, path: Path) -> int:
     """Create the file at its full size; return where the pictures start in it.
 
     Writing to a mapped file would end the process where the disk is full; so the room is taken now, and filled by
@@ -197,7 +197,7 @@ def _reserve(source: FrameSource, path: Path) -> int:
         return stream.tell()
 
 
-def _written(write: Callable[[Part], int], source: FrameSource, workers: int | None) -> Generator[int]:
+def _written(write: Callable[[Part], int], source: Camera, workers: int | None) -> Generator[int]:
     """Frames of every part, once it is written."""
     workers = workers or (1 if source.nbytes < _SMALL else len(os.sched_getaffinity(0)))
     if workers == 1:
@@ -214,7 +214,7 @@ def _written(write: Callable[[Part], int], source: FrameSource, workers: int | N
         pool.shutdown(cancel_futures=True)
 
 
-def _write_part(source: FrameSource, path: Path, offset: int, part: Part) -> int:
+def _write_part(source: Camera, path: Path, offset: int, part: Part) -> int:
     """Decode a part into its place; return how many frames it holds."""
     frames = 0
     with descriptor(path, os.O_WRONLY) as handle:

@@ -15,12 +15,12 @@ import numpy as np
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import exclusive, write_file
 from manip_il.data.build import build
+from manip_il.data.gate import check_arrived
 from manip_il.data.info import Feature
-from manip_il.data.lerobot_stats import RunningStats
 from manip_il.data.parquet_files import to_array
+from manip_il.data.statistics import RunningStats
 from manip_il.doctor.cameras import check_pictures, check_videos
 from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.draws import check_draws
 from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
 from manip_il.doctor.leftovers import (
     BESIDE,
@@ -59,7 +59,6 @@ CHECKS: tuple[Check, ...] = (
     check_videos,
     check_pictures,
     check_spec,
-    check_draws,
     check_fingerprint,
     check_stale_files,
     check_leftovers,
@@ -70,8 +69,14 @@ CHECKS: tuple[Check, ...] = (
 def examine(dataset: Dataset, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
     """Yield every finding, as it is found; none for a dataset that is whole.
 
+    Every file is opened in a child process first; if that needs too much memory or time, this is the only finding.
     Raises nothing, whatever the folder holds.
     """
+    try:
+        check_arrived(dataset.root, strict=False)
+    except ManipError as problem:
+        yield error(str(dataset.root), str(problem), Remedy.NONE)
+        return
     for check in checks:
         try:
             yield from check(dataset)

@@ -10,16 +10,16 @@ import numpy as np
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import find_irregular
+from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
-from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature, read_object
-from manip_il.data.lerobot_read import find_irregular
+from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
-from manip_il.doctor.dataset import Dataset, Episodes
+from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, list_first, plural, warning
 from manip_il.errors import ManipError
 
 EPISODES = "meta/episodes"
-_NEEDED = {"spec", "fingerprint", "provenance"}
 _HASH = "_sha256"
 
 
@@ -102,15 +102,16 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
     info = dataset.info
     if info is None:
         return
-    if not dataset.is_ours:
+    try:
+        own = dataset.own
+    except ManipError as problem:
+        yield error(layout.OURS, f"cannot be read: {problem}")
+        return
+    if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= info.features.keys():
             yield warning(layout.OURS, "is missing (LeRobot's tools drop it): the task and the fingerprint are unknown")
         return
-    try:
-        spec = read_spec(dataset)
-    except (OSError, ValueError, TypeError, RecursionError, ManipError) as problem:
-        yield error(layout.OURS, f"cannot be read: {problem}")
-        return
+    spec = own.spec
     for what, said, found in (("fps", spec.fps, info.fps), ("robot_type", spec.lerobot_type, info.robot)):
         if said != found:
             yield error(layout.INFO, f"{what} is {found!r}; {layout.OURS} says {said!r}")
@@ -123,34 +124,21 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
 
 def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
     """Check that the dataset was recorded with the versions that are installed here."""
-    if not dataset.is_ours:
-        return
     try:
-        fingerprint: Any = read_object(dataset.root / layout.OURS).get("fingerprint")
-    except (OSError, ValueError, RecursionError):
+        own = dataset.own
+    except ManipError:
         return  # reported by the check of the spec
-    if not isinstance(fingerprint, dict) or not fingerprint:
+    if own is None:
+        return
+    if not own.fingerprint:
         yield warning(layout.OURS, "has no fingerprint: what the dataset was recorded with is not known")
         return
     theirs, here = (
         {str(key): value for key, value in table.items() if not str(key).endswith(_HASH) and key != "processor"}
-        for table in (cast(dict[Any, Any], fingerprint), environment_fingerprint(b"", {}))
+        for table in (own.fingerprint, environment_fingerprint(b"", {}))
     )  # versions alone: another processor is no fault of a dataset
     for text in compare_fingerprints("the dataset", theirs, "this installation", here):
         yield warning(layout.OURS, text)
-
-
-def read_spec(dataset: Dataset) -> s.RobotTaskSpec:
-    """Read the spec in this program's own file.
-
-    Raises `OSError`, `ValueError`, `TypeError` or `ManipError` for anything else.
-    """
-    ours = read_object(dataset.root / layout.OURS)
-    if missing := _NEEDED - ours.keys():
-        raise ValueError(f"it lacks {list_first(sorted(missing))}")
-    if not isinstance(ours["spec"], dict):
-        raise ValueError(f"its spec is {type(ours['spec']).__name__}; expected an object")
-    return s.RobotTaskSpec.from_json(ours["spec"])
 
 
 def _count_names(names: Any) -> int | None:
@@ -164,7 +152,7 @@ def _count_names(names: Any) -> int | None:
     return None
 
 
-def _check_sequence(episodes: Episodes) -> Iterator[Finding]:
+def _check_sequence(episodes: EpisodeTable) -> Iterator[Finding]:
     ends_before = np.concatenate([[0], episodes.stop[:-1]])
     for name, found, wanted in (
         (layout.EPISODE_INDEX, episodes.index, np.arange(len(episodes))),

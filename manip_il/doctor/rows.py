@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
-from manip_il.data.lerobot_stats import quantile_places
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
-from manip_il.doctor.dataset import Dataset, Episodes
+from manip_il.data.statistics import quantile_places
+from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, error, list_first, plural, warning
 from manip_il.doctor.meta import EPISODES
 from manip_il.doctor.scan import F64, I64, Moments, Runs
@@ -88,7 +89,7 @@ def check_statistics(dataset: Dataset) -> Iterator[Finding]:
         yield from _check_ranks(dataset)
 
 
-def _check_episodes(dataset: Dataset, episodes: Episodes) -> Iterator[Finding]:
+def _check_episodes(dataset: Dataset, episodes: EpisodeTable) -> Iterator[Finding]:
     runs = dataset.scan.runs
     numbers, first, counts = np.unique(runs.episode, return_index=True, return_counts=True)
     if (counts > 1).any():
@@ -107,7 +108,7 @@ def _check_episodes(dataset: Dataset, episodes: Episodes) -> Iterator[Finding]:
     yield from _compare_places(runs, once[mine], episodes, theirs)
 
 
-def _compare_places(runs: Runs, run: I64, episodes: Episodes, row: I64) -> Iterator[Finding]:
+def _compare_places(runs: Runs, run: I64, episodes: EpisodeTable, row: I64) -> Iterator[Finding]:
     for name, found, wanted in (
         ("length", runs.length[run], episodes.length[row]),
         ("dataset_from_index", runs.start[run], episodes.start[row]),

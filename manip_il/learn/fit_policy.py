@@ -25,8 +25,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
+from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_library import Metadata, learn_actions, read_metadata
-from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for, same_width
@@ -288,7 +288,7 @@ def _fit(root: Path | Sequence[Path], config: FitConfig, output_dir: Path, setti
 
 def _convert(dataset: Metadata, conversion: Conversion) -> None:
     """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
-    table = read_tables(dataset.roots, [STATE, ACTION])
+    table = joined_columns(dataset.roots, [STATE, ACTION])
     same_width(table[ACTION], table[STATE], conversion.space)
     learn_actions(dataset, conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
 

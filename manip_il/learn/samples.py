@@ -19,9 +19,9 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
+from manip_il.data.camera import Camera
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.lazy_frames import LazyFrames
-from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
@@ -104,7 +104,7 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class JoinedFrames:
     """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
 
-    def __init__(self, pieces: Sequence[NDArray[np.uint8] | LazyFrames]):
+    def __init__(self, pieces: Sequence[NDArray[np.uint8] | Camera]):
         self._pieces = pieces
         self._ends = np.cumsum([len(piece) for piece in pieces])
 
@@ -209,7 +209,7 @@ def load_samples(
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
     sizes = {key: math.prod(meta.features[key]["shape"]) for key in features}
     in_batch = sum(sizes[key] * _window_length(policy, key) for key in features)  # pictures become floats, too
-    table = read_tables(
+    table = joined_columns(
         roots,
         [*numbers, *_ALWAYS, *label],
         room(
@@ -263,7 +263,7 @@ def _frames(
 
 def read_later(roots: Sequence[Path], cameras: Sequence[str]) -> dict[str, JoinedFrames]:
     """Return the pictures of every camera in all datasets, which are decoded when they are read."""
-    return {camera: JoinedFrames([LazyFrames(root, camera) for root in roots]) for camera in cameras}
+    return {camera: JoinedFrames([Dataset.open(root).camera(camera) for root in roots]) for camera in cameras}
 
 
 def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:

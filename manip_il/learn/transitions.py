@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_read import read_table, read_tables
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, Table, require_finite
@@ -123,7 +123,9 @@ def read_demonstrations(
     says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
     raises.
     """
-    table = read_tables(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
+    table = joined_columns(
+        list(map(Dataset.open, roots)), [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)]
+    )
     require_finite(table, (STATE, ENVIRONMENT_STATE, ACTION))
     pieces = _episodes(table)
     kept = [piece for piece in pieces if _is_demonstration(table, piece)]
@@ -157,5 +159,5 @@ def _is_demonstration(table: Table, piece: slice) -> bool:
 
 def _optional(roots: Sequence[Path]) -> list[str]:
     """The columns beside those of learning that every dataset has."""
-    known = [set(read_table(root, episodes=[0])) for root in roots]
+    known = [set(Dataset.open(root).features) for root in roots]
     return [name for name in _TELLING if all(name in names for names in known)]

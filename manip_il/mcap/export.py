@@ -21,8 +21,8 @@ from manip_il import checks
 from manip_il.data import foxglove
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES
-from manip_il.data.lerobot_read import dataset_info, read_frames, read_instructions, read_table
 from manip_il.data.parquet_files import UNREADABLE, find_shards
 from manip_il.errors import ManipError
 from manip_il.mcap.mapping import TEXT, Camera, Mapping, Values
@@ -60,7 +60,7 @@ class Source:
 
 def open_source(root: Path) -> Source:
     """Open a dataset. Raises `ManipError` for a folder that is none, and for a column that cannot be exported."""
-    dataset_info(root)
+    Dataset.open(root)
     info = checks.read_json(root / layout.INFO, "a LeRobot dataset's description")
     features = {key: feature for key, feature in info["features"].items() if key not in INDEX_FEATURES}
     for key, feature in features.items():
@@ -80,11 +80,12 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
     `read_table` raises.
     """
     columns = [key for key in source.features if key not in source.cameras]
-    table = read_table(source.root, [*columns, layout.EPISODE_INDEX, layout.TASK_INDEX])
+    dataset = Dataset.open(source.root)
+    table = dataset.columns([*columns, layout.EPISODE_INDEX, layout.TASK_INDEX])
     for key in columns:
         require_finite(f"{source.root}, column {key!r}", table[key])
     index, task_index = table.pop(layout.EPISODE_INDEX), table.pop(layout.TASK_INDEX)
-    tasks = _read_tasks(source.root, set(task_index.tolist()))
+    tasks = _read_tasks(dataset, set(task_index.tolist()))
     stored = {
         key: stored_pictures(source.root, key) for key in source.cameras if source.features[key]["dtype"] == "image"
     }
@@ -93,7 +94,7 @@ def export_dataset(source: Source, folder: Path) -> Iterator[Path]:
         episode = int(index[start])
         rows: dict[str, Any] = {key: values[start:stop] for key, values in table.items()}
         rows |= {key: itertools.islice(pictures, stop - start) for key, pictures in stored.items()}
-        rows |= {key: read_frames(source.root, key, episode) for key in source.cameras if key not in stored}
+        rows |= {key: dataset.frames(key, dataset.rows_of(episode)) for key in source.cameras if key not in stored}
         path = folder / f"episode_{episode:06d}.mcap"
         _write(path, source, episode, [tasks[int(task)] for task in task_index[start:stop]], rows)
         yield path
@@ -172,11 +173,11 @@ def _topic(key: str) -> str:
     return "/" + key.replace(".", "/")
 
 
-def _read_tasks(root: Path, wanted: set[int]) -> dict[int, str]:
-    tasks = read_instructions(root)
+def _read_tasks(dataset: Dataset, wanted: set[int]) -> dict[int, str]:
+    tasks = dataset.tasks
     for number in sorted(wanted):
         if not isinstance(tasks.get(number), str):
-            raise ManipError(f"{root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
+            raise ManipError(f"{dataset.root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
     return tasks
 
 

@@ -1,20 +1,27 @@
-"""What a parquet file would have a reader open: the Hugging Face decoders that its metadata names, and its pictures.
+"""The gate for what arrives from outside: every file is opened once in a child process with bounded memory and time.
 
-`datasets` takes the type of a column from the file's metadata and decodes what is in it by that type: audio, PDF, any
-format that Pillow knows, and where a cell has no bytes, what its `path` leads to, an address too.
+A dataset also says what other readers open besides: `datasets` takes the type of a column from a parquet file's
+metadata and decodes what is in it by that type (audio, PDF, any format that Pillow knows), and where a cell has no
+bytes, what its `path` leads to, an address too. Such files are refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
 
+import av
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from manip_il import checks
+from manip_il.data.dataset import find_irregular
+from manip_il.data.info import LARGEST_META, read_object
+from manip_il.data.lerobot_layout import INFO
+from manip_il.data.pictures import open_video
 from manip_il.errors import ManipError
 
 _PICTURE = "Image"
@@ -24,6 +31,56 @@ _PLAIN = (
 )  # types of `datasets` that hold numbers and text as they are stored
 _BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
 _BATCH = 64  # cells held at once
+
+
+def check_arrived(root: Path, *, strict: bool = True) -> None:
+    """Open every file of a dataset in a child process. Raises `ManipError` naming the file that does not pass.
+
+    strict: refuse what is damaged, too; else only what needs too much memory or time or ends the process.
+    """
+    checks.in_child(str(root), open_files, root, strict)
+
+
+def open_files(root: Path, strict: bool = True) -> None:
+    """Open every file of a dataset, in the child process. Raises `ManipError` as `check_arrived` does."""
+    for path in find_irregular(root):
+        raise ManipError(f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links")
+    declared = _declared_pictures(root)
+    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+        checks.opening(str(path))
+        try:
+            open_file(path, declared)
+        except (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError) as error:
+            if strict:
+                named = str(error) if str(path) in str(error) else f"{path}: {error}"
+                raise ManipError(named) from error
+
+
+def open_file(path: Path, declared: Collection[str] = ()) -> None:
+    """Read a file of a dataset to its end, by its suffix. Raises whatever reading it raises.
+
+    declared: the columns that the dataset's description calls pictures.
+    """
+    if path.suffix == ".parquet":
+        check_pictures(path, declared)
+        with pq.ParquetFile(path) as file:
+            for _ in file.iter_batches(_BATCH, use_threads=False):
+                pass
+    elif path.suffix == ".mp4":
+        with closing(open_video(path)) as container:
+            for _ in container.demux(container.streams.video):
+                pass
+    elif path.suffix == ".json":
+        checks.parse_json(str(path), checks.read_bytes(path, "JSON", LARGEST_META), nan_is_none=True)
+
+
+def _declared_pictures(root: Path) -> list[str]:
+    try:
+        features = read_object(root / INFO).get("features")
+    except (OSError, ValueError):
+        return []  # no reader gets to its pictures
+    found = cast(dict[str, Any], features).items() if isinstance(features, dict) else ()
+    return [key for key, one in found if isinstance(one, dict) and one.get("dtype") == "image"]
 
 
 def picture_columns(schema: pa.Schema) -> list[str]:
