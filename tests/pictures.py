@@ -16,9 +16,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from manip_il.data import schema as s
-from manip_il.data.frame_source import find_clips, to_part
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO, VIDEO_PATH
-from manip_il.data.lerobot_read import camera_keys, read_episodes
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
@@ -94,7 +93,7 @@ def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options:
 
 def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
     """A dataset holds these episodes: numbers bit for bit, pictures by the number that they show."""
-    for mine, yours in zip(read_episodes(root), episodes, strict=True):
+    for mine, yours in zip(Dataset.open(root).read_episodes(), episodes, strict=True):
         assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
         assert list(mine.columns) == list(yours.columns)
         for key, values in yours.columns.items():
@@ -108,7 +107,7 @@ def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
 def video_rows(root: Path) -> dict[Path, int]:
     """Every video file of a dataset -> the frames that the rows of `meta/episodes` put into it."""
     rows: Counter[Path] = Counter()
-    for key in camera_keys(root):
+    for key in Dataset.open(root).cameras:
         for clip in find_clips(root, key, 1):
             part = to_part(clip, key, VIDEO_PATH)
             rows[root / part.path] += part.count

@@ -123,9 +123,7 @@ def read_demonstrations(
     says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
     raises.
     """
-    table = joined_columns(
-        list(map(Dataset.open, roots)), [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)]
-    )
+    table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
     require_finite(table, (STATE, ENVIRONMENT_STATE, ACTION))
     pieces = _episodes(table)
     kept = [piece for piece in pieces if _is_demonstration(table, piece)]

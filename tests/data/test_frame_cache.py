@@ -21,7 +21,6 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
 from manip_il.data.frame_cache import ABOUT, FRAMES, cache_folder, open_frame_cache
-from manip_il.data.lerobot_read import read_frames
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
@@ -64,7 +63,7 @@ def test_a_row_is_the_frame_of_its_index_bit_by_bit(root, folder):
     assert shown(frames[FRONT]) == list(range(21))
     assert shown(frames[WRIST]) == list(range(21, 42))
     for key, values in frames.items():
-        decoded = np.concatenate([read_frames(root, key, episode) for episode in range(3)])
+        decoded = np.concatenate([episode_frames(root, key, episode) for episode in range(3)])
         np.testing.assert_array_equal(values, decoded.transpose(0, 3, 1, 2))
         assert (values.shape, values.dtype) == ((21, 3, 72, 96), np.uint8)
         with pytest.raises(ValueError, match="read-only"):

@@ -17,9 +17,8 @@ import datasets
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
-from manip_il.data.lazy_frames import LazyFrames
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import check_all_pictures, check_dataset
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.store.pull import pull
@@ -70,7 +69,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any, opened: list[str], tmp_path: Path):
     set_first(root, cell)
     with pytest.raises(ManipError, match=rf"cannot read the picture {KEY} in frame 0 of .*lift"):
-        _ = LazyFrames(root, KEY)[np.array([0])]
+        _ = Dataset.open(root).camera(KEY)[np.array([0])]
     refused = rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"
     with pytest.raises(ManipError, match=refused):
         merge_datasets([root, root], tmp_path / "two", repo_id="a/b")

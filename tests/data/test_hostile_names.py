@@ -15,7 +15,6 @@ from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, local_id
-from manip_il.data.lerobot_read import camera_keys, dataset_info, read_frames, read_spec
 from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.errors import ManipError, UsageError
@@ -177,7 +176,7 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
 def test_what_info_says_is_checked_by_every_reader(victim, change, words):
     edit_json(victim / layout.INFO, lambda info: info.update(change))
     assert any(words in line for line in lines(victim))
-    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, FRONT, 0)):
+    for read in (dataset_info, camera_keys, open_source, lambda root: episode_frames(root, FRONT, 0)):
         with pytest.raises(ManipError) as error:
             read(victim)
         assert words in str(error.value)
@@ -189,7 +188,7 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
     assert (victim / "videos" / key).resolve() == secret
     edit_json(victim / layout.INFO, lambda info: info["features"].update({key: info["features"].pop(FRONT)}))
     assert any("a feature is '../../secret'" in line for line in lines(victim))
-    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, key, 0)):
+    for read in (dataset_info, camera_keys, open_source, lambda root: episode_frames(root, key, 0)):
         with pytest.raises(ManipError, match=r"a feature is '\.\./\.\./secret'"):
             read(victim)
 

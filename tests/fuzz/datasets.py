@@ -15,7 +15,7 @@ from manip_il.cli.inputs import check_dataset
 from manip_il.data import journal
 from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
-from manip_il.data.lerobot_read import dataset_info, read_episodes, read_fingerprint, read_spec, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.learn.columns import LEARNING_COLUMNS, check_table, learning_rows
 from manip_il.mcap.importing import features_of, frames_of, list_files, read_import
@@ -50,15 +50,15 @@ features:
 
 def make_dataset(folder: Path) -> None:
     """`dataset`, and `dataset.journals` beside it: two episodes of the sample."""
-    episodes = [episode for episode, _ in zip(read_episodes(SAMPLE), range(2), strict=False)]
-    spec, fingerprint = read_spec(SAMPLE), read_fingerprint(SAMPLE)
+    episodes = [episode for episode, _ in zip(Dataset.open(SAMPLE).read_episodes(), range(2), strict=False)]
+    spec, fingerprint = Dataset.open(SAMPLE).spec, Dataset.open(SAMPLE).fingerprint
     write_dataset(episodes, folder / "dataset", spec, repo_id="local/sample", fingerprint=fingerprint)
 
 
 def make_journals(folder: Path) -> None:
     """`demos.journals`: two episodes and their recording.json."""
-    spec, fingerprint = read_spec(SAMPLE), read_fingerprint(SAMPLE)
-    for episode, _ in zip(read_episodes(SAMPLE), range(2), strict=False):
+    spec, fingerprint = Dataset.open(SAMPLE).spec, Dataset.open(SAMPLE).fingerprint
+    for episode, _ in zip(Dataset.open(SAMPLE).read_episodes(), range(2), strict=False):
         journal.write_episode(folder / "demos.journals", episode, spec, fingerprint)
     Recording("local/demos", True, 2, {"driver": "expert"}).write(folder / "demos.journals")
 
@@ -107,13 +107,13 @@ def make_mcap(folder: Path) -> None:
 
 
 def _open(folder: Path) -> None:
-    dataset_info(folder / "dataset")
-    read_spec(folder / "dataset")
-    read_table(folder / "dataset")
+    Dataset.open(folder / "dataset").summary
+    Dataset.open(folder / "dataset").spec
+    Dataset.open(folder / "dataset").columns()
 
 
 def _episodes(folder: Path) -> None:
-    list(read_episodes(folder / "dataset"))
+    list(Dataset.open(folder / "dataset").read_episodes())
 
 
 def _card(folder: Path) -> None:
@@ -123,9 +123,9 @@ def _card(folder: Path) -> None:
 def _learn(folder: Path) -> None:
     """What `train` does with a dataset before it fits."""
     root = folder / "dataset"
-    spec = read_spec(root)
-    check_dataset(root, spec, read_fingerprint(root))
-    table = read_table(root, (*LEARNING_COLUMNS, "frame_index"))
+    spec = Dataset.open(root).spec
+    check_dataset(root, spec, Dataset.open(root).fingerprint)
+    table = Dataset.open(root).columns((*LEARNING_COLUMNS, "frame_index"))
     check_table(table, spec)
     learning_rows(table)
 

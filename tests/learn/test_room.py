@@ -12,7 +12,7 @@ import pytest
 
 from manip_il.data import arrays
 from manip_il.data.arrays import on_disk
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.dataset import joined_columns
 from manip_il.data.schema import ACTION
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn import room as rooms
@@ -79,7 +79,7 @@ def test_a_policy_of_lerobots_is_the_same_from_files(dataset, spec, tmp_path, in
 
 
 def test_columns_are_the_same_in_files(dataset, tmp_path):
-    tables = [read_tables([dataset.root] * 2, LEARNING_COLUMNS, *how) for how in ((), (on_disk(tmp_path),))]
+    tables = [joined_columns([dataset.root] * 2, LEARNING_COLUMNS, *how) for how in ((), (on_disk(tmp_path),))]
     for key, column in tables[0].items():
         assert np.array_equal(column, tables[1][key])
         assert column.dtype == tables[1][key].dtype
