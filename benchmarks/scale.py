@@ -120,7 +120,9 @@ def measure(root: Path, count: int, before: int) -> Row:
 def others(root: Path) -> dict[str, Run]:
     """Measure the commands that only read a dataset."""
     away, back = root.with_name("remote"), root.with_name("back")
-    info = f"from pathlib import Path;     runs = {
+    opened = f"Dataset.open(Path({str(root)!r})).summary"
+    info = f"from pathlib import Path; from manip_il.data.dataset import Dataset; {opened}"
+    runs = {
         "doctor": manip_il("doctor", str(root)),
         "info": measured([sys.executable, "-c", info]),
         "train": manip_il("train", f"--dataset.root={root}", "--steps=1", f"--output_dir={root.with_name('run')}"),

@@ -14,8 +14,8 @@ from manip_il.option import option
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from manip_il.doctor.dataset import Dataset
     from manip_il.doctor.finding import Finding
+    from manip_il.doctor.patient import Patient
 
 _MODEL = "model_sha256"
 
@@ -56,21 +56,21 @@ class DoctorOptions:
         if dataset.episodes and (drawn := summarise_drawn(dataset.episodes.drawn.values())):
             say(f"its episodes draw {drawn}")
 
-    def _examine(self) -> tuple[Dataset, list[Finding]]:
-        from manip_il.doctor.dataset import Dataset
+    def _examine(self) -> tuple[Patient, list[Finding]]:
         from manip_il.doctor.examine import CHECKS, examine
+        from manip_il.doctor.patient import Patient
 
         findings: list[Finding] = []
         with progress(None, "files examined") as bar:
             named = self.dataset.name not in ("", "..")  # journals and copies beside it are named after it
-            dataset = Dataset(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
+            dataset = Patient(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
             for finding in examine(dataset, (*CHECKS, check_robot)):
                 say(str(finding))
                 findings.append(finding)
         return dataset, findings
 
 
-def check_robot(dataset: Dataset) -> Iterator[Finding]:
+def check_robot(dataset: Patient) -> Iterator[Finding]:
     """Compare joints, state and compiled model with those of the robot and task in this program."""
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS

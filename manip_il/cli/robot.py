@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from manip_il import checks
 from manip_il.cli.inputs import require_folder
 from manip_il.cli.options import command_line, to_plain
 from manip_il.cli.outputs import open_output, require_new
-from manip_il.cli.progress import progress, say, warn
+from manip_il.cli.progress import progress, say
 from manip_il.cli.trials import read_condition
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.option import option
@@ -29,7 +31,8 @@ class RobotNewOptions:
     """Write a first YAML for an arm's MJCF: hand, fingers and workspace as they look on the model.
 
     Every line says what it means. What is found beyond that (joints, home, gains, the hand's frame) stands below as
-    comments, to be said otherwise.
+    comments, to be said otherwise. Then checks the robot, as `robot check --episodes=0` does, and says what to change.
+    Exits with 1 if it can do no task yet.
     """
 
     example: ClassVar[str] = "manip-il robot new my_arm.xml --output=my_arm.yaml"
@@ -46,29 +49,53 @@ class RobotNewOptions:
         target = self._target()
         if target.suffix not in SUFFIXES:
             raise UsageError(f"--output is {target}; expected a file, NAME.yaml")
+        checks.name(f"the name of {target}, which will be the robot's,", target.stem)
         require_folder(target.parent, f"the folder of {target}")
         if target.exists() and not self.overwrite:
             raise UsageError(f"{target} exists already; choose another --output, or give --overwrite")
 
     def run(self) -> None:
-        """Write the YAML, and say what to do with it."""
-        from manip_il.robots.robot import Robot
+        """Write the YAML, check the robot, and say what is left to do. Raises `ManipError` if it can do nothing yet."""
+        from manip_il.data.atomic import write_file
+        from manip_il.evaluation.robot_check.advice import advice
+        from manip_il.evaluation.robot_check.page import verdict
+        from manip_il.robots.robot import get_robot
         from manip_il.robots.suggest import found_lines, suggest, yaml_of
 
         target = self._target()
         paths = [os.path.relpath(path, target.parent) if path else "" for path in (self.model, self.gripper)]
-        text = yaml_of(suggest(self.model, self.gripper), *paths)
-        target.write_text(text, encoding="utf-8")
+        found = suggest(self.model, self.gripper)
+        text = yaml_of(found, *paths)
+        for doubt in found.doubts:
+            say(f"look: {doubt}")
+        write_file(target, text.encode())
         try:
-            target.write_text(text + found_lines(Robot.read(target)), encoding="utf-8")
+            write_file(target, (text + found_lines(get_robot(str(target)))).encode())
+            checked = _measure(str(target), list(NAMES), 0)
         except ManipError as error:
-            warn(str(error))
-            say(f"wrote {target}; mend that, then look at the robot: manip-il view --robot.type={target}")
-            return
-        say(f"wrote {target}; look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
+            raise ManipError(f"wrote {target}, which cannot be used yet: {error}") from None
+        except BaseException:
+            target.unlink(missing_ok=True)
+            raise
+        say(f"wrote {target}. {verdict(checked)}")
+        for line in advice(checked):
+            say(f"change: {line}")
+        if len(checked.failed) == len(NAMES):
+            raise ManipError(f"wrote {target}, with which no task can be done yet; see above")
+        say(f"look at the robot: manip-il view --robot.type={target} --task.type=pick_place")
 
     def _target(self) -> Path:
         return self.output or self.model.with_suffix(".yaml")
+
+
+def _measure(
+    robot: str, tasks: Sequence[str], episodes: int, on_result: Callable[[object], object] = lambda _: None
+) -> RobotCheck:
+    from manip_il.collect.workers import Engine
+    from manip_il.evaluation.robot_check.check import check_robot
+
+    with Engine(None) as engine:
+        return check_robot(robot, tasks, episodes, read_condition(_NOISE), engine, on_result)
 
 
 @dataclass
@@ -104,15 +131,13 @@ class RobotCheckOptions:
 
     def run(self) -> None:
         """Measure, print the tables, write the page. Raises `ManipError` where a task cannot be done."""
-        from manip_il.collect.workers import Engine
-        from manip_il.evaluation.robot_check.check import FILE_NAME, check_robot
+        from manip_il.evaluation.robot_check.check import FILE_NAME
         from manip_il.evaluation.robot_check.page import check_report
 
         tasks = list(dict.fromkeys(self.tasks)) or list(NAMES)
         with open_output(self) as folder:
-            with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar, Engine(None) as engine:
-                noise = read_condition(_NOISE)
-                found = check_robot(self.robot, tasks, self.episodes, noise, engine, lambda _: bar.advance())
+            with progress(2 * self.episodes * len(tasks), f"check {self.robot}") as bar:
+                found = _measure(self.robot, tasks, self.episodes, lambda _: bar.advance())
             found.write(folder / FILE_NAME)
             report = check_report(found, command_line("robot check", self), to_plain(self))
             report.write(folder / PAGE)

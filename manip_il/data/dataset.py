@@ -105,7 +105,7 @@ class Dataset:
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """Where the episodes came from; empty in a dataset of another program."""
+        """Origin of the episodes; empty in a dataset of another program."""
         return self.own.provenance if self.own else {}
 
     @cached_property
@@ -185,7 +185,7 @@ class Dataset:
         return {name: self._numpy(table, name) for name in wanted}
 
     def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the columns of one data file after the other. Raises what `columns` raises."""
+        """Yield the columns, (T,) or (T, d), of one data file after the other. Raises what `columns` raises."""
         wanted = self._known(names)
         for path in self.data_files:
             table = read_file(path, wanted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import shutil
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, override
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
@@ -21,9 +23,11 @@ from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 
 from manip_il import checks
+from manip_il.data.atomic import PARTIAL, writing
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import open_files
-from manip_il.data.lerobot_layout import TASK_INDEX
+from manip_il.data.info import read_info, read_object
+from manip_il.data.lerobot_layout import DATA_FILES, STATS, TASK_INDEX, TASKS, write_json
 from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError
@@ -66,6 +70,7 @@ def write_with_library(
         raise
     dataset.finalize()
     shutil.rmtree(root / "images", ignore_errors=True)  # empty folders: the pictures are in the data by now
+    _remove_chance(root)
 
 
 def _save(dataset: LeRobotDataset) -> None:
@@ -89,16 +94,35 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
         open_files(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # its progress bars
+        with writing(root), contextlib.redirect_stderr(io.StringIO()):  # its progress bars
             aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
+            _remove_chance(root)
+    except ManipError:
+        raise
     except Exception as error:  # of every kind: it takes what the files say
-        if isinstance(error, OSError) and error.filename:  # the disk's refusal names its file
-            raise
         told = checks.shorten(" ".join(str(error).split()))
         joined = ", ".join(map(str, roots))
         raise ManipError(
             f"LeRobot cannot join {joined} ({type(error).__name__}: {told}); see `manip-il doctor`"
         ) from error
+
+
+def _remove_chance(root: Path) -> None:
+    """Order the statistics, which LeRobot leaves in a set's order, and drop the random fingerprint of data files."""
+    stats = read_object(root / STATS)
+    write_json(root / STATS, {key: stats[key] for key in read_info(root).features if key in stats})
+    for path in sorted(root.glob(DATA_FILES)):
+        with pq.ParquetFile(path) as file:
+            schema = file.schema_arrow
+            about = json.loads((schema.metadata or {}).get(b"huggingface", b"{}"))
+            if about.pop("fingerprint", None) is None:
+                continue
+            named = schema.with_metadata({**(schema.metadata or {}), b"huggingface": json.dumps(about).encode()})
+            new = path.with_suffix(PARTIAL)
+            with pq.ParquetWriter(new, named, compression="snappy", use_dictionary=True) as writer:  # as LeRobot's
+                for group in range(file.num_row_groups):
+                    writer.write_table(file.read_row_group(group).cast(named))
+        new.replace(path)
 
 
 class Metadata(LeRobotDatasetMetadata):
@@ -119,10 +143,13 @@ class Metadata(LeRobotDatasetMetadata):
         """Read the files with this program's readers: LeRobot's decode what the files' own metadata asks for."""
         dataset = Dataset.open(self.root)
         self.info = load_info(self.root)
-        tasks = sorted(dataset.tasks.items())
-        self.tasks = pd.DataFrame(
-            {TASK_INDEX: [number for number, _ in tasks]}, index=pd.Index([text for _, text in tasks], name="task")
-        )
+        texts = dataset.tasks
+        if sorted(texts) != list(range(len(texts))):
+            found = checks.shorten(sorted(texts))
+            raise ManipError(
+                f"{self.root / TASKS}: task_index holds {found}; expected 0 to {len(texts) - 1}, each once"
+            )
+        self.tasks = _tasks([texts[number] for number in range(len(texts))])
         self.episodes = None  # nobody asks for them
         self.stats = dataset.statistics
         self.info.features = {
@@ -132,10 +159,14 @@ class Metadata(LeRobotDatasetMetadata):
         }
 
     def joint_tasks(self, own: I64) -> I64:
-        """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,)."""
-        if len(self.roots) == 1:
-            return own
+        """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,).
+
+        Raises `ManipError` for a number without a text.
+        """
         pieces = np.split(own, np.cumsum(self.frames)[:-1])
+        for root, numbers, piece in zip(self.roots, self.task_numbers, pieces, strict=True):
+            if len(unknown := piece[(piece < 0) | (piece >= len(numbers))]):
+                raise ManipError(f"{root}: rows have the task {unknown[0]}, which {TASKS} does not hold")
         return np.concatenate([numbers[piece] for numbers, piece in zip(self.task_numbers, pieces, strict=True)])
 
 
@@ -159,8 +190,8 @@ def read_metadata(*roots: Path) -> Metadata:
     first.roots = roots
     first.frames = tuple(meta.total_frames for meta in metas)
     first.episodes_of = tuple(meta.total_episodes for meta in metas)
+    _join_tasks(first, metas)
     if len(metas) > 1:
-        _join_tasks(first, metas)
         alike = {key for key in first.features if all(_shape(meta, key) == _shape(first, key) for meta in metas)}
         first.info.features = {key: value for key, value in first.features.items() if key in alike}
     stats: list[dict[str, Any]] = [meta.stats or {} for meta in metas]
@@ -197,7 +228,12 @@ def _join_tasks(first: Metadata, metas: Sequence[Metadata]) -> None:
     own = [_instructions(meta) for meta in metas]
     joint = {text: number for number, text in enumerate(dict.fromkeys(text for texts in own for text in texts))}
     first.task_numbers = tuple(np.array([joint[text] for text in texts], np.int64) for texts in own)
-    first.tasks = first.tasks.reindex(list(joint)).assign(task_index=list(joint.values()))
+    first.tasks = _tasks(list(joint))
+
+
+def _tasks(texts: Sequence[str]) -> pd.DataFrame:
+    """Tasks as LeRobot has them, numbered in this order."""
+    return pd.DataFrame({TASK_INDEX: range(len(texts))}, index=pd.Index(texts, name="task"))
 
 
 def _instructions(meta: Metadata) -> list[str]:

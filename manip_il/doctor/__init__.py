@@ -12,9 +12,9 @@ Everything is examined: `meta/info.json`, tasks, the list of episodes, parquet f
 index columns and numbers, `meta/stats.json`, every video frame and picture, leftovers of killed programs, journals
 beside the dataset, and, in datasets of this program, the spec and the fingerprint.
 
-The doctor shares what reads files (`data.parquet_files`, `data.info`, `data.episode_table`) with `data.dataset`, but not
-that class itself: it stops at the first damage, the doctor reads on.
+The doctor shares what reads files (`data.parquet_files`, `data.info`, `data.episode_table`) with `data.dataset`, but
+not that class itself: it stops at the first damage, the doctor reads on.
 
-`examine.py` is the list of checks and the repair, `dataset.py` what all checks read, `scan.py` the one pass over the
+`examine.py` is the list of checks and the repair, `patient.py` what all checks read, `scan.py` the one pass over the
 data files, `finding.py` what is reported; the other files are the checks.
 """

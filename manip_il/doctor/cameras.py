@@ -17,8 +17,8 @@ from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import Feature, Info
 from manip_il.data.parquet_files import UNREADABLE, Shard
 from manip_il.data.pictures import open_picture, open_video
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, list_first, plural
+from manip_il.doctor.patient import Patient
 from manip_il.doctor.scan import F64, I64
 
 _TOLERANCE = 1e-4  # LeRobot's reader refuses a frame that is further from its row [s]
@@ -39,7 +39,7 @@ class Film:
     levels: list[F64] = field(default_factory=list[F64])  # mean of R, G and B of sampled frames, in [0, 1]
 
 
-def check_videos(dataset: Dataset) -> Iterator[Finding]:
+def check_videos(dataset: Patient) -> Iterator[Finding]:
     """Decode every frame of every video that episodes name, and compare with their rows."""
     info, episodes = dataset.info, dataset.episodes
     if info is None or episodes is None:
@@ -62,7 +62,7 @@ def check_videos(dataset: Dataset) -> Iterator[Finding]:
         yield from _check_brightness(dataset, feature, levels)
 
 
-def check_pictures(dataset: Dataset) -> Iterator[Finding]:
+def check_pictures(dataset: Patient) -> Iterator[Finding]:
     """Decode every picture that is in a data file."""
     if dataset.info is None:
         return
@@ -189,7 +189,7 @@ def _mean_level(picture: NDArray[np.generic]) -> F64:
     return picture.reshape(-1, 3).mean(axis=0) / 255
 
 
-def _check_brightness(dataset: Dataset, feature: Feature, levels: list[F64]) -> Iterator[Finding]:
+def _check_brightness(dataset: Patient, feature: Feature, levels: list[F64]) -> Iterator[Finding]:
     """Check that the stored mean is about the pictures', and between the stored minimum and maximum."""
     stats = dataset.stats
     if stats is None or not isinstance(stats.get(feature.key), dict) or feature.details.get("is_depth_map"):

@@ -15,15 +15,15 @@ from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
 from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, error, list_first, plural, warning
+from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError
 
 EPISODES = "meta/episodes"
 _HASH = "_sha256"
 
 
-def check_info(dataset: Dataset) -> Iterator[Finding]:
+def check_info(dataset: Patient) -> Iterator[Finding]:
     """Check that `meta/info.json` can be used, has the columns of every dataset, and as many names as numbers."""
     for text in dataset.info_problems:
         yield error(layout.INFO, text)
@@ -39,14 +39,14 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
             yield error(f"{layout.INFO}: {key}", f"{count} names for shape {list(feature.shape)}; expected {wanted}")
 
 
-def check_regular(dataset: Dataset) -> Iterator[Finding]:
+def check_regular(dataset: Patient) -> Iterator[Finding]:
     """Check that the folder holds files and folders alone: a reader of a pipe waits, a device has no end."""
     for path in find_irregular(dataset.root):
         place = path.relative_to(dataset.root).as_posix()
         yield error(place, "is not a regular file, but a pipe, device, socket or broken link")
 
 
-def check_footers(dataset: Dataset) -> Iterator[Finding]:
+def check_footers(dataset: Patient) -> Iterator[Finding]:
     """Check that parquet files of data and of episodes are there and have readable footers."""
     info = dataset.info
     for pattern, shards in ((layout.DATA_FILES, dataset.data_shards), (layout.EPISODES_FILES, dataset.episode_shards)):
@@ -57,7 +57,7 @@ def check_footers(dataset: Dataset) -> Iterator[Finding]:
                 yield error(shard.name, shard.problem)
 
 
-def check_episodes(dataset: Dataset) -> Iterator[Finding]:
+def check_episodes(dataset: Patient) -> Iterator[Finding]:
     """Check that episodes count from 0, that each begins where the one before ends, and info.json's totals."""
     yield from dataset.episode_findings
     info, episodes = dataset.info, dataset.episodes
@@ -74,7 +74,7 @@ def check_episodes(dataset: Dataset) -> Iterator[Finding]:
             yield error(layout.INFO, f"total_{what} is {counted:,}; {EPISODES} holds {found:,}")
 
 
-def check_tasks(dataset: Dataset) -> Iterator[Finding]:
+def check_tasks(dataset: Patient) -> Iterator[Finding]:
     """Check that `meta/tasks.parquet` numbers the tasks, and that episodes name no other."""
     info = dataset.info
     if info is None or (info.episodes == 0 and not (dataset.root / layout.TASKS).exists()):
@@ -97,7 +97,7 @@ def check_tasks(dataset: Dataset) -> Iterator[Finding]:
         yield error(EPISODES, f"names the task {found}, which {layout.TASKS} does not hold")
 
 
-def check_spec(dataset: Dataset) -> Iterator[Finding]:
+def check_spec(dataset: Patient) -> Iterator[Finding]:
     """Check that columns, names and rate are those of the robot and task in this program's own file."""
     info = dataset.info
     if info is None:
@@ -122,7 +122,7 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
         yield warning(layout.INFO, f"has {list_first(extra)} beside the columns of {spec.robot} {spec.task}")
 
 
-def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
+def check_fingerprint(dataset: Patient) -> Iterator[Finding]:
     """Check that the dataset was recorded with the versions that are installed here."""
     try:
         own = dataset.own

@@ -120,7 +120,7 @@ def read_demonstrations(
     """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
 
     Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
-    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
+    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `joined_columns`
     raises.
     """
     table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])

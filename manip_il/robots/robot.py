@@ -95,7 +95,8 @@ class Robot:
             return cls(**said)
         except ValueError as error:  # MuJoCo's, of a model that it reads and does not compile
             why = " ".join(str(error).split())
-            raise UsageError(f"{path}: MuJoCo cannot compile {said['files'].model}: {why}") from None
+            what = "a name is not UTF-8 in" if isinstance(error, UnicodeDecodeError) else "MuJoCo cannot compile"
+            raise UsageError(f"{path}: {what} {said['files'].model}: {why}") from None
         except ManipError as error:
             named = str(path) in str(error) or f"robot {path.stem}" in str(error)
             raise UsageError(str(error) if named else f"{path}: {error}") from None

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import yaml
 
 from manip_il.errors import UsageError
 from manip_il.robots.files import ModelFiles, try_models
@@ -23,6 +26,7 @@ _JAWS = ("jaw", "finger", "grip", "claw")  # in the name of a single one's body 
 _HANDS = ("hand", "flange", "attachment", "tool", "gripper", "ee", "tcp")  # in the name of a body that carries one
 _REACHES, _HALF = 0.5, 0.18  # of the workspace's centre and half width, in lengths of the arm
 _WIDEST, _HIGHEST = 0.15, 0.45  # of a workspace: half its width, its height [m]
+_HARDLY = math.radians(2 * math.pi)  # no joint of a model turns farther: its angles may be radians [rad]
 _ROUND = 0.01  # what lengths are rounded to [m]
 
 
@@ -30,7 +34,8 @@ _ROUND = 0.01  # what lengths are rounded to [m]
 class Suggestion:
     """Words of a robot's YAML as they look on the model; names are those of the gripper's model.
 
-    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m].
+    closed, open: of the driven joints [m] or [rad]. centre, half_width, height: of the workspace [m]. doubts: what may
+    be meant otherwise, a sentence each.
     """
 
     hand: str
@@ -41,6 +46,7 @@ class Suggestion:
     centre: tuple[float, float]
     half_width: float
     height: float
+    doubts: tuple[str, ...] = ()
 
 
 def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
@@ -57,7 +63,9 @@ def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
     else:
         hand, (palm, jaws) = _flange(spec.worldbody), _palm(with_jaws, gripper)
     driven = _driven(with_jaws, jaws, gripper or model)
-    closed, opened, fingers = _ends(with_jaws, palm, jaws, driven)
+    closed, opened, fingers, others = _ends(with_jaws, palm, jaws, driven)
+    if not all((hand.name, palm.name, *fingers)):
+        raise UsageError(f"{gripper or model}: its hand or a finger is a body without a name; name it in the model")
     length, base = _length(spec, hand.name)
     return Suggestion(
         hand.name,
@@ -68,7 +76,18 @@ def suggest(model: Path, gripper: Path | None = None) -> Suggestion:
         (_rounded(base[0] + _REACHES * length), _rounded(base[1])),
         _rounded(min(_WIDEST, _HALF * length)),
         _rounded(min(_HIGHEST, 3 * _HALF * length)),
+        (*_doubted_angles(model, spec), *(_doubted_angles(gripper, with_jaws) if gripper else ()), *others),
     )
+
+
+def _doubted_angles(path: Path, spec: mujoco.MjSpec) -> Iterator[str]:
+    """Say so if every joint that turns hardly turns: radians without a word are read as degrees."""
+    ends = [abs(end) for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE for end in joint.range]
+    if 0 < max(ends, default=0) < _HARDLY:
+        yield (
+            f"{path.name} turns no joint by more than {math.degrees(max(ends)):.2g} degrees: if its angles are radians "
+            'give it <compiler angle="radian"/>, with mend if the file is somebody else\'s (docs/robots.md)'
+        )
 
 
 def _moves(body: Any) -> bool:
@@ -131,8 +150,11 @@ def _driven(spec: mujoco.MjSpec, jaws: Sequence[Any], path: Path) -> list[Any]:
 
 def _ends(
     spec: mujoco.MjSpec, palm: Any, jaws: Sequence[Any], driven: Sequence[Any]
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet."""
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...], list[str]]:
+    """Find where each driven joint is closed and open, by how far the fingers are apart, and the bodies that meet.
+
+    Last comes a sentence about each finger that is left out.
+    """
     moving = [
         jaw.name
         for jaw in jaws
@@ -142,14 +164,16 @@ def _ends(
     ranges = [tuple(float(end) for end in joint.range) for joint in driven]
     model = spec.compile()
     data, fingers = mujoco.MjData(model), finger_geoms(model, bodies)
+    opposed = [[one, *(other for other in fingers if other is not one)] for one in fingers]
 
     def gap(values: Sequence[float]) -> float:
         for joint, value in zip(driven, values, strict=True):
             data.joint(joint.name).qpos[0] = value
         mujoco.mj_kinematics(model, data)
-        ends = nearest(model, data, fingers)[1]
-        centres = [np.mean([data.geom_xpos[geom] for geom in finger], axis=0) for finger in fingers]
-        return float(np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(centres[1] - centres[0]))
+        ends = np.array([nearest(model, data, groups)[1] for groups in opposed])
+        centres = np.array([np.mean(data.geom_xpos[list(finger)], axis=0) for finger in fingers])
+        apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()
+        return float(apart + np.linalg.norm(centres - centres.mean(axis=0), axis=1).sum())
 
     middle = [sum(ends) / 2 for ends in ranges]
     opened, closed = list(middle), list(middle)
@@ -159,7 +183,13 @@ def _ends(
     gap(closed)
     pads = nearest(model, data, fingers)[0]
     touching = tuple(model.body(model.geom_bodyid[pad]).name for pad in pads)
-    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies)
+    others = [
+        f"gripper.fingers names {' and '.join(touching)}, the two that come nearest to each other; the finger "
+        f"{bodies[place] or place} moves, too: name it there if all close on one place"
+        for place, finger in enumerate(fingers)
+        if not {*pads} & {*finger}
+    ]
+    return tuple(closed), tuple(opened), touching if len(moving) > 1 else tuple(bodies), others
 
 
 def _length(spec: mujoco.MjSpec, hand: str) -> tuple[float, tuple[float, float]]:
@@ -182,38 +212,49 @@ def _rounded(length: float) -> float:
 
 def yaml_of(found: Suggestion, model: str, gripper: str = "") -> str:
     """Return the YAML of a suggestion, each line with what it means. model, gripper: paths as the YAML has them."""
-    own = f"  model: {gripper} # a gripper with a model of its own, put onto the hand\n" if gripper else ""
-    unit = "# where they are then: [m] where they slide, [rad] where they turn"
+    unit = "where they are then: [m] where they slide, [rad] where they turn"
+    own = [_line("model", gripper, "a gripper with a model of its own, put onto the hand")] if gripper else []
+    hand = [
+        *own,
+        _line("joints", found.joints, "what drives the fingers"),
+        _line("closed", found.closed, unit),
+        _line("open", found.open, unit),
+        _line("fingers", found.fingers, "bodies that touch things"),
+    ]
+    space = [
+        _line("centre", found.centre, "on the table, x away from the base"),
+        _line("half_width", found.half_width),
+        _line("height", found.height),
+    ]
     return f"""\
 # A first YAML, from what the model shows. Look it over, then: manip-il view --robot.type=THIS_FILE (docs/robots.md)
-model: {model}
-hand: {found.hand} # body that carries the gripper
-gripper:
-{own}  joints: {_listed(found.joints)} # what drives the fingers
-  closed: {_listed(found.closed)} {unit}
-  open: {_listed(found.open)}
-  fingers: {_listed(found.fingers)} # bodies that touch things
-workspace: # [m]
-  centre: {_listed(found.centre)} # on the table, x away from the base
-  half_width: {found.half_width:g}
-  height: {found.height:g}
-"""
+{_line("model", model)}{_line("hand", found.hand, "body that carries the gripper")}gripper:
+{textwrap.indent("".join(hand), "  ")}workspace: # [m]
+{textwrap.indent("".join(space), "  ")}"""
 
 
-def _listed(values: Sequence[Any]) -> str:
-    return f"[{', '.join(f'{one:.5g}' if isinstance(one, float) else str(one) for one in values)}]"
+def _line(key: str, value: Any, note: str = "") -> str:
+    """`key: value # note` in YAML, numbers to five digits."""
+    text = yaml.safe_dump({key: _plain(value)}, default_flow_style=True, width=math.inf, sort_keys=False)
+    return f"{text.strip()[1:-1]}{f' # {note}' if note else ''}\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    return float(f"{value:.5g}") + 0.0 if isinstance(value, float) else value  # no -0
 
 
 def found_lines(robot: Robot) -> str:
     """Return what was found on the model as lines of YAML that say nothing until their `#` is taken away."""
-    ee = robot.ee
-    frame = f"position: {_listed(ee.position)}, quaternion: {_listed(ee.quaternion)}, lowest: {ee.lowest:g}"
-    return f"""\
-# Found on the model; what is said instead holds.
-# joints: {_listed(robot.joints)} # base to hand
-# home: {_listed(robot.home)} # hand down, over the workspace [rad]
-# gains: {_listed(robot.gains)} # kp of position control [N m/rad]
-# forces: {_listed(robot.forces)} # greatest torques [N m]
-# armature: {_listed(robot.armature)} # [kg m^2]
-# ee: {{body: {ee.body}, {frame}}} # [m], wxyz
-"""
+    lines = [
+        _line("joints", robot.joints, "base to hand"),
+        _line("home", robot.home, "hand down, over the workspace [rad]"),
+        _line("gains", robot.gains, "kp of position control [N m/rad]"),
+        _line("forces", robot.forces, "greatest torques [N m]"),
+        _line("armature", robot.armature, "[kg m^2]"),
+        _line("ee", vars(robot.ee), "[m], wxyz"),
+    ]
+    return "# Found on the model; what is said instead holds.\n" + textwrap.indent("".join(lines), "# ", lambda _: True)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.errors import UsageError
+from manip_il.robots.parts import GRIPPER
 from manip_il.robots.robot import Robot
 
 _DEEP = 1e-3  # parts that overlap by less touch at most [m]
@@ -58,9 +59,11 @@ def require_free_home(robot: Robot, model: mujoco.MjModel, prefix: str) -> None:
     always = {pair for pair in meeting_at(robot, model, prefix, np.zeros(len(robot.joints))) if bodies.issuperset(pair)}
     for (one, other), depth in sorted(meeting.items(), key=lambda item: -item[1]):
         if (one, other) not in always:
+            mounted = one.startswith(GRIPPER) != other.startswith(GRIPPER)
+            mount = ", gripper.position or gripper.quaternion" if mounted else ""
             raise UsageError(
                 f"robot {robot.name}: at home {one!r} and {other!r} overlap by {1000 * depth:.0f} mm; choose another "
-                "home, or leave it out, then it is found; or mend base or workspace.centre"
+                f"home, or leave it out, then it is found; or mend base or workspace.centre{mount}"
             )
 
 

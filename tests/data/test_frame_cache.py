@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from manip_il.data import frame_source
+from manip_il.data import camera
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.atomic import PARTIAL
@@ -25,7 +25,7 @@ from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import edit_json
-from ..pictures import encoded, numbered_episodes, numbers_of, picture, store_pictures, write
+from ..pictures import encoded, episode_frames, numbered_episodes, numbers_of, picture, store_pictures, write
 from .test_video import largest_file
 
 FRONT, WRIST = KEYS = ["observation.images.front", "observation.images.wrist"]
@@ -76,8 +76,8 @@ def test_pieces_files_and_processes_change_nothing(tmp_path, folder, make_episod
     write(episodes, root, two, video_files_size_in_mb=0.001)
     assert len(list((root / "videos" / FRONT).rglob("*.mp4"))) > 2
     whole = opened(root, folder, FRONT)
-    monkeypatch.setattr(frame_source, "_PART_BYTES", 1)
-    monkeypatch.setattr(frame_source, "_LEAST", 4)
+    monkeypatch.setattr(camera, "_PART_BYTES", 1)
+    monkeypatch.setattr(camera, "_LEAST", 4)
     told: list[int] = []
     in_pieces = opened(root, tmp_path / "other", FRONT, workers=2, on_frames=told.append)
     assert len(told) > 9
@@ -179,14 +179,14 @@ def test_of_two_at_once_one_decodes(root, folder):
 KILLED = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
-from manip_il.data import frame_source
+from manip_il.data import camera
 from manip_il.data.frame_cache import open_frame_cache
 
 def die(count):
     print(*[child.pid for child in multiprocessing.active_children()], flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 
-frame_source._PART_BYTES, frame_source._LEAST = 1, 4
+camera._PART_BYTES, camera._LEAST = 1, 4
 root, folder, workers = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 open_frame_cache(root, ["observation.images.front"], max_bytes=10**9, folder=folder, workers=workers, on_frames=die)
 """

@@ -18,6 +18,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
+from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
@@ -88,11 +89,6 @@ def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: p
     assert not (tmp_path / "here").exists()
 
 
-def check_both(root: Path) -> None:
-    check_dataset(root)
-    check_all_pictures(root)
-
-
 DECODED: dict[str, Any] = {
     "another picture": {"_type": "Image"},
     "audio": {"_type": "Audio"},
@@ -111,7 +107,7 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
     about = json.dumps({"info": {"features": {"odd": DECODED[kind]}}})
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), root / name)
     with pytest.raises(ManipError, match=r"'odd'.* (decoded as|has no PNG or JPEG)"):
-        check_both(root)
+        check_arrived(root)
     if kind == "another picture":
         meta: Any = read_metadata(root)
         assert meta.episodes is None or meta.episodes[0]["length"] > 0  # LeRobot's would decode the whole row
@@ -157,6 +153,15 @@ def test_statistics_of_another_type_shape_or_depth_are_one_line(root: Path, dama
         (root / layout.STATS).write_text(content)
         with pytest.raises(ManipError, match=r"cannot read .*stats\.json: "):
             read_metadata(root)
+
+
+def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
+    meta = read_metadata(root, root)
+    own = np.zeros(sum(meta.frames), np.int64)
+    assert meta.joint_tasks(own).tolist() == own.tolist()
+    own[-1] = 7
+    with pytest.raises(ManipError, match=r"lift: rows have the task 7, which meta/tasks\.parquet does not hold"):
+        meta.joint_tasks(own)
 
 
 def test_pandas_metadata_that_names_no_column_is_not_looked_at_and_to_join_is_one_line(

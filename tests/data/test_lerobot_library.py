@@ -23,7 +23,16 @@ from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES
-from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import (
+    assert_comes_back,
+    count_frames,
+    episode_frames,
+    numbered_episodes,
+    numbers_of,
+    video_rows,
+    with_cameras,
+    write,
+)
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"
@@ -218,7 +227,7 @@ def test_many_small_files_load(tmp_path, episodes, spec):
 
 
 def test_lerobots_own_dataset_reads_as_ours(pair):
-    left, right = map(read_table, pair)
+    left, right = (Dataset.open(root).columns() for root in pair)
     assert left.keys() == right.keys()
     for key, values in left.items():
         np.testing.assert_array_equal(values, right[key])

@@ -20,6 +20,8 @@ from manip_il.data.pictures import decode_picture, to_png
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
+from ..pictures import episode_frames
+
 FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
 
@@ -107,6 +109,6 @@ def test_damage_is_one_line(root, monkeypatch):
     def damaged(_: Any) -> np.ndarray:
         raise ValueError("it is not a PNG or JPEG")
 
-    monkeypatch.setattr("manip_il.data.lerobot_read.decode_cell", damaged)
+    monkeypatch.setattr("manip_il.data.camera.decode_cell", damaged)
     with pytest.raises(ManipError, match=r"cannot read the pictures observation\.images\.front in .*stills: it is not"):
         next(Dataset.open(root).read_episodes())

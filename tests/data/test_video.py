@@ -28,7 +28,16 @@ from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import digests
-from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import (
+    assert_comes_back,
+    count_frames,
+    episode_frames,
+    numbered_episodes,
+    numbers_of,
+    video_rows,
+    with_cameras,
+    write,
+)
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 

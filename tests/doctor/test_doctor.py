@@ -22,9 +22,9 @@ from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import write_episode
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine, examine_folder, has_errors, verdict
 from manip_il.doctor.finding import Finding, error
+from manip_il.doctor.patient import Patient
 
 from ..damage import DATA, EPISODES, cut, damage_at_random, edit_json, edit_table, lines
 
@@ -116,7 +116,7 @@ def never_closed(root: Path) -> None:
 
 
 def test_a_whole_dataset_has_no_findings(root, journals, filmed_once):
-    dataset = Dataset(root)
+    dataset = Patient(root)
     assert list(examine(dataset)) == []
     assert verdict(dataset, []) == f"{root}: 3 episodes, 20 frames: whole"
     assert verdict(dataset, [error("a", "b"), error("a", "c")]).endswith("lift: 2 errors")
@@ -365,14 +365,14 @@ def test_failed_episodes_that_the_recording_leaves_out_are_not_missed(root, jour
 
 
 def test_a_check_that_fails_hides_no_other(alone):
-    def breaks(dataset: Dataset) -> Iterator[Finding]:
+    def breaks(dataset: Patient) -> Iterator[Finding]:
         yield error("here", "first")
         raise RuntimeError("torn")
 
-    def works(dataset: Dataset) -> Iterator[Finding]:
+    def works(dataset: Patient) -> Iterator[Finding]:
         yield error("there", "second")
 
-    texts = [finding.text for finding in examine(Dataset(alone), [breaks, works])]
+    texts = [finding.text for finding in examine(Patient(alone), [breaks, works])]
     assert texts == ["first", "breaks could not be finished: RuntimeError: torn", "second"]
 
 

@@ -107,8 +107,8 @@ def make_mcap(folder: Path) -> None:
 
 
 def _open(folder: Path) -> None:
-    Dataset.open(folder / "dataset").summary
-    Dataset.open(folder / "dataset").spec
+    _ = Dataset.open(folder / "dataset").summary
+    _ = Dataset.open(folder / "dataset").spec
     Dataset.open(folder / "dataset").columns()
 
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from manip_il.errors import UnknownName
+from manip_il.errors import UnknownName, UsageError
 from manip_il.robots.robot import Robot, get_robot
 from manip_il.robots.spec import arm_model, arm_spec
 from manip_il.robots.suggest import suggest
@@ -225,23 +225,29 @@ def test_a_models_defaults_are_not_for_what_is_added(tmp_path: Path):
 
 FREED = """
 from manip_il.checks import read_yaml
+from manip_il.evaluation.robot_check.joints import arm_facts
 from manip_il.errors import ManipError
 from manip_il.robots import ROBOTS
 from manip_il.robots.found import complete
 from manip_il.robots.robot import FOUND, Robot
+from manip_il.sim.scene import build_scene
 import pathlib, sys
 
-def found(path):
+def found(path, **home):
     said = Robot._said(path, read_yaml(path, ""))
     said = {name: value for name, value in said.items() if name not in (*FOUND, "costs", "yaw", "lerobot")}
     try:
-        return repr([complete(said)[name] for name in FOUND])
+        return {name: value for name, value in complete(said | home).items() if name in FOUND}
     except ManipError as error:
-        return str(error)
+        return {"error": str(error)}
 
 for path in map(pathlib.Path, [*ROBOTS.values(), *sys.argv[1:]]):
-    seen = {found(path) for _ in range(20)}
+    first = found(path)
+    home = {"home": first["home"]} if "home" in first else {}  # found by a long search, of compiled models
+    seen = {repr(found(path, **home)) for _ in range(20)}
     assert len(seen) == 1, (path, seen)
+own = {arm_facts(build_scene("so101", "reach")).own_motors for _ in range(3)}
+assert own == {("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")}, own
 """
 
 
@@ -251,3 +257,10 @@ def test_what_is_found_reads_no_freed_memory():
     environment = os.environ | {"PYTHONMALLOC": "debug", "MALLOC_PERTURB_": "165"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_a_name_that_is_not_utf8_is_no_word_of_mujocos(tmp_path: Path):
+    path = write(tmp_path, tree=short())
+    path.with_name("own.xml").write_bytes(model_of().replace('"elbow"', '"\xe9lbow"').encode("latin-1"))
+    with pytest.raises(UsageError, match=r"a name is not UTF-8 in .*own\.xml"):
+        get_robot(str(path))

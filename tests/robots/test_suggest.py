@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import yaml
 from manip_il.cli.main import main
 from manip_il.errors import UsageError
 from manip_il.robots.robot import Robot, get_robot
-from manip_il.robots.suggest import suggest
+from manip_il.robots.suggest import found_lines, suggest, yaml_of
 
 from .own import ARM, JAWS, model_of, tree_of
 
@@ -54,30 +55,99 @@ def test_an_arm_without_fingers_is_refused_in_one_line(tmp_path: Path):
         suggest(path)
 
 
-def test_the_command_writes_a_yaml_that_is_a_robot(tmp_path: Path, capsys):
-    path = tmp_path / "arm.yaml"
-    assert main(["robot", "new", str(model_in(tmp_path, "slides"))]) == 0
-    text = path.read_text()
-    assert f"--robot.type={path}" in "".join(capsys.readouterr())
-    said = [line for line in text.splitlines() if not line.startswith("#")]
-    assert len(said) <= 15
-    robot = Robot.read(path)
-    comments = yaml.safe_load("\n".join(line[2:] for line in text.splitlines()[-6:]))
-    assert comments["joints"] == list(robot.joints)
-    np.testing.assert_allclose(comments["home"], robot.home, rtol=1e-4)
-    np.testing.assert_allclose(comments["gains"], robot.gains, rtol=1e-4)
-    assert main(["robot", "new", str(tmp_path / "arm.xml")]) == 2  # there is one
-    assert "exists already" in capsys.readouterr().err
-    assert main(["robot", "new", str(tmp_path / "arm.xml"), "--overwrite"]) == 0
+def text_of(folder: Path, model: str) -> tuple[str, str]:
+    """The YAML that is suggested for a model, and what is found on it, as comments."""
+    (folder / "arm.xml").write_text(model)
+    text = yaml_of(suggest(folder / "arm.xml"), "arm.xml")
+    (folder / "arm.yaml").write_text(text)
+    return text, found_lines(Robot.read(folder / "arm.yaml"))
 
 
 def test_what_is_found_may_be_said(tmp_path: Path):
-    assert main(["robot", "new", str(model_in(tmp_path, "slides"))]) == 0
-    path = tmp_path / "arm.yaml"
-    lines = path.read_text().splitlines()
+    text, found = text_of(tmp_path, model_of())
+    assert len(text.splitlines()) <= 15
     said = tmp_path / "said.yaml"
-    said.write_text("\n".join([*lines[:-6], *(line[2:] for line in lines[-6:])]))
-    one, other = Robot.read(path), Robot.read(said)
+    said.write_text(text + "".join(line[2:] for line in found.splitlines(keepends=True)[1:]))
+    one, other = Robot.read(tmp_path / "arm.yaml"), Robot.read(said)
     assert one.joints == other.joints
-    np.testing.assert_allclose(one.home, other.home, atol=1e-4)
+    for name in ("home", "gains", "forces", "armature"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(one.ee.position, other.ee.position, atol=1e-4)
+
+
+def test_a_name_is_a_value_whatever_is_in_it(tmp_path: Path):
+    name = "hand: x\nmodel: /etc/passwd # \x7f'\"[{"
+    model = (
+        model_of().replace('name="hand"', f"name={quoteattr(name, {chr(10): '&#10;'})}").replace('="hand"', '="base"')
+    )
+    text, found = text_of(tmp_path, model.replace("<equality>", "<!--").replace("</equality>", "-->"))
+    assert yaml.safe_load(text)["hand"] == name
+    assert yaml.safe_load(text + found) == yaml.safe_load(text)
+    assert Robot.read(tmp_path / "arm.yaml").hand == name
+
+
+def test_a_third_finger_is_left_out_with_a_word_and_opens_with_the_others(tmp_path: Path):
+    third = """<body name="third" pos="0.03 -0.005 0.06">
+      <joint name="third" type="slide" axis="0 -1 0" range="0 0.045"/>
+      <geom type="box" size="0.01 0.004 0.04" mass="0.05"/></body>"""
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.replace("FINGERS", JAWS["slides"][0] + third))
+    found = suggest(path)
+    assert (found.fingers, found.open) == (("left", "right"), (0.045,) * 3)
+    assert any("the finger third moves, too" in doubt for doubt in found.doubts)
+
+
+def test_radians_that_are_read_as_degrees_are_doubted(tmp_path: Path):
+    path = tmp_path / "arm.xml"
+    path.write_text(model_of("hinges").replace('<compiler angle="radian"/>', ""))
+    assert any("if its angles are radians" in doubt for doubt in suggest(path).doubts)
+    assert not suggest(model_in(tmp_path, "hinges")).doubts
+
+
+def with_gripper(folder: Path, quat: str) -> list[str]:
+    """The words that make a YAML for an arm and a gripper's model, whose palm is turned."""
+    flange = '<body name="flange" pos="0 0 0.02"><geom size="0.01"/></body>'
+    palm = f'<body name="palm" quat="{quat}"><geom size="0.02 0.06 0.01" type="box"/>{JAWS["slides"][0]}</body>'
+    (folder / "arm.xml").write_text(ARM.replace("FINGERS", flange))
+    (folder / "gripper.xml").write_text(f"<mujoco><worldbody>{palm}</worldbody></mujoco>")
+    return ["robot", "new", str(folder / "arm.xml"), f"--gripper={folder / 'gripper.xml'}"]
+
+
+def test_a_hand_put_on_sideways_is_written_without_success_and_the_remedy_named(tmp_path: Path, capsys):
+    assert main(with_gripper(tmp_path, "0.7071 0.7071 0 0")) == 1
+    line = capsys.readouterr().err
+    assert f"wrote {tmp_path / 'arm.yaml'}, which cannot be used yet" in line
+    assert "gripper.quaternion" in line
+    assert yaml.safe_load((tmp_path / "arm.yaml").read_text())["hand"] == "flange"
+
+
+def test_of_work_that_broke_off_nothing_is_left(tmp_path: Path, monkeypatch, capsys):
+    words = ["robot", "new", str(model_in(tmp_path, "slides"))]
+    monkeypatch.setattr("manip_il.cli.robot._measure", lambda *_: {}["no such body"])
+    assert main(words) == 1
+    assert main([*words, f"--output={tmp_path / 'my arm.yaml'}"]) == 1
+    assert "robot's, is 'my arm'" in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == ["arm.xml"]
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_yaml_that_is_a_robot_and_says_what_it_can_do(tmp_path: Path, capsys):
+    path = tmp_path / "arm.yaml"
+    words = ["robot", "new", str(model_in(tmp_path, "slides"))]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert f"--robot.type={path}" in said
+    assert "arm has starts for all" in said
+    assert Robot.read(path).joints
+    assert main(words) == 2  # there is one
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_hand_put_on_backwards_is_no_success_either(tmp_path: Path, capsys):
+    assert main(with_gripper(tmp_path, "0 1 0 0")) == 1
+    said = capsys.readouterr()
+    assert "no task can be done yet" in said.err
+    changes = [line for line in said.out.splitlines() if line.startswith("change: ")]
+    assert len(changes) == 1
+    assert "gripper.quaternion" in changes[0]

@@ -63,9 +63,11 @@ def _of_reach(check: RobotCheck) -> Iterator[str]:
             f"half_width: {reach.half_width:g} in place of {space.half_width:g}."
         )
         return
+    mounted = not reach.table and check.robot.gripper.files is not None
+    mount = "; or turn the gripper on the hand by gripper.quaternion" if mounted else ""
     yield (
         f"The hand gets to {100 * reach.table:.0f} % of the workspace on the table, and not all around its centre: "
-        f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green."
+        f"move workspace.centre, ({space.centre[0]:g}, {space.centre[1]:g}), to where the map is green{mount}."
     )
 
 
@@ -75,6 +77,8 @@ def _of_task(check: RobotCheck, task: TaskCheck) -> Iterator[str]:
         yield _too_wide(check, task.name, wide)
     elif task.refused:
         yield f"{task.name}: {task.refused}."
+    elif not check.reach.table:
+        return  # said of the whole workspace
     elif task.starts is not None and not task.has_starts:
         yield (
             f"{task.name}: {task.starts.drawn - task.starts.found} of {task.starts.drawn} starts find no place within "

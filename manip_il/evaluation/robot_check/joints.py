@@ -59,7 +59,8 @@ def arm_facts(scene: Scene) -> ArmFacts:
     sags, sag = _sags(scene)
     joints = tuple(_joint(scene, place, sags[place]) for place in range(len(robot.joints)))
     files = [one for one in (robot.files, robot.gripper.files) if one is not None]
-    motors = tuple(motor.name for one in files for motor in one.load(robot.name).actuators)
+    specs = [one.load(robot.name) for one in files]  # held: what MuJoCo gives of a model does not keep it
+    motors = tuple(motor.name for spec in specs for motor in spec.actuators)
     return ArmFacts(joints, _chain(scene), motors, robot.max_joint_step, sag)
 
 

@@ -39,9 +39,10 @@ def find_home(robot: Robot, turns: bool) -> Robot:
     best = next((one for one in found if math.isfinite(one[0])), (-math.inf, robot))
     if not math.isfinite(best[0]):
         x, y = robot.workspace.centre
+        mount = " gripper.quaternion (how the gripper is put onto the hand)," if robot.gripper.files else ""
         raise UsageError(
             f"robot {robot.name}: the hand does not get over the workspace's centre ({x:g}, {y:g}), pointing down;"
-            " look at workspace.centre, hand and base, or give home"
+            f" look at workspace.centre,{mount} hand and base, or give home"
         )
     return best[1]
 
