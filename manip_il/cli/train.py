@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # the learner takes a second to import
 RANK = "RANK"  # the variable by which processes that were started together know their place
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
-    *("threads", "processes", "log_freq", "save_freq", "num_workers", "memory"),
+    *("threads", "processes", "log_freq", "save_freq", "num_workers"),
     *("dataset.root", "output_dir", "tensorboard", "wandb", "trust"),
 )
 
@@ -74,7 +74,6 @@ class TrainOptions:
     scheduler: Open = option_of(FitConfig, "scheduler")
     image_augment: bool | None = option_of(FitConfig, "image_augment")
     image_cache_gb: float = option_of(FitConfig, "image_cache_gb")
-    memory: float | None = option_of(FitConfig, "memory")
     num_workers: int = option_of(FitConfig, "num_workers")
     output_dir: Path = option(Path("runs/train"), "folder of the run")
     seed: int = option(0, "seed of weights and batches, 0 to 1000")
@@ -208,13 +207,11 @@ class TrainOptions:
     def _fit_mlp(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
         from manip_il.data.dataset import joined_columns
         from manip_il.learn.columns import LEARNING_COLUMNS
-        from manip_il.learn.room import numbers_of, room
         from manip_il.learn.train import fit
 
         with self._begin(config) as stages:
             roots = data["sources"].roots
-            allocate = room(config, self.output_dir, sum(data["sources"].frames), numbers_of(data["spec"]))
-            table = joined_columns(roots, (*LEARNING_COLUMNS, "frame_index"), allocate)
+            table = joined_columns(roots, (*LEARNING_COLUMNS, "frame_index"))
             stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
             return fit(
                 table,

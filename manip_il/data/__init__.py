@@ -8,9 +8,9 @@ that a dataset takes of rollouts.
 of journals, or one dataset of several. `lerobot_write.py` writes datasets episode by episode with pyarrow and PyAV.
 `dataset.py` opens any LeRobot dataset: `info.py` and `episode_table.py` parse its `meta/`, `camera.py` finds and
 decodes its pictures, `statistics.py` has its statistics. `lerobot_library.py` is LeRobot's own writer, and its metadata
-for policies. Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), parquet (`parquet_files.py`), films and
-pictures (`video.py` writes, `pictures.py` reads, and nothing else opens a picture), and a cache of decoded pictures for
-training (`frame_cache.py`). `gate.py` tries in a child process what arrives from outside.
+for policies. Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), parquet (`parquet_files.py`), films
+and pictures (`video.py` writes, `pictures.py` reads, and nothing else opens a picture), and a cache of decoded pictures
+for training (`frame_cache.py`). `gate.py` tries in a child process what arrives from outside.
 
 What the room promises:
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.arrays import Allocate, in_memory
 from manip_il.data.camera import Camera
 from manip_il.data.episode_table import EpisodeTable, read_episode_table
 from manip_il.data.info import LARGEST_META, NUMBERS, DatasetInfo, Feature, Info, InvalidInfo, read_info
@@ -302,12 +301,10 @@ class Dataset:
         return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
 
 
-def joined_columns(
-    roots: Sequence[Path], names: Sequence[str], allocate: Allocate = in_memory
-) -> dict[str, NDArray[Any]]:
+def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
 
-    One data file is held at a time, beside what `allocate` makes. Raises what `Dataset.columns` raises.
+    One data file is held at a time, beside the columns. Raises what `Dataset.columns` raises.
     """
     datasets = [Dataset.open(root) for root in roots]
     total = sum(map(len, datasets))
@@ -318,7 +315,7 @@ def joined_columns(
         for piece in dataset.pieces(names):
             for name, values in piece.items():
                 if name not in joined:
-                    joined[name] = allocate((total, *values.shape[1:]), _dtype(dataset.features[name], values))
+                    joined[name] = np.empty((total, *values.shape[1:]), _dtype(dataset.features[name], values))
                 part = joined[name][row : row + len(values)]
                 part[:] = values.reshape(part.shape)
                 if before.get(name):

@@ -48,7 +48,7 @@ class Patient:
     @cached_property
     def own(self) -> Own | None:
         """Content of this program's own file; None if there is none. Raises `ManipError` if it cannot be read."""
-        return None if self.info is None else data.Patient(self.root, self.info).own
+        return None if self.info is None else data.Dataset(self.root, self.info).own
 
     @property
     def is_ours(self) -> bool:

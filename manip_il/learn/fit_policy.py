@@ -99,7 +99,7 @@ class PolicyTrainer:
             _convert(self.dataset, self.conversion)
         self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
-            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, output_dir, on_frames)
+            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
         drawn = weights[self.samples.train] if weights is not None else None
         if sources is not None and weights is None:
             drawn = weights = sources.row_weights(self.samples.train)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +25,6 @@ from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.room import room
 
 _LOG = logging.getLogger(__name__)
 I64 = NDArray[np.int64]
@@ -194,32 +192,19 @@ def load_samples(
     policy: PreTrainedConfig,
     config: FitConfig,
     meta: Any,
-    folder: Path,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Return the samples of datasets, taken as one, for a policy that has its features; in memory where they fit.
+    """Return the samples of datasets, taken as one, for a policy that has its features.
 
-    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'. folder: for
-    columns that do not fit in the memory given. on_frames: sees how many frames more have been decoded. Raises
-    `NotFiniteError`, `UsageError` for less memory than a batch needs, and what `windows_of` and `Windows.usable` raise.
+    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'.
+    on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and what `windows_of` and
+    `Windows.usable` raise.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = tuple(key for key in features if key in meta.camera_keys)
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    sizes = {key: math.prod(meta.features[key]["shape"]) for key in features}
-    in_batch = sum(sizes[key] * _window_length(policy, key) for key in features)  # pictures become floats, too
-    table = joined_columns(
-        roots,
-        [*numbers, *_ALWAYS, *label],
-        room(
-            config,
-            folder,
-            meta.total_frames,
-            sum(sizes[key] for key in numbers),
-            4 * in_batch * config.samples_per_step,
-        ),
-    )
+    table = joined_columns(roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     if meta.learnt_actions is not None:
         table[ACTION] = meta.learnt_actions
@@ -240,10 +225,6 @@ def load_samples(
     if len(held_out) > _MAX_HELD_OUT:
         held_out = held_out[np.linspace(0, len(held_out) - 1, _MAX_HELD_OUT).astype(np.int64)]
     return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
-
-
-def _window_length(policy: PreTrainedConfig, key: str) -> int:
-    return len((policy.action_delta_indices if key == ACTION else policy.observation_delta_indices) or (0,))
 
 
 def _frames(
