@@ -194,6 +194,8 @@ class TrainOptions:
         check_same_sources(roots, specs, pictures=pictures, language=language)
         for one in opened:
             check_dataset(one.root, one.spec, one.fingerprint)
+            odd = [key for key in one.cameras if pictures and not one.features[key].is_rgb]
+            warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
         frames = tuple(map(len, opened))
         return specs[0], opened[0].fingerprint, Sources(roots, frames, tuple(self.dataset.weights))
 

@@ -27,7 +27,7 @@ from manip_il.data.statistics import Statistics, column_statistics, read_statist
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
-UNKNOWN_TASK = "unknown"
+UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
 _SEE_CHECK = "run `manip-il doctor` to see what is wrong"
 
 
@@ -111,21 +111,23 @@ class Dataset:
     def spec(self) -> s.RobotTaskSpec:
         """The spec that the dataset was written with.
 
-        LeRobot's tools drop our file beside theirs; then it comes from LeRobot's own, the task `unknown`. Raises
-        `ManipError` for a dataset without the columns of this program's.
+        LeRobot's tools drop our file beside theirs; then it comes from LeRobot's own, the task `unknown`, as for the
+        datasets of other programs: without the columns and cameras that they lack. Raises `ManipError` for a dataset
+        without actions.
         """
         if self.own is not None:
             return self.own.spec
         features = self.features
-        if lacking := [key for key in (s.ACTION, s.ENVIRONMENT_STATE, s.SIM_STATE) if key not in features]:
-            raise ManipError(f"{self.root} lacks columns that this project's datasets have: {', '.join(lacking)}")
+        if s.ACTION not in features:
+            raise ManipError(f"{self.root} has no column {s.ACTION}: there is nothing to learn from it")
+        around = features.get(s.ENVIRONMENT_STATE)
         return s.RobotTaskSpec(
-            **s.robot_of(self.info.robot),
+            **s.robot_of(self.info.robot or UNKNOWN_ROBOT),
             task=UNKNOWN_TASK,
-            fps=int(self.fps),
+            fps=round(self.fps),
             joint_names=features[s.ACTION].labels,
-            environment_state_names=features[s.ENVIRONMENT_STATE].labels,
-            sim_state_size=features[s.SIM_STATE].size,
+            environment_state_names=around.labels if around else (),
+            sim_state_size=features[s.SIM_STATE].size if s.SIM_STATE in features else 0,
             instruction=self.instruction,
             **self._picture_spec(),
         )
@@ -239,7 +241,7 @@ class Dataset:
             success, at_end = len(np.unique(index[flags.astype(bool)])), int(flags[last].sum())
         return DatasetInfo(
             root=self.root,
-            robot=own.spec.robot if own else s.robot_of(self.info.robot)["robot"],
+            robot=own.spec.robot if own else s.robot_of(self.info.robot or UNKNOWN_ROBOT)["robot"],
             task=own.spec.task if own else UNKNOWN_TASK,
             instruction=own.spec.instruction if own else self.instruction,
             fps=self.fps,
@@ -292,11 +294,13 @@ class Dataset:
         return text
 
     def _picture_spec(self) -> dict[str, Any]:
-        """Cameras and their size for a spec."""
-        features = [self.features[key] for key in self.cameras if key.startswith(s.IMAGES)]
+        """Cameras and their size for a spec, which has one for all: none if they differ."""
+        features = [
+            self.features[key] for key in self.cameras if key.startswith(s.IMAGES) and self.features[key].is_rgb
+        ]
         sizes = {one.key.removeprefix(s.IMAGES): one.picture_size for one in features}
         if len(set(sizes.values())) > 1:
-            raise ManipError(f"cameras of different sizes: {sizes}; this project's datasets have one size for all")
+            return {}
         video = not any(one.dtype == "image" for one in features)
         return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
 

@@ -29,7 +29,7 @@ _PLAIN = (
     *("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Translation", "TranslationVariableLanguages"),
     *("Array2D", "Array3D", "Array4D", "Array5D"),
 )  # types of `datasets` that hold numbers and text as they are stored
-_BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
+_BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  # PNG, JPEG, and TIFF, which depth is
 _BATCH = 64  # cells held at once
 
 
@@ -98,7 +98,7 @@ def picture_columns(schema: pa.Schema) -> list[str]:
 
 
 def check_pictures(path: Path, declared: Collection[str]) -> None:
-    """Raise `ManipError` unless every picture of a data file is in it, as PNG or JPEG.
+    """Raise `ManipError` unless every picture of a data file is in it, as PNG, JPEG or TIFF.
 
     declared: the columns that the dataset's description calls pictures; those that the file does count too.
     """
@@ -108,9 +108,18 @@ def check_pictures(path: Path, declared: Collection[str]) -> None:
             for key in sorted(columns):
                 row = 0
                 for batch in file.iter_batches(_BATCH, columns=[key], use_threads=False):
-                    bad = next((i for i, begin in enumerate(_begins(batch.column(0))) if begin not in _BEGIN), None)
+                    bad = next(
+                        (
+                            i
+                            for i, begin in enumerate(_begins(batch.column(0)))
+                            if not (begin or b"").startswith(_BEGIN)
+                        ),
+                        None,
+                    )
                     if bad is not None:
-                        raise ValueError(f"column {key!r} has no PNG or JPEG in row {row + bad:,}; expected its bytes")
+                        raise ValueError(
+                            f"column {key!r} has no PNG, JPEG or TIFF in row {row + bad:,}; expected its bytes"
+                        )
                     row += len(batch)
         except (ValueError, pa.ArrowException) as error:
             raise ManipError(f"{path}: {error}") from error
@@ -137,4 +146,4 @@ def _begins(cells: pa.Array) -> list[bytes | None]:
     if not (pa.types.is_binary(content.type) or pa.types.is_large_binary(content.type)):
         raise ValueError(f"a column of pictures holds {checks.shorten(str(content.type))}; expected their bytes")
     begins: list[bytes | None] = pc.binary_slice(content, 0, 8).to_pylist()  # pyright: ignore[reportAttributeAccessIssue]
-    return [begin[:3] if begin and begin.startswith(_BEGIN[1]) else begin for begin in begins]
+    return begins

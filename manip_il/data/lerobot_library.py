@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.atomic import PARTIAL, writing
 from manip_il.data.dataset import Dataset
-from manip_il.data.gate import open_files
+from manip_il.data.gate import check_arrived
 from manip_il.data.info import read_info, read_object
 from manip_il.data.lerobot_layout import DATA_FILES, STATS, TASK_INDEX, TASKS, write_json
 from manip_il.data.scheduling import scheduling_kept
@@ -91,7 +91,7 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
     Raises `ManipError` for one that its readers must not open, or that it cannot join.
     """
     for source in roots:
-        open_files(source)
+        check_arrived(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
     try:
         with writing(root), contextlib.redirect_stderr(io.StringIO()):  # its progress bars

@@ -76,17 +76,18 @@ def check_statistics(dataset: Patient) -> Iterator[Finding]:
     if info is None or info.episodes == 0:
         return
     if stats is None:
-        state = "cannot be read" if (dataset.root / layout.STATS).exists() else "is missing"
-        yield error(layout.STATS, f"{state}: nothing can be normalised with it", Remedy.STATISTICS)
-    else:
-        if unknown := sorted(set(stats) - set(info.features)):
-            yield warning(layout.STATS, f"has statistics of {list_first(unknown)}, which {layout.INFO} does not list")
-        yield from _check_all_moments(dataset, info.of_dtype(*NUMBERS))
+        if (dataset.root / layout.STATS).exists():
+            yield error(layout.STATS, "cannot be read: nothing can be normalised with it", Remedy.STATISTICS)
+        else:
+            yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it", Remedy.STATISTICS)
+        return
+    if unknown := sorted(set(stats) - set(info.features)):
+        yield warning(layout.STATS, f"has statistics of {list_first(unknown)}, which {layout.INFO} does not list")
+    yield from _check_all_moments(dataset, info.of_dtype(*NUMBERS))
     for feature in info.of_dtype(*PICTURES):
-        if not isinstance((stats or {}).get(feature.key), dict):
+        if not isinstance(stats.get(feature.key), dict):
             yield error(f"{layout.STATS}: {feature.key}", "is missing")
-    if stats is not None:
-        yield from _check_ranks(dataset)
+    yield from _check_ranks(dataset)
 
 
 def _check_episodes(dataset: Patient, episodes: EpisodeTable) -> Iterator[Finding]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from manip_il.data.camera import Camera
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.frame_cache import open_frame_cache
+from manip_il.data.lerobot_layout import STATS
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
@@ -251,7 +252,8 @@ def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
     """SHA-256 of the columns and of the datasets' statistics, which stand for the pictures."""
     digest = hashlib.sha256()
     for root in roots:
-        digest.update((root / "meta" / "stats.json").read_bytes())
+        path = root / STATS
+        digest.update(path.read_bytes() if path.exists() else b"")
     for key, column in table.items():
         digest.update(key.encode())
         digest.update(np.ascontiguousarray(column))

@@ -235,7 +235,7 @@ def test_a_truncated_data_file_is_named(root, keep):
 
 def test_broken_json_and_other_versions_are_named(root):
     edit_json(root / layout.INFO, lambda info: info.update(codebase_version="v2.1"))
-    with pytest.raises(ManipError, match=r"version v2\.1"):
+    with pytest.raises(ManipError, match=r"codebase_version is .v2\.1."):
         Dataset.open(root).columns()
     (root / layout.INFO).write_text("{")
     with pytest.raises(ManipError, match=r"info\.json is not valid JSON"):

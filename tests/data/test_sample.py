@@ -32,6 +32,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from manip_il.collect.expert import Expert
+from manip_il.data.dataset import Dataset
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 

@@ -110,5 +110,7 @@ def test_damage_is_one_line(root, monkeypatch):
         raise ValueError("it is not a PNG or JPEG")
 
     monkeypatch.setattr("manip_il.data.camera.decode_cell", damaged)
-    with pytest.raises(ManipError, match=r"cannot read the pictures observation\.images\.front in .*stills: it is not"):
+    with pytest.raises(
+        ManipError, match=r"cannot read the pictures observation\.images\.front in frames 0 to 6 of .*: it is not"
+    ):
         next(Dataset.open(root).read_episodes())
