@@ -260,12 +260,17 @@ _OF_ACTION = "meta/stats.json: action ..."
         (stats(lambda stats: stats[s.ACTION].update(mean=[0])), f"{_OF_ACTION} mean is 1 number; expected 3 numbers"),
         (stats(lambda stats: stats[s.ACTION].update(q50=[9] * 3)), f"{_OF_ACTION} not in order between min and max"),
         (stats(lambda stats: stats[s.ACTION].pop("q10")), f"{_OF_ACTION} are not all there"),
-        (delete(layout.STATS), "meta/stats.json: is missing"),
     ],
 )
 def test_statistics_that_are_wrong(alone, change, text):
     change(alone)
     assert said(alone, text)
+
+
+def test_missing_statistics_are_a_warning_as_a_fit_computes_them(alone):
+    (alone / layout.STATS).unlink()
+    assert said(alone, "meta/stats.json: is missing", kind="warning")
+    assert not said(alone, "stats.json")
 
 
 @pytest.mark.parametrize(
@@ -310,7 +315,7 @@ _START = f"{_CAMERA}/from_timestamp"
     ("change", "texts"),
     [
         (delete(VIDEO), ["is missing; it holds observation.images.front of 3 episodes"]),
-        (never_closed, ["has no moov box: its encoder died before it closed the file"]),
+        (never_closed, ["cannot be decoded, as if its encoder had died before it closed the file"]),
         (lambda root: cut(root / VIDEO, 0.7), ["decoded frames for 21 rows of 3 episodes"]),
         # rows against decoded frames, whatever the file's own index counts
         (

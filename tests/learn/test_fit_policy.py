@@ -159,14 +159,14 @@ def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, dem
 def loaded(root: Path, config: FitConfig, observation: str) -> Samples:
     meta, policy = read_metadata(root), policy_config(config.policy)
     set_features(policy, meta, observation)
-    return load_samples([root], policy, config, meta, root.parent)
+    return load_samples([root], policy, config, meta)
 
 
 def loaded_all(roots: list[Path], config: FitConfig) -> Samples:
     """Several datasets for a policy on pictures."""
     meta, policy = read_metadata(*roots), policy_config(config.policy)
     set_features(policy, meta, "images")
-    return load_samples(roots, policy, config, meta, roots[0].parent)
+    return load_samples(roots, policy, config, meta)
 
 
 def edit_tasks(root: Path, text: str) -> None:
