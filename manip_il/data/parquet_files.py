@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +21,7 @@ from manip_il.errors import ManipError, UnknownName
 
 MAGIC = b"PAR1"
 NO_FOOTER = "has no footer: its writer died before it closed the file, or the file was cut"
+_TEXT = ("string", "language")
 _ROWS = 16_384  # held at once
 _TASK_NAMES = ("task", "__index_level_0__")  # pandas' for an index with a name and for one without
 UNREADABLE = (OSError, pa.ArrowException, ValueError, MemoryError)  # ArrowInvalid and its like are ValueErrors too
@@ -125,29 +127,29 @@ def read_file(path: Path, columns: list[str]) -> pa.Table:
     return table.replace_schema_metadata(None)
 
 
-def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), as its feature says; numbers of another width are taken as they are.
+def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int], *, exact: bool = False) -> NDArray[Any]:
+    """Return a column, (T,) or (T, *shape), as its feature says; text as objects.
 
-    Raises `BadColumn` if values have another kind or shape, or some are missing.
+    exact: the numbers must have the width that the feature says, too. Raises `BadColumn` if values have another kind or
+    shape, or some are missing.
     """
-    shape = tuple(shape)
-    holds = f"holds {checks.shorten(str(column.type))}"
-    if column.null_count:
-        raise BadColumn(f"{holds} with {column.null_count} missing; expected {dtype} of shape {shape}")
-    try:
-        array = column.combine_chunks()
-        length, nested = len(array), False
-        while _is_list(array.type):
-            array, nested = array.flatten(), True
-        values = array.to_numpy(zero_copy_only=False)
-        values = values.reshape(length, *shape) if nested else values
-        kind = "O" if dtype in ("string", "language") else np.dtype(dtype).kind
-    except (ValueError, TypeError, pa.ArrowException) as error:
-        raise BadColumn(f"is not {dtype} of shape {shape}: {error}") from error
-    fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
-    if values.dtype.kind != kind or len(values) != len(column) or not fits:
-        raise BadColumn(f"{holds}; expected {dtype} of shape {shape}")
-    return values
+    array: Any = column.combine_chunks()
+    rows, size, nested = len(array), math.prod(shape), False
+    while True:
+        if isinstance(array.type, pa.BaseExtensionType):
+            array = array.storage
+        if array.null_count:
+            raise BadColumn(f"holds {array.null_count:,} missing values")
+        if not _is_list(array.type):
+            break
+        array, nested = array.flatten(), True
+    found, wanted = _numpy_type(array.type), np.dtype(object if dtype in _TEXT else dtype)
+    if found.kind != wanted.kind or (exact and found != wanted):
+        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
+    if len(array) != rows * size:
+        raise BadColumn(f"holds {len(array):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
+    values = array.to_numpy(zero_copy_only=False)
+    return values.reshape(rows, *shape) if nested or size > 1 else values
 
 
 def _is_list(kind: pa.DataType) -> bool:
@@ -239,25 +241,6 @@ def read_tasks(root: Path) -> tuple[list[int], list[str]]:
     return numbers.tolist(), table.column(names[0]).to_pylist()
 
 
-def to_array(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
-    """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
-    array: Any = column.combine_chunks()
-    rows, size = len(array), int(np.prod(shape, dtype=np.int64))
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):
-            array = array.storage
-        if array.null_count:
-            raise BadColumn(f"holds {array.null_count:,} missing values")
-        if not _is_list(array.type):
-            break
-        array = array.flatten()
-    if str(_numpy_type(array.type)) != dtype:
-        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
-    if len(array) != rows * size:
-        raise BadColumn(f"holds {len(array):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
-    return array.to_numpy(zero_copy_only=False).reshape(rows, size)
-
-
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
     """Return a column of whole numbers, (T,). Raises `BadColumn` for a missing one, missing values or another type."""
     return _numbers(table, name, "integers", pa.types.is_integer).astype(np.int64)
@@ -278,8 +261,8 @@ def _numbers(table: pa.Table, name: str, expected: str, *types: Callable[[pa.Dat
     return column.to_numpy()
 
 
-def _numpy_type(kind: pa.DataType) -> Any:
+def _numpy_type(kind: pa.DataType) -> np.dtype[Any]:
     try:
         return np.dtype(kind.to_pandas_dtype())
     except (NotImplementedError, TypeError):
-        return kind
+        return np.dtype("V")  # nothing that a feature can be

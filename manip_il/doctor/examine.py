@@ -17,7 +17,7 @@ from manip_il.data.atomic import exclusive, write_file
 from manip_il.data.build import build
 from manip_il.data.gate import check_arrived
 from manip_il.data.info import Feature
-from manip_il.data.parquet_files import to_array
+from manip_il.data.parquet_files import to_numpy
 from manip_il.data.statistics import RunningStats
 from manip_il.doctor.cameras import check_pictures, check_videos
 from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
@@ -201,7 +201,7 @@ def _statistics(dataset: Patient, feature: Feature) -> dict[str, list[float]]:
     with closing(RunningStats(dataset.root)) as running:
         for shard in dataset.data_shards:
             for table in shard.tables([feature.key]):
-                values = to_array(table.column(feature.key), feature.dtype, feature.shape)
+                values = to_numpy(table.column(feature.key), feature.dtype, feature.shape, exact=True)
                 running.add({feature.key: values.reshape(-1, last)})
         return {**running.result()[feature.key], "count": [dataset.scan.moments[feature.key].rows]}
 

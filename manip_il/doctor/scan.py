@@ -13,7 +13,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.episode_table import concatenate
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, Info
-from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, to_array
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, to_numpy
 from manip_il.doctor.finding import Finding, error, plural
 
 I64 = NDArray[np.int64]
@@ -139,11 +139,12 @@ def _scan_shard(shard: Shard, info: Info, result: Scan) -> Iterator[Runs]:
                 if key in bad_columns:
                     continue
                 try:
-                    values = to_array(table.column(key), info.features[key].dtype, info.features[key].shape)
+                    values = to_numpy(table.column(key), info.features[key].dtype, info.features[key].shape, exact=True)
                 except BadColumn as problem:
                     bad_columns.add(key)
                     result.findings.append(error(f"{shard.name}: {key}", str(problem)))
                     continue
+                values = values.reshape(len(values), -1)
                 result.moments[key].add(values, rows)
                 if key in kept:
                     kept[key].append(values)
