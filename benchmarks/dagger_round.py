@@ -23,7 +23,7 @@ from manip_il.algorithms.run import DATASET, round_folder
 from manip_il.algorithms.table import run_algorithm
 from manip_il.collect.expert import Expert
 from manip_il.collect.workers import Engine, default_workers
-from manip_il.data.lerobot_read import read_table
+from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
@@ -69,7 +69,7 @@ def report(result: RoundResult, folder: Path, config: RunConfig, workers: int) -
 def seconds_to_label(root: Path, config: RunConfig) -> float:
     """What one core takes to ask the expert in every state of a dataset."""
     expert = Expert(build_scene(config.env.robot, config.env.task))
-    states = [State.from_vector(vector) for vector in read_table(root, ("sim_state",))["sim_state"]]
+    states = [State.from_vector(vector) for vector in Dataset.open(root).columns(("sim_state",))["sim_state"]]
     expert.label(states[0])
     started = time.perf_counter()
     for state in states:

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from manip_il.data.dataset import Dataset
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE
 from manip_il.learn.cnn.modeling_cnn import CNNPolicy
 
@@ -30,7 +30,7 @@ def batch_of(root: Path, cameras: tuple[str, ...], rows: NDArray[np.int64]) -> B
     """Return frames of a dataset as a policy takes them."""
     keys = [IMAGES + camera for camera in cameras]
     frames: Any = open_frame_cache(root, keys, max_bytes=int(60e9))
-    table = read_table(root, [STATE, ENVIRONMENT_STATE])
+    table = Dataset.open(root).columns([STATE, ENVIRONMENT_STATE])
     numbers = {key: torch.from_numpy(np.array(column[rows])) for key, column in table.items()}
     return numbers | {key: torch.from_numpy(frames[key][rows]).float() / 255 for key in keys}
 
@@ -79,8 +79,8 @@ def main() -> None:
         print(__doc__)
         return
     policy, root = CNNPolicy.from_pretrained(sys.argv[1]).eval(), Path(sys.argv[2])
-    spec = read_spec(root)
-    count = len(read_table(root, [STATE])[STATE])
+    spec = Dataset.open(root).spec
+    count = len(Dataset.open(root).columns([STATE])[STATE])
     rows = np.sort(np.random.default_rng(1).choice(count, min(FRAMES, count), replace=False))
     batch = batch_of(root, spec.cameras, rows)
     report(policy, batch, spec.environment_state_names)

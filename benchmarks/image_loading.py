@@ -28,9 +28,9 @@ from _machine import describe_machine
 from lerobot.datasets import LeRobotDataset
 
 import datasets
+from manip_il.data.dataset import Dataset
 from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import camera_keys, read_table
 from manip_il.learn.batches import Augment, pictures_to_float
 from manip_il.learn.limits import threads
 from manip_il.learn.samples import JoinedFrames, SampleSource, Windows
@@ -102,9 +102,9 @@ def epochs(root: Path, workers: int) -> Iterator[float]:
 
 
 def our_source(root: Path, folder: Path) -> SampleSource:
-    frames = open_frame_cache(root, camera_keys(root), max_bytes=PLENTY, folder=folder / "cache")
+    frames = open_frame_cache(root, Dataset.open(root).cameras, max_bytes=PLENTY, folder=folder / "cache")
     assert frames is not None
-    table = {key: values for key, values in read_table(root).items() if values.dtype != object}
+    table = {key: values for key, values in Dataset.open(root).columns().items() if values.dtype != object}
     columns = {key: torch.from_numpy(np.array(values)) for key, values in table.items()}
     texts = read_metadata(root).tasks
     assert texts is not None
@@ -137,12 +137,12 @@ def samples_per_s(epoch: Callable[[], int]) -> float:
 def build_time(root: Path, folder: Path) -> float:
     """Seconds that decoding all frames takes."""
     started = time.perf_counter()
-    open_frame_cache(root, camera_keys(root), max_bytes=PLENTY, folder=folder)
+    open_frame_cache(root, Dataset.open(root).cameras, max_bytes=PLENTY, folder=folder)
     return time.perf_counter() - started
 
 
 def report(root: Path, repeats: list[Repeat]) -> None:
-    keys, frames = camera_keys(root), len(read_table(root, ["index"])["index"])
+    keys, frames = Dataset.open(root).cameras, len(Dataset.open(root).columns(["index"])["index"])
     print(f"{frames} frames of {len(keys)} cameras, batches of {BATCH}; samples/s, medians; ratios' medians and ranges")
     print("pictures    LeRobot, 0 processes   2 processes       ours   ours / LeRobot's best")
     two, none = (statistics.median(repeat.peers[way] for repeat in repeats) for way in (0, 1))

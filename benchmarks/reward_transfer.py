@@ -30,8 +30,8 @@ from manip_il.cli.main import main as manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_spec
 from manip_il.collect.job import RolloutJob
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes, read_journal
-from manip_il.data.lerobot_read import read_spec
 from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.mdp import Episode
 from manip_il.rewards.methods import METHODS, learn
@@ -98,7 +98,7 @@ def demonstrate(folder: Path, taste: str, count: int) -> Path:
     words = [f"--task.type={CARRY}", f"--task.reward={taste}", f"--dataset.root={root}", "--quiet"]
     if manip_il(["record", *words, "--dataset.repo_id=benchmark/all", f"--dataset.num_episodes={3 * count}"]):
         raise SystemExit("recording failed")
-    names = read_spec(root).environment_state_names
+    names = Dataset.open(root).spec.environment_state_names
     journals = root.with_name("all.journals")
     few = [path for path in list_episodes(journals) if things(read_journal(path)[1], names) <= FEW][:count]
     kept.mkdir()

@@ -120,7 +120,8 @@ def measure(root: Path, count: int, before: int) -> Row:
 def others(root: Path) -> dict[str, Run]:
     """Measure the commands that only read a dataset."""
     away, back = root.with_name("remote"), root.with_name("back")
-    info = f"from pathlib import Path; from manip_il.data.lerobot_read import dataset_info as i; i(Path({str(root)!r}))"
+    opened = f"Dataset.open(Path({str(root)!r})).summary"
+    info = f"from pathlib import Path; from manip_il.data.dataset import Dataset; {opened}"
     runs = {
         "doctor": manip_il("doctor", str(root)),
         "info": measured([sys.executable, "-c", info]),

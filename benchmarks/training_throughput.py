@@ -20,7 +20,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
 import datasets
-from manip_il.data.lerobot_read import read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec, features
 from manip_il.learn.columns import learning_rows
 from manip_il.learn.fit_config import FitConfig
@@ -69,7 +69,7 @@ def lerobot_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callabl
 
 def our_path(dataset: LeRobotDataset) -> tuple[Callable[[], object], Callable[[], object]]:
     """A batch from the table in memory; and the same update with it."""
-    table = read_table(dataset.root, LEARNING)
+    table = Dataset.open(dataset.root).columns(LEARNING)
     names = dataset.meta.features
     spec = RobotTaskSpec(
         robot="benchmark",

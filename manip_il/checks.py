@@ -16,6 +16,7 @@ import pickle
 import re
 import reprlib
 import resource
+import signal
 import stat
 import subprocess
 import sys
@@ -162,36 +163,47 @@ def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
 
 
 def in_child(what: str, function: Callable[..., object], *arguments: object) -> None:
-    """Call `function(*arguments)` in a child process, which may take 4 GB of memory and 120 s.
+    """Call `function(*arguments)` in a child process, which may take 4 GB of memory and 120 s, or so long a file.
 
     Nothing but the text of its `ManipError` comes back, as what it opens may be from anyone. Raises that, and
-    `ManipError` if the child exceeds its limits or dies. what: the thing that is opened, for these messages.
+    `ManipError` if the child exceeds its limits or dies. what: the thing that is opened, for these messages; a function
+    that opens several calls `opening`.
     """
-    call = pickle.dumps((MEMORY_IN_CHILD, function, arguments))
+    call = pickle.dumps((MEMORY_IN_CHILD, SECONDS_IN_CHILD, function, arguments))
     command = [sys.executable, "-c", "from manip_il.checks import answer_parent; answer_parent()"]
-    try:
-        done = subprocess.run(command, input=call, capture_output=True, timeout=SECONDS_IN_CHILD, check=False)
-    except subprocess.TimeoutExpired:
-        raise ManipError(f"{what} took more than {SECONDS_IN_CHILD:g} s to open") from None
+    done = subprocess.run(command, input=call, capture_output=True, check=False)
+    lines = done.stdout.decode(errors="replace").splitlines()
     if done.returncode == _REFUSED:
-        raise ManipError(" ".join(done.stdout.decode(errors="replace").split()))
+        raise ManipError(lines[-1])
+    what = lines[-1] if lines else what
+    if done.returncode == -signal.SIGALRM:
+        raise ManipError(f"{what} took more than {SECONDS_IN_CHILD:g} s to open")
     if done.returncode == _OUT_OF_MEMORY or b"bad_alloc" in done.stderr:
         raise ManipError(f"{what} needs more than {MEMORY_IN_CHILD / 1024**3:g} GB of memory to open")
     if done.returncode != 0:
         raise ManipError(f"{what} cannot be opened: the process that read it ended with code {done.returncode}")
 
 
+def opening(name: str) -> None:
+    """Say in the child process which file is opened next, and give it as much time as there is for one."""
+    sys.stdout.write(" ".join(name.split()) + "\n")
+    sys.stdout.flush()
+    signal.setitimer(signal.ITIMER_REAL, SECONDS_IN_CHILD)  # ends the process
+
+
 def answer_parent() -> None:
     """Run in the child process what `in_child` asks for."""
-    memory, function, arguments = pickle.load(sys.stdin.buffer)
+    memory, seconds, function, arguments = pickle.load(sys.stdin.buffer)
+    globals()["SECONDS_IN_CHILD"] = seconds
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         function(*arguments)
     except MemoryError:
         os._exit(_OUT_OF_MEMORY)
     except ManipError as error:
-        sys.stdout.write(str(error))
+        sys.stdout.write(" ".join(str(error).split()) + "\n")
         sys.stdout.flush()
         os._exit(_REFUSED)
     os._exit(0)

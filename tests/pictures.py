@@ -16,9 +16,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from manip_il.data import schema as s
-from manip_il.data.frame_source import find_clips, to_part
-from manip_il.data.lerobot_layout import INFO, VIDEO_PATH
-from manip_il.data.lerobot_read import camera_keys, read_episodes
+from manip_il.data.dataset import Dataset
+from manip_il.data.lerobot_layout import INFO
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.data.pictures import open_video
 from manip_il.mdp import Episode
@@ -94,7 +93,7 @@ def write(episodes: list[Episode], root: Path, spec: s.RobotTaskSpec, **options:
 
 def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
     """A dataset holds these episodes: numbers bit for bit, pictures by the number that they show."""
-    for mine, yours in zip(read_episodes(root), episodes, strict=True):
+    for mine, yours in zip(Dataset.open(root).read_episodes(), episodes, strict=True):
         assert (mine.seed, mine.success, mine.success_at_end) == (yours.seed, yours.success, yours.success_at_end)
         assert list(mine.columns) == list(yours.columns)
         for key, values in yours.columns.items():
@@ -105,12 +104,17 @@ def assert_comes_back(root: Path, episodes: list[Episode]) -> None:
                 np.testing.assert_array_equal(mine.columns[key], values, err_msg=key)
 
 
+def episode_frames(root: Path, key: str, episode: int) -> np.ndarray:
+    """An episode's pictures of one camera, decoded, (T, height, width, 3)."""
+    dataset = Dataset.open(root)
+    return dataset.frames(key, dataset.rows_of(episode))
+
+
 def video_rows(root: Path) -> dict[Path, int]:
     """Every video file of a dataset -> the frames that the rows of `meta/episodes` put into it."""
     rows: Counter[Path] = Counter()
-    for key in camera_keys(root):
-        for clip in find_clips(root, key, 1):
-            part = to_part(clip, key, VIDEO_PATH)
+    for key in Dataset.open(root).cameras:
+        for part in Dataset.open(root).camera(key).parts:
             rows[root / part.path] += part.count
     return dict(rows)
 

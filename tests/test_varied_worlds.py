@@ -19,9 +19,8 @@ from manip_il.collect.source import open_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
 from manip_il.data.build import build, merge_datasets
-from manip_il.data.draws import read_drawn
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, read_journal
-from manip_il.data.lerobot_read import read_episodes
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder
 from manip_il.errors import MismatchError
@@ -127,8 +126,10 @@ def test_an_episode_names_its_draws_and_journal_and_dataset_keep_them(
         found = drawn_in(state.variation, ManipEnv.of(config).scene.nominal)
         assert found.keys() == episode.drawn.keys() - NOT_IN_THE_WORLDS_NUMBERS
     build(tmp_path / "varied.journals", tmp_path / "varied")
-    assert read_drawn(tmp_path / "varied") == {at: episode.drawn for at, episode in enumerate(episodes)}
-    assert [one.drawn for one in read_episodes(tmp_path / "varied")] == [one.drawn for one in episodes]
+    assert Dataset.open(tmp_path / "varied").episodes.drawn == {
+        at: episode.drawn for at, episode in enumerate(episodes)
+    }
+    assert [one.drawn for one in Dataset.open(tmp_path / "varied").read_episodes()] == [one.drawn for one in episodes]
     assert examine_folder(tmp_path / "varied") == []
 
 
@@ -141,7 +142,7 @@ def test_a_dataset_of_varied_worlds_merges_with_one_of_the_plain_world(
     for name, ones in (("varied", episodes), ("plain", plain)):
         write_dataset(ones, tmp_path / name, env_spec(config), repo_id=f"local/{name}", **about)
     merge_datasets([tmp_path / "varied", tmp_path / "plain"], tmp_path / "both", repo_id="local/both")
-    assert list(read_drawn(tmp_path / "both").values()) == [one.drawn for one in [*episodes, *plain]]
+    assert list(Dataset.open(tmp_path / "both").episodes.drawn.values()) == [one.drawn for one in [*episodes, *plain]]
     assert open_source(tmp_path / "both").conditions == ()  # its states say how each frame looks
     assert examine_folder(tmp_path / "both") == []
 
@@ -183,7 +184,7 @@ def test_the_same_seeds_give_the_same_bytes_with_one_worker_or_two(tmp_path: Pat
     assert main([*words, "--workers=1", f"--dataset.root={tmp_path / 'one'}"]) == 0
     assert main([*words, "--workers=2", f"--dataset.root={tmp_path / 'two'}"]) == 0
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
-    assert len({str(drawn) for drawn in read_drawn(tmp_path / "one").values()}) == 3
+    assert len({str(drawn) for drawn in Dataset.open(tmp_path / "one").episodes.drawn.values()}) == 3
 
 
 def test_episodes_of_any_shape_have_the_shapes_that_are_asked_for_and_say_so(tmp_path: Path, capsys):
@@ -201,7 +202,7 @@ def test_episodes_of_any_shape_have_the_shapes_that_are_asked_for_and_say_so(tmp
     assert main(["doctor", str(tmp_path / "round")]) == 0
     assert "shape cylinder or sphere, size 0.0" in capsys.readouterr().out
     assert main([*words, f"--dataset.root={tmp_path / 'any'}"]) == 0
-    assert {one["shape"] for one in read_drawn(tmp_path / "any").values()} == set(SHAPES)
+    assert {one["shape"] for one in Dataset.open(tmp_path / "any").episodes.drawn.values()} == set(SHAPES)
 
 
 @pytest.mark.parametrize(

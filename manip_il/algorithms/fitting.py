@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from manip_il.algorithms.config import RunConfig
 from manip_il.collect.environments import env_actions, env_fingerprint, env_spec
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.dataset import joined_columns
 from manip_il.data.schema import ACTION, ACTOR, EXECUTED_ACTION, ROUND
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.learn.fit_config import LEROBOT, FitConfig
@@ -35,7 +35,7 @@ def fit_round(
     """
     fit, weights = round_fit(config, init_from, member), frame_weights(config, roots)
     if fit.is_mlp:
-        return fit_table(config, read_tables(roots, LEARNING_COLUMNS), folder, fit, on_log, weights)
+        return fit_table(config, joined_columns(roots, LEARNING_COLUMNS), folder, fit, on_log, weights)
     from manip_il.learn.fit_policy import begin_fit  # torch stays out of what only rolls out
 
     with begin_fit(
@@ -94,4 +94,4 @@ def frame_weights(config: RunConfig, roots: Sequence[Path]) -> F64 | None:
     if config.sampling.is_even:
         return None
     scale = env_actions(config.env).scale
-    return config.sampling.weights(read_tables(roots, COLUMNS), scale)
+    return config.sampling.weights(joined_columns(roots, COLUMNS), scale)

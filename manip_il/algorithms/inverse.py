@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX
-from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import ManipError
 from manip_il.rewards.demonstrations import Demonstration
 from manip_il.robots.robot import get_robot
@@ -47,9 +47,10 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     Raises `ManipError` for a dataset that lacks what tells layouts and paths, naming it, for a robot that is not known
     here, and where no episode reached the goal; and what `read_spec` and `read_table` raise.
     """
-    spec = read_spec(root)
+    dataset = Dataset.open(root)
+    spec = dataset.spec
     places = _places(root, spec)
-    table = read_table(root, [schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
+    table = dataset.columns([schema.ENVIRONMENT_STATE, schema.SUCCESS, EPISODE_INDEX])
     scene = build_scene(get_robot(spec.robot).name, CARRY, spec.object)
     index = table[EPISODE_INDEX].ravel()
     found = list[Carried]()

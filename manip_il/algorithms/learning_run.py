@@ -32,7 +32,7 @@ from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import dataset_sha256
-from manip_il.data.lerobot_read import read_spec
+from manip_il.data.dataset import Dataset
 from manip_il.errors import MismatchError, UsageError
 from manip_il.evaluation.results import FILE_NAME, EvalResult
 from manip_il.evaluation.runner import HOLD, evaluate
@@ -84,7 +84,7 @@ class LearningRun:
         self._validated_at = 0
         self._seconds = dict.fromkeys(STAGES, 0.0)
         self._given = _hashes(config, reward)
-        spec = read_spec(config.datasets[0]) if config.datasets else env_spec(config.env)
+        spec = Dataset.open(config.datasets[0]).spec if config.datasets else env_spec(config.env)
         self._spec = spec
         self.conversion = start_conversion(config.start, config.action_space, spec)
         demonstrations = read_demonstrations(config.datasets, self.conversion.encode) if config.datasets else None

@@ -44,8 +44,8 @@ from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Header, list_episodes, read_header
-from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
 from manip_il.errors import MismatchError, NothingToLearnError
 from manip_il.evaluation.results import FILE_NAME, EpisodeResult, EvalResult
 from manip_il.evaluation.runner import evaluate
@@ -166,7 +166,7 @@ class Run:
     def _scenes(self, round_: int) -> tuple[int, int]:
         """How many scenes a round gets, as many a state as round 0's, and the number of the first."""
         made = [one.dataset for one in self._made.values() if one.dataset is not None and one.round <= round_]
-        states = [dataset_info(dataset).frames for dataset in made]
+        states = [len(Dataset.open(dataset)) for dataset in made]
         counts = [max(1, self.config.redraw * count // states[0]) for count in states]
         return counts[-1], sum(counts[:-1])
 
@@ -260,11 +260,13 @@ class Run:
         with self._timed("collect"):
             if not self._is_recorded(0):
                 merge_datasets(datasets, root, repo_id=self._repo_id(0), provenance={"given": found})
-        for (one, ours), theirs in zip(found.items(), read_provenance(root).get("given", {}).values(), strict=True):
+        for (one, ours), theirs in zip(
+            found.items(), Dataset.open(root).provenance.get("given", {}).values(), strict=True
+        ):
             if ours != theirs:
                 raise MismatchError("content of a dataset", one, ours, f"the run in {self.folder}", theirs)
-        info = dataset_info(root)
-        labels = int(read_table(root, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum())
+        info = Dataset.open(root).summary
+        labels = _count_labels(root)
         self._made[0] = Rollouts(0, root, 1.0, labels, labels, info.episodes, info.success or 0, info.frames)
         return self._made[0]
 
@@ -281,7 +283,7 @@ class Run:
         here = self._folder(round_)
         headers = [read_header(path) for path in list_episodes(here / JOURNALS)]
         dataset = here / DATASET if self._is_recorded(round_) else None
-        labels = int(read_table(dataset, (schema.LABEL_VALID,))[schema.LABEL_VALID].sum()) if dataset else 0
+        labels = _count_labels(dataset) if dataset else 0
         steps = sum(header.frames for header in headers)
         queries = steps if queried_everywhere else labels
         successes = sum(header.success for header in headers)
@@ -308,7 +310,7 @@ class Run:
         rounds = [one.dataset for one in self._made.values() if one.dataset is not None]
         if not rounds:
             return
-        if root.is_dir() and dataset_info(root).episodes == sum(dataset_info(one).episodes for one in rounds):
+        if root.is_dir() and _episodes(root) == sum(map(_episodes, rounds)):
             return
         shutil.rmtree(root, ignore_errors=True)
         name = f"local/{config.env.robot}_{config.env.task}_dagger"
@@ -320,6 +322,14 @@ class Run:
         started = time.monotonic()
         yield
         self._seconds[stage] = self._seconds.get(stage, 0.0) + time.monotonic() - started
+
+
+def _count_labels(root: Path) -> int:
+    return int(Dataset.open(root).columns([schema.LABEL_VALID])[schema.LABEL_VALID].sum())
+
+
+def _episodes(root: Path) -> int:
+    return Dataset.open(root).info.episodes
 
 
 def round_folder(folder: Path, round_: int) -> Path:

@@ -52,18 +52,19 @@ class AdversarialOptions(LearningOptions):
     def environment(self) -> EnvConfig:
         """Return the environment of the demonstrations, which must be known here and one and the same."""
         from manip_il.collect.environments import is_known
-        from manip_il.data.lerobot_read import read_fingerprint, read_spec
+        from manip_il.data.dataset import Dataset
         from manip_il.learn.sources import check_same_sources
         from manip_il.sim.config import EnvConfig
 
         roots = self.roots
-        specs = [read_spec(root) for root in roots]
+        opened = [Dataset.open(root) for root in roots]
+        specs = [one.spec for one in opened]
         check_same_sources(roots, specs, pictures=False, language=False)
         spec = specs[0]
         if not is_known(spec.robot, spec.task):
             raise UsageError(f"{roots[0]} is for {spec.robot} {spec.task}, which cannot be simulated here")
-        for root, one in zip(roots, specs, strict=True):
-            check_dataset(root, one, read_fingerprint(root))
+        for one in opened:
+            check_dataset(one.root, one.spec, one.fingerprint)
         return EnvConfig(spec.robot, spec.task, spec.fps, object=spec.object)
 
     def algorithm(self) -> Callable[[LearningRun, LearningConfig], Iterator[Iteration]]:

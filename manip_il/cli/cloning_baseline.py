@@ -16,8 +16,8 @@ from manip_il.collect.record import MAX_TRIES, collect_successes, provenance, re
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import write_file
 from manip_il.data.build import Recording
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
-from manip_il.data.lerobot_read import read_table
 from manip_il.data.schema import LABEL_VALID
 from manip_il.learn.columns import LEARNING_COLUMNS
 from manip_il.seeding import stream_seeds
@@ -33,7 +33,7 @@ def clone_with_labels(
     """
     if not (folder / "dataset").is_dir():
         _demonstrate(config, labels, round_folder(run, 0), folder, engine, stages)
-    table = read_table(folder / "dataset", LEARNING_COLUMNS)
+    table = Dataset.open(folder / "dataset").columns(LEARNING_COLUMNS)
     so_far = np.cumsum(table[LABEL_VALID])
     rows = int(np.searchsorted(so_far, labels)) + 1
     stages.start("cloning with as many labels, fit", round_fit(config).total_steps)

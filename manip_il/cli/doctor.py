@@ -14,8 +14,8 @@ from manip_il.option import option
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from manip_il.doctor.dataset import Dataset
     from manip_il.doctor.finding import Finding
+    from manip_il.doctor.patient import Patient
 
 _MODEL = "model_sha256"
 
@@ -39,7 +39,7 @@ class DoctorOptions:
 
     def run(self) -> None:
         """Examine, repair where asked, and say the verdict; raises `NotWhole` where something stays wrong."""
-        from manip_il.data.draws import read_drawn, summary
+        from manip_il.data.episode_table import summarise_drawn
         from manip_il.doctor.examine import has_errors, repair, verdict
         from manip_il.doctor.finding import NotWhole
 
@@ -53,37 +53,36 @@ class DoctorOptions:
         if has_errors(findings):
             raise NotWhole(verdict(dataset, findings))
         say(verdict(dataset, findings))
-        if drawn := summary(read_drawn(self.dataset).values()):
+        if dataset.episodes and (drawn := summarise_drawn(dataset.episodes.drawn.values())):
             say(f"its episodes draw {drawn}")
 
-    def _examine(self) -> tuple[Dataset, list[Finding]]:
-        from manip_il.doctor.dataset import Dataset
+    def _examine(self) -> tuple[Patient, list[Finding]]:
         from manip_il.doctor.examine import CHECKS, examine
+        from manip_il.doctor.patient import Patient
 
         findings: list[Finding] = []
         with progress(None, "files examined") as bar:
             named = self.dataset.name not in ("", "..")  # journals and copies beside it are named after it
-            dataset = Dataset(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
+            dataset = Patient(self.dataset if named else self.dataset.resolve(), on_file=bar.advance)
             for finding in examine(dataset, (*CHECKS, check_robot)):
                 say(str(finding))
                 findings.append(finding)
         return dataset, findings
 
 
-def check_robot(dataset: Dataset) -> Iterator[Finding]:
+def check_robot(dataset: Patient) -> Iterator[Finding]:
     """Compare joints, state and compiled model with those of the robot and task in this program."""
     from manip_il.data.fingerprint import compare_fingerprints
     from manip_il.data.lerobot_layout import OURS
-    from manip_il.data.lerobot_read import read_fingerprint
     from manip_il.doctor.finding import error, warning
-    from manip_il.doctor.meta import read_spec
 
-    if not dataset.is_ours:
-        return
     try:
-        spec, fingerprint = read_spec(dataset), read_fingerprint(dataset.root)
-    except (OSError, ValueError, TypeError, RecursionError, ManipError):
+        own = dataset.own
+    except ManipError:
         return  # named by the check of the spec
+    if own is None:
+        return
+    spec, fingerprint = own.spec, own.fingerprint
     from manip_il.collect.environments import env_fingerprint, env_spec, is_known
     from manip_il.sim.env import EnvConfig
     from manip_il.sim.variation import OLDER

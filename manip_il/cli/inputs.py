@@ -106,17 +106,17 @@ def check_given(config: RunConfig) -> None:
     Raises what `check_policy` raises.
     """
     from manip_il.collect.environments import env_spec
-    from manip_il.data.lerobot_read import read_fingerprint, read_spec
+    from manip_il.data.dataset import Dataset
     from manip_il.learn.checkpoint import read_meta
     from manip_il.learn.pretrained import read_config, require_trust
     from manip_il.learn.sources import check_same_sources
 
     recorded = None if config.redraw else config.cameras
     here, run = env_spec(config.env, recorded), f"{config.env.robot} {config.env.task} of this run"
-    specs = [read_spec(root) for root in config.datasets]
-    for root, spec in zip(config.datasets, specs, strict=True):
-        check_same_sources((root, Path(run)), (spec, here), pictures=config.cameras is not None, language=False)
-        check_dataset(root, spec, read_fingerprint(root))
+    for root in config.datasets:
+        given = Dataset.open(root)
+        check_same_sources((root, Path(run)), (given.spec, here), pictures=config.cameras is not None, language=False)
+        check_dataset(root, given.spec, given.fingerprint)
     if config.start is None:
         return
     require_trust(read_config(config.start), str(config.start), config.fit.trust, config.start)

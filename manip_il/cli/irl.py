@@ -52,12 +52,12 @@ class IrlOptions:
             open_line,
             summary_lines,
         )
-        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
         from manip_il.rewards.methods import learn
         from manip_il.seeding import rng_for, stream_base
 
-        info, begin, timings = dataset_info(self.dataset), time.monotonic(), dict[str, float]()
+        info, begin, timings = Dataset.open(self.dataset).summary, time.monotonic(), dict[str, float]()
         with progress(info.episodes, f"irl {self.dataset}") as bar:
             carried = read_carried(self.dataset, bar.advance)
         timings["reading"] = time.monotonic() - begin

@@ -206,14 +206,14 @@ class PreferencesFitOptions:
         say(f"next: manip-il score DATASET --reward={folder} --output_dir=runs/scores")
 
     def _write(self, folder: Path, found: Any, clips: Any) -> None:
-        from manip_il.data.lerobot_read import read_fingerprint
+        from manip_il.data.dataset import Dataset
         from manip_il.evaluation.results import write_json
         from manip_il.learn.checkpoint import PRETRAINED_MODEL
         from manip_il.learn.preference.modeling_preference import write_reward
 
         target = folder / PRETRAINED_MODEL
         target.mkdir(parents=True, exist_ok=True)
-        fingerprint = read_fingerprint(Path(clips.pairs.sources[0].root))
+        fingerprint = Dataset.open(Path(clips.pairs.sources[0].root)).fingerprint
         options = {"seed": self.seed, "pairs": clips.pairs.sha256, "clip": clips.pairs.length}
         write_reward(target, found.fit.network, found.shape, clips.frames[0].spec, options, fingerprint)
         write_json(folder / "fit.json", found.to_json())

@@ -119,7 +119,7 @@ class RecordOptions(common.EnvOptions):
 
     def _is_complete(self, root: Path, journals: Path) -> bool:
         """Return whether a resumed recording is complete."""
-        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.dataset import Dataset
 
         if not self.resume:
             return False
@@ -129,7 +129,7 @@ class RecordOptions(common.EnvOptions):
             return False
         if not journals.is_dir():
             raise ManipError(f"no {journals} to continue from; record {root} again with --overwrite=true")
-        return dataset_info(root).episodes == self.dataset.num_episodes
+        return Dataset.open(root).info.episodes == self.dataset.num_episodes
 
     def _record(self, engine: Engine, job: RolloutJob, root: Path, journals: Path) -> None:
         from manip_il.collect.record import MAX_TRIES, collect_successes, journal_of, provenance, record
@@ -229,11 +229,11 @@ class RenderOptions:
         from manip_il.collect.source import open_source
         from manip_il.collect.workers import default_workers
         from manip_il.data.build import local_id
-        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.dataset import Dataset
 
         source = open_source(self.source, self.robot.type)
         warn(*source.warnings)
-        with exclusive(self.target), progress(dataset_info(self.source).episodes, f"render {self.source}") as bar:
+        with exclusive(self.target), progress(Dataset.open(self.source).info.episodes, f"render {self.source}") as bar:
             info = render_dataset(
                 source,
                 self.target,

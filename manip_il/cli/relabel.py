@@ -49,12 +49,12 @@ class RelabelOptions:
         from manip_il.collect.source import open_source
         from manip_il.collect.workers import default_workers
         from manip_il.data.build import local_id
-        from manip_il.data.lerobot_read import dataset_info
+        from manip_il.data.dataset import Dataset
 
         target, workers = self._target(), self.workers or default_workers()
         source = open_source(self.dataset, self.robot.type)
         warn(*source.warnings)
-        with exclusive(target), progress(dataset_info(self.dataset).episodes, f"relabel {self.dataset}") as bar:
+        with exclusive(target), progress(Dataset.open(self.dataset).info.episodes, f"relabel {self.dataset}") as bar:
             changes = relabel_dataset(
                 source,
                 target,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # the learner takes a second to import
 RANK = "RANK"  # the variable by which processes that were started together know their place
 # What may differ when a fit is resumed: nothing of it changes the weights.
 _FREE = (
-    *("threads", "processes", "log_freq", "save_freq", "num_workers", "memory"),
+    *("threads", "processes", "log_freq", "save_freq", "num_workers"),
     *("dataset.root", "output_dir", "tensorboard", "wandb", "trust"),
 )
 
@@ -74,7 +74,6 @@ class TrainOptions:
     scheduler: Open = option_of(FitConfig, "scheduler")
     image_augment: bool | None = option_of(FitConfig, "image_augment")
     image_cache_gb: float = option_of(FitConfig, "image_cache_gb")
-    memory: float | None = option_of(FitConfig, "memory")
     num_workers: int = option_of(FitConfig, "num_workers")
     output_dir: Path = option(Path("runs/train"), "folder of the run")
     seed: int = option(0, "seed of weights and batches, 0 to 1000")
@@ -150,11 +149,12 @@ class TrainOptions:
         """Return how often each frame is drawn, relative to the others, (N,); None where all are drawn alike."""
         if self.weights is None:
             return None
-        from manip_il.data.lerobot_read import dataset_info, read_table
+        from manip_il.data.dataset import Dataset
         from manip_il.learn.weights import rabc_weights, read_progress
 
-        episodes = read_table(root, ["episode_index"])["episode_index"].astype("int64")
-        ahead = getattr(lerobot.policy, "chunk_size", None) or dataset_info(root).fps
+        dataset = Dataset.open(root)
+        episodes = dataset.columns(["episode_index"])["episode_index"].astype("int64")
+        ahead = getattr(lerobot.policy, "chunk_size", None) or int(dataset.fps)
         weights = rabc_weights(read_progress(self.weights, episodes), episodes, ahead)
         say(f"{(weights == 0).mean():.1%} of the frames weigh 0, {(weights == 1).mean():.1%} weigh 1")
         return weights
@@ -184,17 +184,20 @@ class TrainOptions:
         self, lerobot: LeRobotFit, roots: tuple[Path, ...]
     ) -> tuple[RobotTaskSpec, Mapping[str, Any], Sources]:
         """Return spec and fingerprint of the first dataset, and all of them, which must agree with it."""
-        from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_spec
+        from manip_il.data.dataset import Dataset
         from manip_il.learn.pretrained import PLAIN
         from manip_il.learn.sources import Sources, check_same_sources
 
-        specs, fingerprints = [read_spec(root) for root in roots], [read_fingerprint(root) for root in roots]
+        opened = [Dataset.open(root) for root in roots]
+        specs = [one.spec for one in opened]
         pictures, language = lerobot.observation != "state", lerobot.policy.type not in PLAIN
         check_same_sources(roots, specs, pictures=pictures, language=language)
-        for root, spec, fingerprint in zip(roots, specs, fingerprints, strict=True):
-            check_dataset(root, spec, fingerprint)
-        frames = tuple(dataset_info(root).frames for root in roots)
-        return specs[0], fingerprints[0], Sources(roots, frames, tuple(self.dataset.weights))
+        for one in opened:
+            check_dataset(one.root, one.spec, one.fingerprint)
+            odd = [key for key in one.cameras if pictures and not one.features[key].is_rgb]
+            warn(*(f"{one.root}: {key} is left out: it holds depth, or no RGB pictures" for key in odd))
+        frames = tuple(map(len, opened))
+        return specs[0], opened[0].fingerprint, Sources(roots, frames, tuple(self.dataset.weights))
 
     def _begin(self, config: FitConfig) -> Stages:
         """Write the options, now that what can be wrong has been found, and return the display."""
@@ -204,15 +207,13 @@ class TrainOptions:
         return Stages(kept=f"every finished checkpoint in {self.output_dir} (one every {steps:,} steps)")
 
     def _fit_mlp(self, config: FitConfig, data: Mapping[str, Any]) -> Path:
-        from manip_il.data.lerobot_read import read_tables
+        from manip_il.data.dataset import joined_columns
         from manip_il.learn.columns import LEARNING_COLUMNS
-        from manip_il.learn.room import numbers_of, room
         from manip_il.learn.train import fit
 
         with self._begin(config) as stages:
             roots = data["sources"].roots
-            allocate = room(config, self.output_dir, sum(data["sources"].frames), numbers_of(data["spec"]))
-            table = read_tables(roots, (*LEARNING_COLUMNS, "frame_index"), allocate)
+            table = joined_columns(roots, (*LEARNING_COLUMNS, "frame_index"))
             stages.start(f"train on {len(table['action']):,} frames", config.total_steps)
             return fit(
                 table,
@@ -249,7 +250,7 @@ class TrainOptions:
     @contextlib.contextmanager
     def _decoding(self) -> Iterator[Callable[[int], None]]:
         """Yield a callback for the number of pictures just decoded; a bar is displayed from the first one on."""
-        from manip_il.data.lerobot_read import camera_keys, dataset_info
+        from manip_il.data.dataset import Dataset
 
         with contextlib.ExitStack() as stack:
             bar = None
@@ -257,8 +258,8 @@ class TrainOptions:
             def decoded(frames: int) -> None:
                 nonlocal bar
                 if bar is None:
-                    roots = self.dataset.root
-                    total = sum(dataset_info(root).frames * len(camera_keys(root)) for root in roots)
+                    opened = map(Dataset.open, self.dataset.root)
+                    total = sum(len(one) * len(one.cameras) for one in opened)
                     bar = stack.enter_context(progress(total, "decode pictures, once"))
                 bar.advance(frames)
 
@@ -272,10 +273,10 @@ class TrainOptions:
 
 def _look(roots: Sequence[Path]) -> dict[str, Any] | None:
     """The light of the first dataset's pictures, in which the policy is evaluated; warn where others have another."""
-    from manip_il.data.lerobot_read import read_fingerprint, read_provenance
+    from manip_il.data.dataset import Dataset
     from manip_il.learn.checkpoint import recorded_look
 
-    first, *others = [recorded_look(read_provenance(root), read_fingerprint(root)) for root in roots]
+    first, *others = [recorded_look(one.provenance, one.fingerprint) for one in map(Dataset.open, roots)]
     for root, look in zip(roots[1:], others, strict=True):
         if look != first:
             warn(f"light of the pictures differs: {roots[0]} has {first}, {root} has {look}; evaluated in the first")

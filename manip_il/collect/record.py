@@ -17,8 +17,8 @@ from manip_il.collect.redraw import STATES, RedrawJob, write_states
 from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
 from manip_il.data.build import Recording, dataset_sha256, local_id
+from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import Header, Journal, list_seeds
-from manip_il.data.lerobot_read import DatasetInfo
 from manip_il.data.schema import IMAGES
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode

@@ -21,8 +21,8 @@ from manip_il.collect.query import branch
 from manip_il.collect.rollout import Labeller
 from manip_il.data import schema
 from manip_il.data.atomic import write_file, writing
+from manip_il.data.dataset import Dataset
 from manip_il.data.episodes import to_episode
-from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Actor, Episode, Label, Observation, State, Transition
 from manip_il.seeding import BLOCK, rng_for, stream_base
@@ -104,7 +104,7 @@ def write_states(source: Path, folder: Path, seed: int) -> int:
 
     Raises `ManipError` for a dataset without `sim_state`, and where they cannot be written.
     """
-    states = read_table(source, [schema.SIM_STATE])[schema.SIM_STATE]
+    states = Dataset.open(source).columns([schema.SIM_STATE])[schema.SIM_STATE]
     order = rng_for(seed, "order of redrawn states").permutation(len(states))
     content = io.BytesIO()
     np.save(content, states[order], allow_pickle=False)

@@ -18,7 +18,6 @@ from manip_il.collect.rollout import Labeller
 from manip_il.collect.source import Source
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
-from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_provenance
 from manip_il.data.lerobot_write import own_file
 from manip_il.data.rewrite import rewrite_columns
 from manip_il.mdp import Episode, State
@@ -76,11 +75,11 @@ def relabel_dataset(
             yield columns
 
     origin = {"from": source.root.name, "sha256": dataset_sha256(source.root)}
-    simulated = {key: value for key, value in read_fingerprint(source.root).items() if key.endswith("_sha256")}
+    simulated = {key: value for key, value in source.dataset.fingerprint.items() if key.endswith("_sha256")}
     fingerprint = {**env_fingerprint(source.env), **simulated}
-    provenance = {**read_provenance(source.root), "relabelled": origin}
+    provenance = {**source.dataset.provenance, "relabelled": origin}
     about = own_file(repo_id, source.spec, fingerprint, provenance)
-    episodes = read_episodes(source.root, pictures=False)
+    episodes = source.dataset.read_episodes(pictures=False)
     with closing(map_in_order(partial(_label_episode, source.env), episodes, workers)) as found:
         rewrite_columns(source.root, target, relabelled(), about, replace=replace)
     return changes

@@ -16,7 +16,7 @@ from manip_il.child_processes import map_in_order
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.source import Source
 from manip_il.data import schema
-from manip_il.data.lerobot_read import DatasetInfo, read_episodes, read_fingerprint, read_provenance
+from manip_il.data.info import DatasetInfo
 from manip_il.data.lerobot_write import new_dataset
 from manip_il.errors import RenderError
 from manip_il.mdp import Episode, State
@@ -47,9 +47,9 @@ def render_dataset(
     look = env_fingerprint(source.env, cameras)["cameras_sha256"]
     names = env_spec(source.env, cameras).keypoints
     spec = dataclasses.replace(source.spec, cameras=cameras.names, image_size=cameras.size, keypoints=names)
-    fingerprint = {**read_fingerprint(source.root), "cameras_sha256": look}
+    fingerprint = {**source.dataset.fingerprint, "cameras_sha256": look}
     rendered = {"from": source.root.name, "cameras": dataclasses.asdict(cameras)}
-    states = read_episodes(source.root, pictures=False)
+    states = source.dataset.read_episodes(pictures=False)
     with (
         new_dataset(target, spec, repo_id=repo_id, fingerprint=fingerprint, replace=replace) as writer,
         closing(render_episodes(states, source.env, cameras, workers, source.conditions)) as episodes,
@@ -58,7 +58,7 @@ def render_dataset(
             writer.add(episode)
             if on_episode is not None:
                 on_episode(episode)
-        return writer.finish({**read_provenance(source.root), "rendered": rendered})
+        return writer.finish({**source.dataset.provenance, "rendered": rendered})
 
 
 def render_episodes(

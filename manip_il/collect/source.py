@@ -9,9 +9,9 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.lerobot_layout import OURS
-from manip_il.data.lerobot_read import UNKNOWN_TASK, read_fingerprint, read_provenance, read_spec
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.robots.robot import ROBOTS, get_robot
@@ -32,11 +32,16 @@ class Source:
     warnings: what may make the restored world differ from the recorded one. conditions: what its episodes draw from.
     """
 
-    root: Path
+    dataset: Dataset
     spec: RobotTaskSpec
     env: EnvConfig
     warnings: tuple[str, ...]
     conditions: tuple[Condition, ...] = ()
+
+    @property
+    def root(self) -> Path:
+        """Folder of the dataset."""
+        return self.dataset.root
 
 
 def open_source(root: Path, robot: str | None = None) -> Source:
@@ -45,7 +50,8 @@ def open_source(root: Path, robot: str | None = None) -> Source:
     Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
     a robot and task that are known here, `MismatchError` where its states do not fit them.
     """
-    spec = read_spec(root)
+    dataset = Dataset.open(root)
+    spec = dataset.spec
     if spec.task == UNKNOWN_TASK:
         raise ManipError(
             f"{root} does not name its task: {OURS} is missing; LeRobot's tools drop it: render or relabel first"
@@ -65,11 +71,11 @@ def open_source(root: Path, robot: str | None = None) -> Source:
     lacks = size - spec.sim_state_size  # of states from before they held all draws
     if lacks not in (0, *OLDER):
         raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
-    here, there = env_fingerprint(env), read_fingerprint(root)
+    here, there = env_fingerprint(env), dataset.fingerprint
     left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
     differences = tuple(compare_fingerprints(str(root), left, "this machine", right))
-    conditions = recorded_conditions(root, read_provenance(root)) if lacks == max(OLDER) else ()
-    return Source(root, spec, env, differences, conditions)
+    conditions = recorded_conditions(root, dataset.provenance) if lacks == max(OLDER) else ()
+    return Source(dataset, spec, env, differences, conditions)
 
 
 def recorded_conditions(root: Path, provenance: Mapping[str, Any]) -> tuple[Condition, ...]:

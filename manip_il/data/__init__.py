@@ -5,12 +5,12 @@ environment must share. `episodes.py` turns transitions into an `Episode` with t
 that a dataset takes of rollouts.
 
 `journal.py` writes one MCAP file for every finished episode, at once: a journal. `build.py` makes a dataset of a folder
-of journals, or one dataset of several. `lerobot_write.py` writes datasets episode by episode with pyarrow and PyAV;
-`lerobot_read.py` reads them as numpy arrays; `lerobot_library.py` is LeRobot's own writer, and its
-metadata for policies. Around them: LeRobot's paths and types (`lerobot_layout.py`), statistics (`lerobot_stats.py`),
-parquet (`parquet_files.py`, `parquet_limits.py`, `picture_columns.py`), videos (`video.py` writes, `pictures.py`
-reads, and nothing else opens a picture), and pictures for training (`frame_source.py`): in a cache (`frame_cache.py`),
-or decoded when they are drawn (`lazy_frames.py`).
+of journals, or one dataset of several. `lerobot_write.py` writes datasets episode by episode with pyarrow and PyAV.
+`dataset.py` opens any LeRobot dataset: `info.py` and `episode_table.py` parse its `meta/`, `camera.py` finds and
+decodes its pictures, `statistics.py` has its statistics. `lerobot_library.py` is LeRobot's own writer, and its metadata
+for policies. Around them: LeRobot's paths and Arrow types (`lerobot_layout.py`), parquet (`parquet_files.py`), films
+and pictures (`video.py` writes, `pictures.py` reads, and nothing else opens a picture), and a cache of decoded pictures
+for training (`frame_cache.py`). `gate.py` tries in a child process what arrives from outside.
 
 What the room promises:
 
@@ -19,7 +19,7 @@ What the room promises:
 - Equal bytes. The same episodes in the same order give the same journals and the same dataset, videos included, whether
   it is written while episodes come or built from their journals later. `fingerprint.py` says when two environments
   promise equal episodes.
-- Everything read is checked. Datasets may come from anyone: names never lead out of their folder, sizes are bounded
-  before anything is unpacked, and whatever is wrong is one `ManipError` that names the file. So it is with a journal,
-  whose checksums are compared before it is taken apart; its size is bounded when it is written.
+- What arrives passes the gate: each file is opened once with bounded memory and time. Names never lead out of their
+  folder, and whatever is wrong is one `ManipError` that names the file. Code from outside never runs.
+  A journal's checksums are compared before it is taken apart.
 """

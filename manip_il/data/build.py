@@ -18,20 +18,11 @@ from typing import Any
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, write_file
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import Selection
 from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import Header, list_episodes, read_journal
-from manip_il.data.lerobot_read import (
-    UNKNOWN_TASK,
-    DatasetInfo,
-    camera_keys,
-    check_dataset,
-    dataset_info,
-    read_episodes,
-    read_fingerprint,
-    read_provenance,
-    read_spec,
-)
 from manip_il.data.lerobot_write import DatasetWriter, new_dataset, own_file, write_dataset
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.data.video_config import VideoConfig
@@ -173,19 +164,20 @@ def merge_datasets(
     """
     if not roots:
         raise ManipError("no datasets to merge")
-    specs, first = [read_spec(source) for source in roots], read_fingerprint(roots[0])
-    for other, spec in zip(roots, specs, strict=True):
-        _check_mergeable(str(roots[0]), specs[0], str(other), spec)
-        for warning in compare_fingerprints(str(roots[0]), first, str(other), read_fingerprint(other)):
+    opened = [Dataset.open(source) for source in roots]
+    specs, first = [one.spec for one in opened], opened[0].fingerprint
+    for one in opened:
+        _check_mergeable(str(roots[0]), specs[0], str(one.root), one.spec)
+        for warning in compare_fingerprints(str(roots[0]), first, str(one.root), one.fingerprint):
             _LOG.warning("%s", warning)
-    sources = [{"name": source.name, "provenance": read_provenance(source)} for source in roots]
+    sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     spec = next((spec for spec in specs if spec.task != UNKNOWN_TASK), specs[0])
     origin = {**(provenance or {}), "merged": sources}
     fingerprint = first if fingerprint is None else fingerprint
-    if any(camera_keys(source) for source in roots):
+    if any(one.cameras for one in opened):
         about = own_file(repo_id, spec, fingerprint, origin)
         return _copy(roots[0], root, about) if len(roots) == 1 else _join_by_lerobot(roots, root, repo_id, about)
-    episodes = itertools.chain.from_iterable(read_episodes(source) for source in roots)
+    episodes = itertools.chain.from_iterable(one.read_episodes() for one in opened)
     return write_dataset(episodes, root, spec, repo_id=repo_id, fingerprint=fingerprint, provenance=origin)
 
 
@@ -200,11 +192,11 @@ def dataset_sha256(root: Path) -> str:
 
 def _copy(source: Path, root: Path, about: Mapping[str, Any]) -> DatasetInfo:
     """Copy files with their times of change, by which decoded pictures are found again."""
-    check_dataset(source)
+    Dataset.open(source)
     with new_folder(root) as folder:
         shutil.copytree(source, folder, dirs_exist_ok=True)
         layout.write_json(folder / layout.OURS, about)
-    return dataset_info(root)
+    return Dataset.open(root).summary
 
 
 def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Mapping[str, Any]) -> DatasetInfo:
@@ -217,7 +209,7 @@ def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Map
             path.rename(folder / path.name)
         work.rmdir()
         layout.write_json(folder / layout.OURS, about)
-    return dataset_info(root)
+    return Dataset.open(root).summary
 
 
 def _check_mergeable(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:

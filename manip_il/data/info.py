@@ -46,6 +46,20 @@ class Feature:
         return math.prod(self.shape)
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """One name a number: those of the file, whether a list or lists by group, else `<column>.<place>`."""
+        names: Any = self.names
+        groups = cast(dict[str, Any], names).values() if isinstance(names, dict) else [names]
+        found = [str(name) for group in groups if isinstance(group, list) for name in cast(list[Any], group)]
+        return tuple(found) if len(found) == self.size else tuple(f"{self.key}.{place}" for place in range(self.size))
+
+    @property
+    def is_rgb(self) -> bool:
+        """Whether it is a camera whose pictures are red, green and blue, and no depth."""
+        depth = self.details.get("is_depth_map") or self.details.get("video.is_depth_map")
+        return self.dtype in PICTURES and self.channels == 3 and not depth
+
+    @property
     def picture_size(self) -> tuple[int, int]:
         """Height and width [pixels]; the names say where they stand, else they come first."""
         names = cast(list[Any], self.names) if isinstance(self.names, list) else []
@@ -76,6 +90,21 @@ class Info:
     def of_dtype(self, *dtypes: str) -> list[Feature]:
         """Return features of these dtypes."""
         return [feature for feature in self.features.values() if feature.dtype in dtypes]
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """Names and counts of a dataset. success: episodes that succeeded at some step; None if no column says so."""
+
+    root: Path
+    robot: str
+    task: str
+    instruction: str
+    fps: float
+    episodes: int
+    frames: int
+    success: int | None
+    success_at_end: int | None
 
 
 class InvalidInfo(ManipError):

@@ -12,8 +12,8 @@ from typing import Any, override
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
+from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -22,23 +22,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 
-from datasets import Dataset
 from manip_il import checks
 from manip_il.data.atomic import PARTIAL, writing
-from manip_il.data.info import NUMBERS, PICTURES, Feature, read_info, read_object
-from manip_il.data.lazy_frames import without_progress_bars
-from manip_il.data.lerobot_layout import (
-    DATA_FILES,
-    EPISODES_FILES,
-    QUANTILES,
-    STAT_NAMES,
-    STATS,
-    TASK_INDEX,
-    TASKS,
-    write_json,
-)
-from manip_il.data.lerobot_read import check_all_pictures, check_dataset, read_instructions
-from manip_il.data.parquet_files import find_shards, read_file
+from manip_il.data.dataset import Dataset
+from manip_il.data.gate import check_arrived
+from manip_il.data.info import read_info, read_object
+from manip_il.data.lerobot_layout import DATA_FILES, STATS, TASK_INDEX, TASKS, write_json
 from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError, MismatchError
@@ -86,8 +75,14 @@ def write_with_library(
 
 def _save(dataset: LeRobotDataset) -> None:
     """Save an episode without LeRobot's progress bar."""
-    with without_progress_bars(), scheduling_kept():
-        dataset.save_episode(parallel_encoding=False)
+    enabled = is_progress_bar_enabled()
+    disable_progress_bar()
+    try:
+        with scheduling_kept():
+            dataset.save_episode(parallel_encoding=False)
+    finally:
+        if enabled:
+            enable_progress_bar()
 
 
 def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
@@ -96,8 +91,7 @@ def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
     Raises `ManipError` for one that its readers must not open, or that it cannot join.
     """
     for source in roots:
-        check_dataset(source)
-        check_all_pictures(source)
+        check_arrived(source)
     names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
     try:
         with writing(root), contextlib.redirect_stderr(io.StringIO()):  # its progress bars
@@ -147,16 +141,22 @@ class Metadata(LeRobotDatasetMetadata):
     @override
     def _load_metadata(self) -> None:
         """Read the files with this program's readers: LeRobot's decode what the files' own metadata asks for."""
+        dataset = Dataset.open(self.root)
         self.info = load_info(self.root)
-        texts = read_instructions(self.root)
+        texts = dataset.tasks
         if sorted(texts) != list(range(len(texts))):
             found = checks.shorten(sorted(texts))
             raise ManipError(
                 f"{self.root / TASKS}: task_index holds {found}; expected 0 to {len(texts) - 1}, each once"
             )
         self.tasks = _tasks([texts[number] for number in range(len(texts))])
-        self.episodes = _episodes(self.root)
-        self.stats = read_stats(self.root)
+        self.episodes = None  # nobody asks for them
+        self.stats = dataset.statistics
+        self.info.features = {
+            key: value
+            for key, value in self.info.features.items()
+            if key not in dataset.cameras or dataset.features[key].is_rgb
+        }
 
     def joint_tasks(self, own: I64) -> I64:
         """Return the joint number of the task of every frame of all datasets, (N,), from each dataset's own, (N,).
@@ -183,7 +183,7 @@ def read_metadata(*roots: Path) -> Metadata:
     that is no dataset, `MismatchError` for several of different rates or columns to learn from. Columns that not all
     have in one shape, cameras too, are left out; statistics are those of all frames, each counted once.
     """
-    metas = [_metadata(root) for root in roots]
+    metas = [Metadata(f"local/{root.name}", root=root) for root in roots]
     first = metas[0]
     for meta in metas[1:]:
         _check_same_nature(first, meta)
@@ -238,58 +238,3 @@ def _tasks(texts: Sequence[str]) -> pd.DataFrame:
 
 def _instructions(meta: Metadata) -> list[str]:
     return list(map(str, meta.tasks.index))
-
-
-def _metadata(root: Path) -> Metadata:
-    check_dataset(root)  # else LeRobot would request what is not there from the Hub
-    return Metadata(f"local/{root.name}", root=root)
-
-
-def _episodes(root: Path) -> Dataset:
-    """The table of episodes without their statistics."""
-    shards = find_shards(root, EPISODES_FILES)
-    kept = [[name for name in shard.columns if not name.startswith("stats/")] for shard in shards]
-    tables = [read_file(shard.path, names) for shard, names in zip(shards, kept, strict=True)]
-    try:
-        return Dataset(pa.concat_tables(tables))
-    except Exception as error:  # types that `datasets` does not know, files that differ in theirs
-        raise ManipError(f"cannot read {root}/meta/episodes: {error}; run `manip-il doctor` to see why") from error
-
-
-def read_stats(root: Path) -> dict[str, dict[str, NDArray[Any]]]:
-    """Return column -> statistic -> numbers, as LeRobot has them: (n,), of pictures (channels, 1, 1).
-
-    Raises `ManipError` for a statistic that is missing, that is not numbers, or that is not of the column's shape.
-    """
-    path = root / STATS
-    try:
-        found = read_object(path)
-    except FileNotFoundError:
-        advice = "run `manip-il doctor` to see what is left"
-        raise ManipError(f"{root} has no statistics ({STATS}); {advice}") from None
-    except (OSError, ValueError) as error:
-        raise ManipError(f"cannot read {path}: {error}; `manip-il doctor --repair=true` computes it again") from error
-    known = [feature for feature in read_info(root).of_dtype(*NUMBERS, *PICTURES) if feature.key in found]
-    return {feature.key: _statistics(path, feature, found[feature.key]) for feature in known}
-
-
-def _statistics(path: Path, feature: Feature, table: Any) -> dict[str, NDArray[Any]]:
-    shapes = {(feature.size,), feature.shape[-1:], feature.shape}
-    if feature.dtype in PICTURES:
-        shapes = {(count, 1, 1) for count in feature.shape}  # the names of its axes may be missing
-    statistics: dict[str, NDArray[Any]] = {}
-    for name in STAT_NAMES:
-        value = table.get(name) if isinstance(table, dict) else None
-        if value is None and name in QUANTILES:
-            continue
-        wanted = {(1,)} if name == "count" else shapes
-        try:
-            numbers = np.atleast_1d(np.asarray(value))
-        except (ValueError, OverflowError):
-            numbers = np.zeros(0, object)
-        if numbers.dtype.kind not in "iuf" or numbers.shape not in wanted:
-            shape = " or ".join(map(str, sorted(wanted)))
-            what = f"{name} of {feature.key} is {checks.shorten(value)}"
-            raise ManipError(f"{path}: {what}; expected numbers of shape {shape} (`manip-il doctor` tells more)")
-        statistics[name] = numbers
-    return statistics

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, writing
-from manip_il.data.draws import to_text
-from manip_il.data.lerobot_read import DatasetInfo
-from manip_il.data.lerobot_stats import I64, RunningStats, picture_stats, pixel_counts
+from manip_il.data.episode_table import drawn_text
+from manip_il.data.info import DatasetInfo
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
+from manip_il.data.statistics import I64, RunningStats, picture_stats, pixel_counts
 from manip_il.data.video import CameraFiles, CameraThreads, Clip, try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
@@ -140,7 +140,7 @@ class DatasetWriter:
         columns |= self._index_columns(len(episode), self._tasks.setdefault(task, len(self._tasks)))
         with _explained(self._root):
             row = self._write_data(columns | stills, len(episode), task) | _flat(self._stats.add(columns))
-            row[layout.DRAWN] = to_text(episode.drawn)
+            row[layout.DRAWN] = drawn_text(episode.drawn)
             for key, frames in stills.items():
                 row |= self._picture_columns(key, pixel_counts(frames), len(episode))
             self._encoding.append((row, self._cameras.write(films)))

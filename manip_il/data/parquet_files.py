@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,13 +16,14 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.parquet_limits import check_parquet
 from manip_il.data.pictures import to_png
 from manip_il.errors import ManipError, UnknownName
 
 MAGIC = b"PAR1"
 NO_FOOTER = "has no footer: its writer died before it closed the file, or the file was cut"
+_TEXT = ("string", "language")
 _ROWS = 16_384  # held at once
+_TASK_NAMES = ("task", "__index_level_0__")  # pandas' for an index with a name and for one without
 UNREADABLE = (OSError, pa.ArrowException, ValueError, MemoryError)  # ArrowInvalid and its like are ValueErrors too
 
 
@@ -108,25 +110,16 @@ def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def check_files(root: Path, paths: list[Path], columns: list[str] | None) -> None:
-    """Raise `ManipError` where files of a dataset cannot be read, or columns (None: all) unpack to too much."""
-    try:
-        check_parquet(paths, columns)
-    except (OSError, ValueError, pa.ArrowException) as error:
-        place = paths[0] if len(paths) == 1 else f"{root}/{paths[0].relative_to(root).parts[0]}"
-        raise ManipError(f"cannot read {place}: {error}; run `manip-il doctor` to see what is left") from error
-
-
 def read_file(path: Path, columns: list[str]) -> pa.Table:
     """Return columns of a file.
 
-    Raises `ManipError` for one that is damaged or unpacks to too much, `UnknownName` for a missing column.
+    Raises `ManipError` for one that is damaged, `UnknownName` for a missing column.
     """
     try:
-        check_parquet([path], columns)
-        # one thread: handing out pieces of one episode costs more than reading them
-        table = pq.ParquetFile(path).read(columns, use_threads=False)
-    except (OSError, ValueError, pa.ArrowException) as error:
+        with open(checks.open_regular(path), "rb") as stream:
+            # one thread: handing out pieces of one episode costs more than reading them
+            table = pq.ParquetFile(stream).read(columns, use_threads=False)
+    except UNREADABLE as error:
         raise ManipError(f"cannot read {path}: {error}; run `manip-il doctor` to see what is left") from error
     for name in columns:
         if name not in table.column_names:
@@ -134,34 +127,29 @@ def read_file(path: Path, columns: list[str]) -> pa.Table:
     return table.replace_schema_metadata(None)
 
 
-def read_column(root: Path, name: str, table: pa.Table, feature: Mapping[str, Any]) -> NDArray[Any]:
-    """Return a column, (T,) or (T, *shape), as `feature` says.
+def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int], *, exact: bool = False) -> NDArray[Any]:
+    """Return a column, (T,) or (T, *shape), as its feature says; text as objects.
 
-    Numbers of another width are taken, as they are; the doctor, by `to_array`, tells of them.
-    Raises `ManipError` naming the dataset `root` where values have another kind or shape, or some are missing.
+    exact: the numbers must have the width that the feature says, too. Raises `BadColumn` if values have another kind or
+    shape, or some are missing.
     """
-    shape, dtype = tuple(feature["shape"]), feature["dtype"]
-    column = table.column(name)
-    try:
-        values = _to_numpy(column, shape)
-        kind = "O" if dtype == "string" else np.dtype(dtype).kind
-    except (ValueError, TypeError, pa.ArrowException) as error:
-        raise ManipError(f"{root}: column {name!r} is not {dtype} of shape {shape}: {error}") from error
-    fits = values.shape[1:] == shape or (values.ndim == 1 and shape in ((1,), ()))  # a scalar may have no width
-    if column.null_count or values.dtype.kind != kind or len(values) != len(column) or not fits:
-        missing = f" with {column.null_count} missing" if column.null_count else ""
-        holds = checks.shorten(str(column.type))
-        raise ManipError(f"{root}: column {name!r} holds {holds}{missing}; expected {dtype} of shape {shape}")
-    return values
-
-
-def _to_numpy(column: pa.ChunkedArray, shape: Sequence[int]) -> NDArray[Any]:
-    array = column.combine_chunks()
-    length, nested = len(array), False
-    while _is_list(array.type):
+    array: Any = column.combine_chunks()
+    rows, size, nested = len(array), math.prod(shape), False
+    while True:
+        if isinstance(array.type, pa.BaseExtensionType):
+            array = array.storage
+        if array.null_count:
+            raise BadColumn(f"holds {array.null_count:,} missing values")
+        if not _is_list(array.type):
+            break
         array, nested = array.flatten(), True
+    found, wanted = _numpy_type(array.type), np.dtype(object if dtype in _TEXT else dtype)
+    if found.kind != wanted.kind or (exact and found != wanted):
+        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
+    if len(array) != rows * size:
+        raise BadColumn(f"holds {len(array):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
     values = array.to_numpy(zero_copy_only=False)
-    return values.reshape(length, *shape) if nested else values
+    return values.reshape(rows, *shape) if nested or size > 1 else values
 
 
 def _is_list(kind: pa.DataType) -> bool:
@@ -226,7 +214,6 @@ def open_shard(name: str, path: Path) -> Shard:
             return Shard(name, path, "is not a parquet file")
         if last != MAGIC or size < 12:
             return Shard(name, path, NO_FOOTER)
-        check_parquet([path])
         return Shard(name, path, columns=_column_names(path, size, path.stat().st_mtime_ns))
     except UNREADABLE as problem:
         return Shard(name, path, f"cannot be read: {problem}")
@@ -247,29 +234,11 @@ def read_tasks(root: Path) -> tuple[list[int], list[str]]:
         raise BadColumn(shard.problem)
     table = pa.concat_tables(shard.tables())
     numbers = integers(table, layout.TASK_INDEX)
-    names = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
-    if len(names) != 1:  # pandas names the index `task`, or leaves it without a name of its own
-        raise BadColumn(f"has {len(names)} columns of text; expected the tasks' names in one")
+    texts = [one.name for one in table.schema if pa.types.is_string(one.type) or pa.types.is_large_string(one.type)]
+    names = [name for name in texts if name in _TASK_NAMES] or texts
+    if len(names) != 1:
+        raise BadColumn(f"has {len(texts)} columns of text; expected the tasks' names in one called task")
     return numbers.tolist(), table.column(names[0]).to_pylist()
-
-
-def to_array(column: pa.ChunkedArray, dtype: str, shape: Sequence[int]) -> NDArray[Any]:
-    """Return rows as (T, numbers of a frame). Raises `BadColumn` where type, size or emptiness does not fit."""
-    array: Any = column.combine_chunks()
-    rows, size = len(array), int(np.prod(shape, dtype=np.int64))
-    while True:
-        if isinstance(array.type, pa.BaseExtensionType):
-            array = array.storage
-        if array.null_count:
-            raise BadColumn(f"holds {array.null_count:,} missing values")
-        if not _is_list(array.type):
-            break
-        array = array.flatten()
-    if str(_numpy_type(array.type)) != dtype:
-        raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
-    if len(array) != rows * size:
-        raise BadColumn(f"holds {len(array):,} numbers in {rows:,} rows; info.json says shape {list(shape)}")
-    return array.to_numpy(zero_copy_only=False).reshape(rows, size)
 
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
@@ -292,8 +261,8 @@ def _numbers(table: pa.Table, name: str, expected: str, *types: Callable[[pa.Dat
     return column.to_numpy()
 
 
-def _numpy_type(kind: pa.DataType) -> Any:
+def _numpy_type(kind: pa.DataType) -> np.dtype[Any]:
     try:
         return np.dtype(kind.to_pandas_dtype())
     except (NotImplementedError, TypeError):
-        return kind
+        return np.dtype("V")  # nothing that a feature can be

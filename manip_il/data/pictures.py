@@ -1,17 +1,12 @@
-"""Read pictures of datasets, which may come from anyone: MP4 videos, PNG and JPEG, of bounded size.
+"""Read pictures of datasets: MP4 videos, PNG and JPEG. Nothing else opens a picture of a dataset.
 
-FFmpeg looks at what a file holds, not at its name: a playlist named `.mp4` makes it open other files and addresses. It
-keeps a file's index in memory, 36 bytes a frame, by counts that are only claims. Pillow hands other formats to other
-programs (EPS to Ghostscript), and only warns of a picture that fills the memory.
+FFmpeg looks at what a file holds, not at its name: a playlist named `.mp4` makes it open other files and addresses.
+Pillow hands other formats to other programs (EPS to Ghostscript).
 """
 
 from __future__ import annotations
 
 import itertools
-import mmap
-import re
-import warnings
-from collections.abc import Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
@@ -24,20 +19,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from manip_il import checks
-from manip_il.data.schema import MOST_PIXELS
 from manip_il.errors import ManipError
 
-MOST_INDEXED = 5_000_000  # frames of a file: 46 hours at 30 a second
 _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # tracks that are in other files
-    "max_pixels": str(2 * MOST_PIXELS),  # should pictures grow on the way; codecs round them up to whole blocks
 }
-_BOX = 8  # its size and name [bytes]
-MOST_BOXES = 100_000  # outermost ones
-_COUNTS = re.compile(rb"(stsz|stz2|elst)(?s:.){4}")  # frames by their sizes, edits: version and flags, ..., count
-_ELSEWHERE = re.compile(rb"moof|mvex|cmov")  # fragments and a packed index: what follows is counted nowhere here
-
 _UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 _FORMATS = ("PNG", "JPEG")
 _LEVEL = 1  # of compression: the next ones save a tenth and take twice as long
@@ -46,21 +33,11 @@ Pictures = NDArray[np.uint8]  # (T, height, width, 3), RGB
 
 
 def open_picture(content: bytes) -> Image.Image:
-    """Open a PNG or JPEG, whose pixels are not decoded yet.
-
-    Raises `ValueError` for another format, and for more than `MOST_PIXELS` pixels.
-    """
+    """Open a PNG or JPEG, whose pixels are not decoded yet. Raises `ValueError` for another format."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            picture = Image.open(BytesIO(content), formats=_FORMATS)
-    except Image.UnidentifiedImageError as error:
-        raise ValueError(f"it is not a {' or '.join(_FORMATS)}") from error
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise ValueError(f"it has more than {MOST_PIXELS:,} pixels") from error
-    if picture.width * picture.height > MOST_PIXELS:
-        raise ValueError(f"it has {picture.width} x {picture.height} pixels; expected at most {MOST_PIXELS:,} in all")
-    return picture
+        return Image.open(BytesIO(content), formats=_FORMATS)
+    except (Image.UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise ValueError(f"it is not a {' or '.join(_FORMATS)} of ordinary size") from error
 
 
 def to_png(picture: NDArray[np.uint8]) -> bytes:
@@ -92,22 +69,16 @@ def decode_picture(content: bytes | None) -> Pictures:
 def open_video(path: Path) -> InputContainer:
     """Open an MP4 file for reading; its pictures are not decoded yet.
 
-    Raises `ValueError` for an index or pictures beyond the limits, for a codec without a decoder, and for fragmented
-    files, which no LeRobot dataset has; `OSError` and `av.FFmpegError` for what is no MP4 file or cannot be read.
+    Raises `ValueError` for a codec without a decoder, `OSError` and `av.FFmpegError` for what is no MP4 file or cannot
+    be read.
     """
-    _check_index(path)
+    with open(checks.open_regular(path), "rb") as file:
+        if file.read(8)[4:] != b"ftyp":
+            raise ValueError("it does not begin as an MP4 file does; FFmpeg would take it for another format")
     container = av.open(f"file:{path}", format="mp4", options=_OPTIONS)
-    try:
-        for stream in container.streams.video:
-            if not stream.codec_context:  # PyAV's types do not say so
-                raise ValueError("its pictures are of a codec that no decoder is known for; write it as AV1 or H.264")
-            stream.codec_context.options = {"max_pixels": _OPTIONS["max_pixels"]}
-            if stream.width * stream.height > MOST_PIXELS:
-                size = f"{stream.width} x {stream.height}"
-                raise ValueError(f"its pictures have {size} pixels; expected at most {MOST_PIXELS:,} in all")
-    except BaseException:
+    if not all(stream.codec_context for stream in container.streams.video):  # PyAV's types do not say so
         container.close()
-        raise
+        raise ValueError("its pictures are of a codec that no decoder is known for; write it as AV1 or H.264")
     return container
 
 
@@ -118,7 +89,7 @@ class VideoReader:
         self._path: Path | None = None
         self._container: InputContainer | None = None
 
-    def read(self, path: Path, first: int, count: int, fps: int) -> Pictures:
+    def read(self, path: Path, first: int, count: int, fps: float) -> Pictures:
         """Decode frames `first` to `first + count - 1`, (count, height, width, 3).
 
         Raises `ManipError` for a file that cannot be read or does not hold each of them.
@@ -150,50 +121,7 @@ def count_packets(path: Path) -> int:
         raise _unreadable(path, error) from error
 
 
-def _check_index(path: Path) -> None:
-    """Raise `ValueError` where FFmpeg would make a larger index of the file than any video needs."""
-    if path.is_file() and path.stat().st_size < _BOX:
-        return  # FFmpeg refuses it
-    frames, edits = 0, 1
-    with (
-        open(checks.open_regular(path), "rb") as stream,
-        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
-    ):
-        for name, size, start, stop in find_boxes(data):
-            if name == b"mdat" and size >= _BOX:
-                continue  # coded frames
-            if found := _ELSEWHERE.search(data, start, stop):
-                raise ValueError(
-                    f"it has a box {found[0].decode()}, which videos of datasets do not have; write it as plain MP4"
-                )
-            for match in _COUNTS.finditer(data, start, stop):
-                is_edits = match[1] == b"elst"
-                at = match.end() + (0 if is_edits else 4)  # behind the size that all frames may have
-                count = int.from_bytes(data[at : at + 4])
-                frames, edits = (frames, max(edits, count)) if is_edits else (frames + count, edits)
-    if frames * edits > MOST_INDEXED:
-        raise ValueError(f"it declares {frames:,} frames and {edits:,} edits; expected at most {MOST_INDEXED:,} frames")
-
-
-def find_boxes(data: mmap.mmap) -> Iterator[tuple[bytes, int, int, int]]:
-    """Yield an MP4 file's outermost boxes: name, declared size, start and stop in the file [bytes].
-
-    One of no valid size lasts to the end. Raises `ValueError` for too many.
-    """
-    at = 0
-    for _ in range(MOST_BOXES):
-        if at + _BOX > len(data):
-            return
-        size, name = int.from_bytes(data[at : at + 4]), data[at + 4 : at + _BOX]
-        if size == 1:  # it follows as 64 bits
-            size = int.from_bytes(data[at + _BOX : at + 2 * _BOX])
-        stop = min(at + size, len(data)) if size >= _BOX else len(data)
-        yield name, size, at, stop
-        at = stop
-    raise ValueError(f"it has more than {MOST_BOXES:,} boxes")
-
-
-def _decode(container: InputContainer, first: int, count: int, fps: int) -> list[NDArray[np.uint8]]:
+def _decode(container: InputContainer, first: int, count: int, fps: float) -> list[NDArray[np.uint8]]:
     """The frames as far as there is no gap."""
     stream = container.streams.video[0]
     tick = stream.time_base or 1  # [s]

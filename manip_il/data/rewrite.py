@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import LARGEST_META
-from manip_il.data.lerobot_read import check_dataset
-from manip_il.data.lerobot_stats import RunningStats
 from manip_il.data.parquet_files import integers, open_writer, to_table
+from manip_il.data.statistics import RunningStats
 from manip_il.errors import ManipError
 
 Columns = Mapping[str, NDArray[Any]]
@@ -35,7 +35,7 @@ def rewrite_columns(
     replace: as in `new_folder`. Raises `ManipError` for a dataset that cannot be read, or whose episodes have other
     lengths than the columns.
     """
-    check_dataset(source)
+    Dataset.open(source)
     with new_folder(target, replace=replace) as folder:
         shutil.copytree(source, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.parquet"))
         shutil.copy2(source / layout.TASKS, folder / layout.TASKS)

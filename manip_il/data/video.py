@@ -25,9 +25,9 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.lerobot_stats import I64, pixel_counts
 from manip_il.data.pictures import Pictures, count_packets, open_video
 from manip_il.data.scheduling import scheduling_kept
+from manip_il.data.statistics import I64, pixel_counts
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, UsageError
 

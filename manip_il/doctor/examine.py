@@ -15,12 +15,11 @@ import numpy as np
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import exclusive, write_file
 from manip_il.data.build import build
+from manip_il.data.gate import check_arrived
 from manip_il.data.info import Feature
-from manip_il.data.lerobot_stats import RunningStats
-from manip_il.data.parquet_files import to_array
+from manip_il.data.parquet_files import to_numpy
+from manip_il.data.statistics import RunningStats
 from manip_il.doctor.cameras import check_pictures, check_videos
-from manip_il.doctor.dataset import Dataset
-from manip_il.doctor.draws import check_draws
 from manip_il.doctor.finding import Finding, Remedy, Severity, count_frames, error, list_first, plural
 from manip_il.doctor.leftovers import (
     BESIDE,
@@ -39,10 +38,11 @@ from manip_il.doctor.meta import (
     check_spec,
     check_tasks,
 )
+from manip_il.doctor.patient import Patient
 from manip_il.doctor.rows import check_columns, check_finite, check_rows, check_statistics, check_task_numbers
 from manip_il.errors import ManipError
 
-Check = Callable[[Dataset], Iterator[Finding]]
+Check = Callable[[Patient], Iterator[Finding]]
 
 CHECKS: tuple[Check, ...] = (
     check_info,
@@ -59,7 +59,6 @@ CHECKS: tuple[Check, ...] = (
     check_videos,
     check_pictures,
     check_spec,
-    check_draws,
     check_fingerprint,
     check_stale_files,
     check_leftovers,
@@ -67,11 +66,17 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def examine(dataset: Dataset, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
+def examine(dataset: Patient, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
     """Yield every finding, as it is found; none for a dataset that is whole.
 
+    Every file is opened in a child process first; if that needs too much memory or time, this is the only finding.
     Raises nothing, whatever the folder holds.
     """
+    try:
+        check_arrived(dataset.root, strict=False)
+    except ManipError as problem:
+        yield error(str(dataset.root), str(problem), Remedy.NONE)
+        return
     for check in checks:
         try:
             yield from check(dataset)
@@ -83,7 +88,7 @@ def examine(dataset: Dataset, checks: Sequence[Check] = CHECKS) -> Iterator[Find
 
 def examine_folder(root: Path) -> list[Finding]:
     """Return all findings about a folder."""
-    return list(examine(Dataset(root)))
+    return list(examine(Patient(root)))
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:
@@ -91,7 +96,7 @@ def has_errors(findings: Sequence[Finding]) -> bool:
     return any(finding.severity is Severity.ERROR for finding in findings)
 
 
-def verdict(dataset: Dataset, findings: Sequence[Finding]) -> str:
+def verdict(dataset: Patient, findings: Sequence[Finding]) -> str:
     """Return one line: how many episodes and frames are whole, or how many errors and warnings there are."""
     severities = [finding.severity for finding in findings]
     counts = {kind.value: severities.count(kind) for kind in Severity}
@@ -102,7 +107,7 @@ def verdict(dataset: Dataset, findings: Sequence[Finding]) -> str:
     return f"{dataset.root}: {whole}: whole{f', {text}' if text else ''}"
 
 
-def repair(dataset: Dataset, findings: Sequence[Finding]) -> Iterator[str]:
+def repair(dataset: Patient, findings: Sequence[Finding]) -> Iterator[str]:
     """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
 
     Raises `FolderBusyError` where another process is at work on the dataset. Examine the folder anew afterwards.
@@ -124,7 +129,7 @@ def repair(dataset: Dataset, findings: Sequence[Finding]) -> Iterator[str]:
                 yield f"not repaired, as there is no copy of it: {one.place}"
 
 
-def _why_no_rebuild(dataset: Dataset) -> str:
+def _why_no_rebuild(dataset: Patient) -> str:
     """Return why the dataset cannot be built from its journals; empty where it can."""
     folder = dataset.journals
     if not folder.is_dir():
@@ -141,7 +146,7 @@ def _why_no_rebuild(dataset: Dataset) -> str:
     return ""
 
 
-def _rebuild(dataset: Dataset, findings: Sequence[Finding]) -> Iterator[str]:
+def _rebuild(dataset: Patient, findings: Sequence[Finding]) -> Iterator[str]:
     root = dataset.root
     kept = _free_name(root)
     root.rename(kept)
@@ -160,7 +165,7 @@ def _rebuild(dataset: Dataset, findings: Sequence[Finding]) -> Iterator[str]:
     yield f"built again from {dataset.journals.name}: {count}; what was there is kept in {kept}"
 
 
-def _in_place(dataset: Dataset, findings: Sequence[Finding], kept: Path) -> Iterator[str]:
+def _in_place(dataset: Patient, findings: Sequence[Finding], kept: Path) -> Iterator[str]:
     """Move leftovers away and compute statistics."""
     if any(one.remedy is Remedy.STATISTICS for one in findings) and dataset.reads_all_rows:
         yield _compute_statistics(dataset, kept)
@@ -173,7 +178,7 @@ def _in_place(dataset: Dataset, findings: Sequence[Finding], kept: Path) -> Iter
         yield f"moved away: {place}"
 
 
-def _compute_statistics(dataset: Dataset, kept: Path) -> str:
+def _compute_statistics(dataset: Patient, kept: Path) -> str:
     """Compute statistics of all columns of numbers; those of pictures stay as they are."""
     path = dataset.root / layout.STATS
     if not _is_inside(dataset.root, path):
@@ -190,18 +195,18 @@ def _compute_statistics(dataset: Dataset, kept: Path) -> str:
     return f"recomputed from the data: {layout.STATS}, {plural(len(sound), 'column')}"
 
 
-def _statistics(dataset: Dataset, feature: Feature) -> dict[str, list[float]]:
+def _statistics(dataset: Patient, feature: Feature) -> dict[str, list[float]]:
     """Compute one column's statistics; a matrix' over its last axis, as LeRobot has them."""
     last = feature.shape[-1] if feature.shape else 1
     with closing(RunningStats(dataset.root)) as running:
         for shard in dataset.data_shards:
             for table in shard.tables([feature.key]):
-                values = to_array(table.column(feature.key), feature.dtype, feature.shape)
+                values = to_numpy(table.column(feature.key), feature.dtype, feature.shape, exact=True)
                 running.add({feature.key: values.reshape(-1, last)})
         return {**running.result()[feature.key], "count": [dataset.scan.moments[feature.key].rows]}
 
 
-def _paths(dataset: Dataset, place: str, kept: Path) -> tuple[Path, Path]:
+def _paths(dataset: Patient, place: str, kept: Path) -> tuple[Path, Path]:
     """Return the path of a leftover, and the one that it is moved to."""
     if place.startswith(BESIDE):
         return dataset.root.with_name(Path(place).name), kept / Path(place).name

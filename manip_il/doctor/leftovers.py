@@ -12,8 +12,8 @@ from manip_il.data.atomic import PARTIAL, descriptor, try_lock
 from manip_il.data.build import RECORDING, Recording
 from manip_il.data.journal import Header, list_episodes, read_header
 from manip_il.data.parquet_files import NO_FOOTER
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.finding import Finding, Remedy, count_frames, error, list_first, plural, warning
+from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError
 
 BESIDE = "../"  # first part of the place of a file beside the dataset
@@ -23,7 +23,7 @@ _TEMPORARY = re.compile(r".*\.(partial|incomplete|ffconcat)|\..*\.tmp")
 _TEMPORARY_FOLDER = re.compile(r"tmp[a-z0-9_]{8}")  # of Python's tempfile, which LeRobot encodes videos in
 
 
-def check_recorder(dataset: Dataset) -> Iterator[Finding]:
+def check_recorder(dataset: Patient) -> Iterator[Finding]:
     """Check that LeRobot's own recorder did not die before `finalize()`: it closes its files only there."""
     info = dataset.info
     if info is None or dataset.is_ours:
@@ -47,7 +47,7 @@ def check_recorder(dataset: Dataset) -> Iterator[Finding]:
         )
 
 
-def check_stale_files(dataset: Dataset) -> Iterator[Finding]:
+def check_stale_files(dataset: Patient) -> Iterator[Finding]:
     """Check that an episode refers to every file among data, videos and episodes."""
     episodes = dataset.episodes
     if episodes is None or not dataset.knows_all_episodes:
@@ -63,7 +63,7 @@ def check_stale_files(dataset: Dataset) -> Iterator[Finding]:
             yield warning(name, "no episode refers to it", Remedy.MOVE)
 
 
-def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
+def check_leftovers(dataset: Patient) -> Iterator[Finding]:
     """Check that there are no temporary files or folders, in the dataset or beside it."""
     root = dataset.root
     if pictures := len(_files(root, _IMAGES)):
@@ -82,7 +82,7 @@ def check_leftovers(dataset: Dataset) -> Iterator[Finding]:
     yield from _check_beside(root.absolute())
 
 
-def check_journals(dataset: Dataset) -> Iterator[Finding]:
+def check_journals(dataset: Patient) -> Iterator[Finding]:
     """Check that every journal beside the dataset is whole, and that the dataset holds their episodes."""
     folder = dataset.journals
     if not folder.is_dir():
@@ -111,7 +111,7 @@ def count_readable(folder: Path) -> int:
     return len(_expected_seeds(headers, Recording.read(folder)))
 
 
-def _advise(dataset: Dataset, whole: int) -> str:
+def _advise(dataset: Patient, whole: int) -> str:
     if not whole or dataset.episodes is None:
         return "LeRobot can neither read nor resume this: record again, into another folder"
     frames = int(dataset.episodes.length[:whole].sum())
@@ -152,7 +152,7 @@ def _expected_seeds(headers: list[Header], recording: Recording) -> list[int]:
     return taken if recording.episodes is None else taken[: recording.episodes]
 
 
-def _compare_seeds(dataset: Dataset, expected: list[int]) -> Iterator[Finding]:
+def _compare_seeds(dataset: Patient, expected: list[int]) -> Iterator[Finding]:
     if not dataset.reads_all_rows:
         return
     runs, place = dataset.scan.runs, dataset.journals.name

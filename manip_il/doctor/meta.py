@@ -10,20 +10,20 @@ import numpy as np
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import find_irregular
+from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.fingerprint import compare_fingerprints, environment_fingerprint
-from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature, read_object
-from manip_il.data.lerobot_read import find_irregular
+from manip_il.data.info import INDEX_FEATURES, PICTURES, Feature
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
-from manip_il.doctor.dataset import Dataset, Episodes
 from manip_il.doctor.finding import Finding, error, list_first, plural, warning
+from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError
 
 EPISODES = "meta/episodes"
-_NEEDED = {"spec", "fingerprint", "provenance"}
 _HASH = "_sha256"
 
 
-def check_info(dataset: Dataset) -> Iterator[Finding]:
+def check_info(dataset: Patient) -> Iterator[Finding]:
     """Check that `meta/info.json` can be used, has the columns of every dataset, and as many names as numbers."""
     for text in dataset.info_problems:
         yield error(layout.INFO, text)
@@ -39,14 +39,14 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
             yield error(f"{layout.INFO}: {key}", f"{count} names for shape {list(feature.shape)}; expected {wanted}")
 
 
-def check_regular(dataset: Dataset) -> Iterator[Finding]:
+def check_regular(dataset: Patient) -> Iterator[Finding]:
     """Check that the folder holds files and folders alone: a reader of a pipe waits, a device has no end."""
     for path in find_irregular(dataset.root):
         place = path.relative_to(dataset.root).as_posix()
         yield error(place, "is not a regular file, but a pipe, device, socket or broken link")
 
 
-def check_footers(dataset: Dataset) -> Iterator[Finding]:
+def check_footers(dataset: Patient) -> Iterator[Finding]:
     """Check that parquet files of data and of episodes are there and have readable footers."""
     info = dataset.info
     for pattern, shards in ((layout.DATA_FILES, dataset.data_shards), (layout.EPISODES_FILES, dataset.episode_shards)):
@@ -57,7 +57,7 @@ def check_footers(dataset: Dataset) -> Iterator[Finding]:
                 yield error(shard.name, shard.problem)
 
 
-def check_episodes(dataset: Dataset) -> Iterator[Finding]:
+def check_episodes(dataset: Patient) -> Iterator[Finding]:
     """Check that episodes count from 0, that each begins where the one before ends, and info.json's totals."""
     yield from dataset.episode_findings
     info, episodes = dataset.info, dataset.episodes
@@ -74,7 +74,7 @@ def check_episodes(dataset: Dataset) -> Iterator[Finding]:
             yield error(layout.INFO, f"total_{what} is {counted:,}; {EPISODES} holds {found:,}")
 
 
-def check_tasks(dataset: Dataset) -> Iterator[Finding]:
+def check_tasks(dataset: Patient) -> Iterator[Finding]:
     """Check that `meta/tasks.parquet` numbers the tasks, and that episodes name no other."""
     info = dataset.info
     if info is None or (info.episodes == 0 and not (dataset.root / layout.TASKS).exists()):
@@ -97,20 +97,21 @@ def check_tasks(dataset: Dataset) -> Iterator[Finding]:
         yield error(EPISODES, f"names the task {found}, which {layout.TASKS} does not hold")
 
 
-def check_spec(dataset: Dataset) -> Iterator[Finding]:
+def check_spec(dataset: Patient) -> Iterator[Finding]:
     """Check that columns, names and rate are those of the robot and task in this program's own file."""
     info = dataset.info
     if info is None:
         return
-    if not dataset.is_ours:
+    try:
+        own = dataset.own
+    except ManipError as problem:
+        yield error(layout.OURS, f"cannot be read: {problem}")
+        return
+    if own is None:
         if {s.SIM_STATE, s.EXECUTED_ACTION} <= info.features.keys():
             yield warning(layout.OURS, "is missing (LeRobot's tools drop it): the task and the fingerprint are unknown")
         return
-    try:
-        spec = read_spec(dataset)
-    except (OSError, ValueError, TypeError, RecursionError, ManipError) as problem:
-        yield error(layout.OURS, f"cannot be read: {problem}")
-        return
+    spec = own.spec
     for what, said, found in (("fps", spec.fps, info.fps), ("robot_type", spec.lerobot_type, info.robot)):
         if said != found:
             yield error(layout.INFO, f"{what} is {found!r}; {layout.OURS} says {said!r}")
@@ -121,36 +122,23 @@ def check_spec(dataset: Dataset) -> Iterator[Finding]:
         yield warning(layout.INFO, f"has {list_first(extra)} beside the columns of {spec.robot} {spec.task}")
 
 
-def check_fingerprint(dataset: Dataset) -> Iterator[Finding]:
+def check_fingerprint(dataset: Patient) -> Iterator[Finding]:
     """Check that the dataset was recorded with the versions that are installed here."""
-    if not dataset.is_ours:
-        return
     try:
-        fingerprint: Any = read_object(dataset.root / layout.OURS).get("fingerprint")
-    except (OSError, ValueError, RecursionError):
+        own = dataset.own
+    except ManipError:
         return  # reported by the check of the spec
-    if not isinstance(fingerprint, dict) or not fingerprint:
+    if own is None:
+        return
+    if not own.fingerprint:
         yield warning(layout.OURS, "has no fingerprint: what the dataset was recorded with is not known")
         return
     theirs, here = (
         {str(key): value for key, value in table.items() if not str(key).endswith(_HASH) and key != "processor"}
-        for table in (cast(dict[Any, Any], fingerprint), environment_fingerprint(b"", {}))
+        for table in (own.fingerprint, environment_fingerprint(b"", {}))
     )  # versions alone: another processor is no fault of a dataset
     for text in compare_fingerprints("the dataset", theirs, "this installation", here):
         yield warning(layout.OURS, text)
-
-
-def read_spec(dataset: Dataset) -> s.RobotTaskSpec:
-    """Read the spec in this program's own file.
-
-    Raises `OSError`, `ValueError`, `TypeError` or `ManipError` for anything else.
-    """
-    ours = read_object(dataset.root / layout.OURS)
-    if missing := _NEEDED - ours.keys():
-        raise ValueError(f"it lacks {list_first(sorted(missing))}")
-    if not isinstance(ours["spec"], dict):
-        raise ValueError(f"its spec is {type(ours['spec']).__name__}; expected an object")
-    return s.RobotTaskSpec.from_json(ours["spec"])
 
 
 def _count_names(names: Any) -> int | None:
@@ -164,7 +152,7 @@ def _count_names(names: Any) -> int | None:
     return None
 
 
-def _check_sequence(episodes: Episodes) -> Iterator[Finding]:
+def _check_sequence(episodes: EpisodeTable) -> Iterator[Finding]:
     ends_before = np.concatenate([[0], episodes.stop[:-1]])
     for name, found, wanted in (
         (layout.EPISODE_INDEX, episodes.index, np.arange(len(episodes))),

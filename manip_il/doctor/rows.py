@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature
-from manip_il.data.lerobot_stats import quantile_places
 from manip_il.data.parquet_files import UNREADABLE, read_tasks
-from manip_il.doctor.dataset import Dataset, Episodes
+from manip_il.data.statistics import quantile_places
 from manip_il.doctor.finding import Finding, Remedy, error, list_first, plural, warning
 from manip_il.doctor.meta import EPISODES
+from manip_il.doctor.patient import Patient
 from manip_il.doctor.scan import F64, I64, Moments, Runs
 
 _DATA = "data"
@@ -22,7 +23,7 @@ _DATA = "data"
 _TOLERANCES = {"min": 1e-5, "max": 1e-5, "mean": 1e-4, "std": 2e-3}
 
 
-def check_columns(dataset: Dataset) -> Iterator[Finding]:
+def check_columns(dataset: Patient) -> Iterator[Finding]:
     """Check that every data file has the columns of info.json and no other: LeRobot loads no file that has."""
     if dataset.info is None:
         return
@@ -36,7 +37,7 @@ def check_columns(dataset: Dataset) -> Iterator[Finding]:
             yield error(shard.name, f"has the column {list_first(extra)}, which {layout.INFO} does not list")
 
 
-def check_rows(dataset: Dataset) -> Iterator[Finding]:
+def check_rows(dataset: Patient) -> Iterator[Finding]:
     """Check that every episode's rows are there, once, in order, in the file that `meta/episodes` names."""
     yield from dataset.scan.findings
     info, episodes = dataset.info, dataset.episodes
@@ -49,7 +50,7 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
         yield from _check_episodes(dataset, episodes)
 
 
-def check_task_numbers(dataset: Dataset) -> Iterator[Finding]:
+def check_task_numbers(dataset: Patient) -> Iterator[Finding]:
     """Check that `task_index` of every row is in `meta/tasks.parquet`."""
     try:
         numbers, _ = read_tasks(dataset.root)
@@ -60,7 +61,7 @@ def check_task_numbers(dataset: Dataset) -> Iterator[Finding]:
         yield error(place, f"rows have {list_first(unknown)}, which {layout.TASKS} does not hold")
 
 
-def check_finite(dataset: Dataset) -> Iterator[Finding]:
+def check_finite(dataset: Patient) -> Iterator[Finding]:
     """Check that no column has NaN or infinity."""
     for key, moments in dataset.scan.moments.items():
         if moments.first_bad is not None:
@@ -69,26 +70,27 @@ def check_finite(dataset: Dataset) -> Iterator[Finding]:
             yield error(f"{_DATA}: {key}", f"{value} in row {row:,} of the dataset ({like} like this)")
 
 
-def check_statistics(dataset: Dataset) -> Iterator[Finding]:
+def check_statistics(dataset: Patient) -> Iterator[Finding]:
     """Check that `meta/stats.json` has the statistics of every column, and that those of numbers are the data's."""
     info, stats = dataset.info, dataset.stats
     if info is None or info.episodes == 0:
         return
     if stats is None:
-        state = "cannot be read" if (dataset.root / layout.STATS).exists() else "is missing"
-        yield error(layout.STATS, f"{state}: nothing can be normalised with it", Remedy.STATISTICS)
-    else:
-        if unknown := sorted(set(stats) - set(info.features)):
-            yield warning(layout.STATS, f"has statistics of {list_first(unknown)}, which {layout.INFO} does not list")
-        yield from _check_all_moments(dataset, info.of_dtype(*NUMBERS))
+        if (dataset.root / layout.STATS).exists():
+            yield error(layout.STATS, "cannot be read: nothing can be normalised with it", Remedy.STATISTICS)
+        else:
+            yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it", Remedy.STATISTICS)
+        return
+    if unknown := sorted(set(stats) - set(info.features)):
+        yield warning(layout.STATS, f"has statistics of {list_first(unknown)}, which {layout.INFO} does not list")
+    yield from _check_all_moments(dataset, info.of_dtype(*NUMBERS))
     for feature in info.of_dtype(*PICTURES):
-        if not isinstance((stats or {}).get(feature.key), dict):
+        if not isinstance(stats.get(feature.key), dict):
             yield error(f"{layout.STATS}: {feature.key}", "is missing")
-    if stats is not None:
-        yield from _check_ranks(dataset)
+    yield from _check_ranks(dataset)
 
 
-def _check_episodes(dataset: Dataset, episodes: Episodes) -> Iterator[Finding]:
+def _check_episodes(dataset: Patient, episodes: EpisodeTable) -> Iterator[Finding]:
     runs = dataset.scan.runs
     numbers, first, counts = np.unique(runs.episode, return_index=True, return_counts=True)
     if (counts > 1).any():
@@ -107,7 +109,7 @@ def _check_episodes(dataset: Dataset, episodes: Episodes) -> Iterator[Finding]:
     yield from _compare_places(runs, once[mine], episodes, theirs)
 
 
-def _compare_places(runs: Runs, run: I64, episodes: Episodes, row: I64) -> Iterator[Finding]:
+def _compare_places(runs: Runs, run: I64, episodes: EpisodeTable, row: I64) -> Iterator[Finding]:
     for name, found, wanted in (
         ("length", runs.length[run], episodes.length[row]),
         ("dataset_from_index", runs.start[run], episodes.start[row]),
@@ -127,7 +129,7 @@ def _list_episodes(numbers: I64) -> str:
     return f"episode{'' if len(numbers) == 1 else 's'} {list_first(numbers.tolist())}"
 
 
-def _check_all_moments(dataset: Dataset, features: list[Feature]) -> Iterator[Finding]:
+def _check_all_moments(dataset: Patient, features: list[Feature]) -> Iterator[Finding]:
     stale: list[str] = []
     for feature in features if dataset.reads_all_rows else []:
         moments = dataset.scan.moments.get(feature.key)
@@ -144,7 +146,7 @@ def _check_all_moments(dataset: Dataset, features: list[Feature]) -> Iterator[Fi
         yield warning(layout.STATS, text, Remedy.STATISTICS)
 
 
-def _check_moments(dataset: Dataset, feature: Feature, moments: Moments) -> Iterator[Finding]:
+def _check_moments(dataset: Patient, feature: Feature, moments: Moments) -> Iterator[Finding]:
     place = f"{layout.STATS}: {feature.key}"
     table: Any = (dataset.stats or {}).get(feature.key)
     if not isinstance(table, dict):
@@ -185,7 +187,7 @@ def _differ(found: F64 | None, wanted: F64, tolerance: F64) -> str:
     return f"[{bad[0]}]{text} ({len(bad)} of {len(wanted)} numbers like this)" if len(wanted) > 1 else text
 
 
-def _check_ranks(dataset: Dataset) -> Iterator[Finding]:
+def _check_ranks(dataset: Patient) -> Iterator[Finding]:
     """Check quantiles of this program: q of T numbers is the one of rank ceil(q T), from 1."""
     wrong: list[str] = []
     for key, moments in dataset.scan.moments.items():

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.episode_table import concatenate
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, Info
-from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, to_array
-from manip_il.data.parquet_limits import check_parquet
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, to_numpy
 from manip_il.doctor.finding import Finding, error, plural
 
 I64 = NDArray[np.int64]
@@ -119,10 +119,6 @@ def scan(shards: Sequence[Shard], info: Info, quantiles: Mapping[str, F64], on_f
     """Read every file that has a footer, once. quantiles: column -> (Q, n), those whose ranks are counted."""
     numbers = info.of_dtype(*NUMBERS)
     result = Scan(moments={feature.key: Moments(feature.size, quantiles.get(feature.key)) for feature in numbers})
-    try:
-        check_parquet((shard.path for shard in shards if not shard.problem), list(result.moments))
-    except UNREADABLE as problem:
-        return Scan(findings=[error("data", f"cannot be read: {problem}")])
     runs = [result.runs]
     for shard in shards:
         if not shard.problem:
@@ -130,18 +126,6 @@ def scan(shards: Sequence[Shard], info: Info, quantiles: Mapping[str, F64], on_f
         on_file()
     result.runs = concatenate(runs)
     return result
-
-
-def concatenate(parts: Sequence[Any]) -> Any:
-    """Join values of one type: arrays (T, ...), lists, tables of those, or dataclasses of them."""
-    first = parts[0]
-    if isinstance(first, np.ndarray):
-        return np.concatenate(parts)
-    if isinstance(first, list):
-        return [value for part in parts for value in part]
-    if isinstance(first, dict):
-        return {key: concatenate([part[key] for part in parts]) for key in first}
-    return type(first)(**concatenate([vars(part) for part in parts]))
 
 
 def _scan_shard(shard: Shard, info: Info, result: Scan) -> Iterator[Runs]:
@@ -155,11 +139,12 @@ def _scan_shard(shard: Shard, info: Info, result: Scan) -> Iterator[Runs]:
                 if key in bad_columns:
                     continue
                 try:
-                    values = to_array(table.column(key), info.features[key].dtype, info.features[key].shape)
+                    values = to_numpy(table.column(key), info.features[key].dtype, info.features[key].shape, exact=True)
                 except BadColumn as problem:
                     bad_columns.add(key)
                     result.findings.append(error(f"{shard.name}: {key}", str(problem)))
                     continue
+                values = values.reshape(len(values), -1)
                 result.moments[key].add(values, rows)
                 if key in kept:
                     kept[key].append(values)

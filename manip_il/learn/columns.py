@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.arrays import Allocate, in_memory, pieces
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, NotFiniteError
 from manip_il.learn.action_spaces import JOINT_DELTAS, Conversion
@@ -47,22 +46,19 @@ def check_table(table: Table, spec: RobotTaskSpec) -> None:
 def require_finite(table: Table, keys: Sequence[str]) -> None:
     """Raise `NotFiniteError` naming column, row, episode and frame unless all values of these columns are finite."""
     for key in keys:
-        row = next((part.start + at for part in pieces(len(table[key])) for at in _not_finite(table[key][part])), None)
-        if row is None:
+        values = np.asarray(table[key])
+        rows = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if len(rows) == 0:
             continue
+        row = int(rows[0])
         place = [f"row {row}"]
         for name, column in (("episode", EPISODE_INDEX), ("frame", FRAME_INDEX)):
             if column in table:
                 place.append(f"{name} {int(np.asarray(table[column]).reshape(-1)[row])}")
-        raise NotFiniteError(f"column {key}, {', '.join(place)}: {np.asarray(table[key])[row]} is not finite")
+        raise NotFiniteError(f"column {key}, {', '.join(place)}: {values[row]} is not finite")
 
 
-def _not_finite(values: NDArray[Any]) -> Sequence[int]:
-    """The rows that have a value that is not finite."""
-    return np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1)).tolist()
-
-
-def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS, allocate: Allocate = in_memory) -> Rows:
+def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS) -> Rows:
     """Return the rows whose `label_valid` is not 0 (all of them where there is no such column).
 
     Targets are the actions in the space of `conversion`. Without `episode_index` all rows count as one episode. Raises
@@ -74,14 +70,9 @@ def learning_rows(table: Table, conversion: Conversion = JOINT_DELTAS, allocate:
     valid = valid_frames(table)
     if not valid.any():
         raise ManipError(f"none of {len(valid)} frames has a valid label: there is nothing to learn from")
-    sound, n = np.flatnonzero(valid), state.shape[1]
-    inputs = allocate((len(sound), n + environment.shape[1]), np.float32)
-    targets = allocate((len(sound), action.shape[1]), np.float32)
-    for part in pieces(len(sound)):
-        rows = sound[part]
-        inputs[part, :n], inputs[part, n:] = state[rows], environment[rows]
-        targets[part] = conversion.encode(action[rows].astype(np.float32, copy=False), inputs[part, :n])
-    return Rows(inputs, targets, episodes[valid])
+    inputs = np.concatenate([state[valid], environment[valid]], axis=1, dtype=np.float32)
+    targets = conversion.encode(action[valid].astype(np.float32, copy=False), inputs[:, : state.shape[1]])
+    return Rows(inputs, targets.astype(np.float32, copy=False), episodes[valid])
 
 
 def valid_frames(table: Table) -> NDArray[np.bool_]:

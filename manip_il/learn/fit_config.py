@@ -100,9 +100,6 @@ class FitConfig:
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
     image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it each step decodes its own")
-    memory: float | None = option(
-        None, "what the numbers learnt from may take [GB]; if they take more, they are kept in files of OUTPUT_DIR"
-    )
     num_workers: int = option(4, "processes that decode pictures beyond image_cache_gb")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")
@@ -123,8 +120,6 @@ class FitConfig:
             raise UsageError(f"dataset.eval_split is {self.eval_split}; expected at least 0 and less than 1")
         if self.lr is not None and not 0.0 < self.lr < math.inf:
             raise UsageError(f"lr is {self.lr}; expected more than 0")
-        if self.memory is not None and not 0.0 < self.memory < math.inf:
-            raise UsageError(f"memory is {self.memory} GB; expected more than 0")
         check_names(self.policy)
         if self.processes > 1 and self.is_mlp:
             raise UsageError(f"processes is {self.processes}; the mlp is fitted by one")

@@ -25,8 +25,8 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
+from manip_il.data.dataset import joined_columns
 from manip_il.data.lerobot_library import Metadata, learn_actions, read_metadata
-from manip_il.data.lerobot_read import read_tables
 from manip_il.data.schema import ACTION, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError, UsageError
 from manip_il.learn.action_spaces import Conversion, conversion_for, same_width
@@ -99,7 +99,7 @@ class PolicyTrainer:
             _convert(self.dataset, self.conversion)
         self.options = self.lerobot.resume_options()  # with the features
         with self.accelerator.main_process_first():  # it fills the cache, the others find it full
-            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, output_dir, on_frames)
+            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
         drawn = weights[self.samples.train] if weights is not None else None
         if sources is not None and weights is None:
             drawn = weights = sources.row_weights(self.samples.train)
@@ -288,7 +288,7 @@ def _fit(root: Path | Sequence[Path], config: FitConfig, output_dir: Path, setti
 
 def _convert(dataset: Metadata, conversion: Conversion) -> None:
     """Leave the actions to learn with a dataset's metadata, and their statistics in place of the column's."""
-    table = read_tables(dataset.roots, [STATE, ACTION])
+    table = joined_columns(dataset.roots, [STATE, ACTION])
     same_width(table[ACTION], table[STATE], conversion.space)
     learn_actions(dataset, conversion.encode(np.asarray(table[ACTION], np.float32), table[STATE]))
 

@@ -22,6 +22,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from manip_il.data.info import PICTURES
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, JOINT_TARGETS, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.batches import Augment
@@ -197,7 +198,7 @@ def policy_features(
     """
     if observation not in OBSERVATIONS:
         raise UnknownName("observation", observation, OBSERVATIONS)
-    cameras = [key for key in features if key.startswith(IMAGES)]
+    cameras = [key for key, feature in features.items() if feature["dtype"] in PICTURES]
     wanted = [STATE]
     if observation != "images":
         wanted.append(ENVIRONMENT_STATE)

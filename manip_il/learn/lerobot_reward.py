@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from manip_il import checks
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.batches import to_float
 from manip_il.learn.columns import EPISODE_INDEX
@@ -43,7 +43,7 @@ def score_by_lerobot(
         raise ManipError(f"{root} lacks {', '.join(missing)}, which the reward model in {folder} sees")
     deltas = config.observation_delta_indices
     ahead = {} if deltas is None else {key: np.asarray(deltas, np.int64) for key in features}
-    table = read_table(root, [key for key, feature in meta.features.items() if feature["dtype"] in NUMBERS])
+    table = Dataset.open(root).columns([key for key, feature in meta.features.items() if feature["dtype"] in NUMBERS])
     source = SampleSource(
         Windows(table[EPISODE_INDEX].reshape(-1), ahead),
         {key: torch.from_numpy(column.copy()) for key, column in table.items()},

@@ -18,7 +18,6 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manip_il import checks
-from manip_il.data.arrays import pieces
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.learn.action_spaces import ARM, GRIPPER
 from manip_il.learn.fit_config import ACTION_SPACES, JOINT_DELTA
@@ -92,38 +91,29 @@ class Statistics:
 def fit_statistics(
     inputs: NDArray[np.float32], targets: NDArray[np.float32], loss: str, rows: NDArray[np.int64] | None = None
 ) -> Statistics:
-    """Return statistics of inputs (N, d) and targets (N, n), of all rows or of some, (S,); none need fit in memory.
+    """Return statistics of inputs (N, d) and targets (N, n), of all rows or of some, (S,).
 
     Targets are scaled by mean and deviation, for `categorical` by the middle and half-width of
     their range, which puts them in [-1, 1]. A constant target has scale 0: it is its mean.
     """
-    rows = np.arange(len(inputs)) if rows is None else rows
-    low, high = _range(targets, rows)
+    if rows is not None:
+        inputs, targets = inputs[rows], targets[rows]
+    low, high = targets.min(0).astype(np.float64), targets.max(0).astype(np.float64)
     if loss == "categorical":
         target_mean, target_scale = (low + high) / 2, (high - low) / 2
     else:
-        target_mean, target_scale = _mean_and_deviation(targets, rows)
+        target_mean, target_scale = _mean_and_deviation(targets)
     target_scale = np.where(target_scale < CONSTANT_TARGET, 0.0, target_scale)
-    input_mean, deviation = _mean_and_deviation(inputs, rows)
+    input_mean, deviation = _mean_and_deviation(inputs)
     input_scale = np.where(deviation < CONSTANT_INPUT, 0.0, 1.0 / np.maximum(deviation, CONSTANT_INPUT))
     values = (input_mean, input_scale, target_mean, target_scale, low, high)
     return Statistics(*(torch.from_numpy(value.astype(np.float32)) for value in values))
 
 
-def _range(values: NDArray[np.float32], rows: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Smallest and largest of each column."""
-    ranges = [(one.min(0), one.max(0)) for one in (values[rows[part]] for part in pieces(len(rows)))]
-    low, high = (np.array(ends, np.float64) for ends in zip(*ranges, strict=True))
-    return low.min(0), high.max(0)
-
-
-def _mean_and_deviation(
-    values: NDArray[np.float32], rows: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _mean_and_deviation(values: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and standard deviation of each column."""
-    parts = [rows[part] for part in pieces(len(rows))]
-    mean = np.sum([values[one].sum(0, dtype=np.float64) for one in parts], axis=0) / len(rows)
-    return mean, np.sqrt(np.sum([np.square(values[one] - mean).sum(0) for one in parts], axis=0) / len(rows))
+    mean = values.mean(0, dtype=np.float64)
+    return mean, np.sqrt(np.square(values - mean).mean(0))
 
 
 class MLPNetwork(nn.Module):

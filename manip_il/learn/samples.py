@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,14 +18,14 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
+from manip_il.data.camera import Camera
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.lazy_frames import LazyFrames
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.lerobot_layout import STATS
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, FRAME_INDEX, INDEX, require_finite, split_by_episode, valid_frames
 from manip_il.learn.fit_config import FitConfig
-from manip_il.learn.room import room
 
 _LOG = logging.getLogger(__name__)
 I64 = NDArray[np.int64]
@@ -104,7 +103,7 @@ def windows_of(policy: PreTrainedConfig, columns: Sequence[str], episodes: I64) 
 class JoinedFrames:
     """The pictures of several datasets as one array (N, 3, H, W) of which rows are read, without copying the rest."""
 
-    def __init__(self, pieces: Sequence[NDArray[np.uint8] | LazyFrames]):
+    def __init__(self, pieces: Sequence[NDArray[np.uint8] | Camera]):
         self._pieces = pieces
         self._ends = np.cumsum([len(piece) for piece in pieces])
 
@@ -194,32 +193,19 @@ def load_samples(
     policy: PreTrainedConfig,
     config: FitConfig,
     meta: Any,
-    folder: Path,
     on_frames: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Return the samples of datasets, taken as one, for a policy that has its features; in memory where they fit.
+    """Return the samples of datasets, taken as one, for a policy that has its features.
 
-    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'. folder: for
-    columns that do not fit in the memory given. on_frames: sees how many frames more have been decoded. Raises
-    `NotFiniteError`, `UsageError` for less memory than a batch needs, and what `windows_of` and `Windows.usable` raise.
+    meta: LeRobot's metadata of the datasets, with the actions to learn where those are not the datasets'.
+    on_frames: sees how many frames more have been decoded. Raises `NotFiniteError` and what `windows_of` and
+    `Windows.usable` raise.
     """
     features = [*(policy.input_features or {}), ACTION]
     cameras = tuple(key for key in features if key in meta.camera_keys)
     numbers = [key for key in features if key not in cameras]
     label = [LABEL_VALID] if LABEL_VALID in meta.features else []
-    sizes = {key: math.prod(meta.features[key]["shape"]) for key in features}
-    in_batch = sum(sizes[key] * _window_length(policy, key) for key in features)  # pictures become floats, too
-    table = read_tables(
-        roots,
-        [*numbers, *_ALWAYS, *label],
-        room(
-            config,
-            folder,
-            meta.total_frames,
-            sum(sizes[key] for key in numbers),
-            4 * in_batch * config.samples_per_step,
-        ),
-    )
+    table = joined_columns(roots, [*numbers, *_ALWAYS, *label])
     table[TASK_INDEX] = meta.joint_tasks(table[TASK_INDEX])
     if meta.learnt_actions is not None:
         table[ACTION] = meta.learnt_actions
@@ -242,10 +228,6 @@ def load_samples(
     return Samples(source, usable[train], usable[held_out], cameras, _digest(roots, table))
 
 
-def _window_length(policy: PreTrainedConfig, key: str) -> int:
-    return len((policy.action_delta_indices if key == ACTION else policy.observation_delta_indices) or (0,))
-
-
 def _frames(
     roots: Sequence[Path], cameras: Sequence[str], limit: int, on_frames: Callable[[int], None] | None
 ) -> dict[str, JoinedFrames] | None:
@@ -263,14 +245,15 @@ def _frames(
 
 def read_later(roots: Sequence[Path], cameras: Sequence[str]) -> dict[str, JoinedFrames]:
     """Return the pictures of every camera in all datasets, which are decoded when they are read."""
-    return {camera: JoinedFrames([LazyFrames(root, camera) for root in roots]) for camera in cameras}
+    return {camera: JoinedFrames([Dataset.open(root).camera(camera) for root in roots]) for camera in cameras}
 
 
 def _digest(roots: Sequence[Path], table: Mapping[str, NDArray[Any]]) -> str:
     """SHA-256 of the columns and of the datasets' statistics, which stand for the pictures."""
     digest = hashlib.sha256()
     for root in roots:
-        digest.update((root / "meta" / "stats.json").read_bytes())
+        path = root / STATS
+        digest.update(path.read_bytes() if path.exists() else b"")
     for key, column in table.items():
         digest.update(key.encode())
         digest.update(np.ascontiguousarray(column))

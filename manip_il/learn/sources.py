@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_read import UNKNOWN_TASK
+from manip_il.data.dataset import UNKNOWN_TASK
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.fit_config import check_weights

@@ -26,7 +26,6 @@ from lerobot.policies.factory import make_pre_post_processors
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 
-from manip_il.data.arrays import Allocate, in_memory, pieces
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, RobotTaskSpec
 from manip_il.errors import NotFiniteError
 from manip_il.learn.action_spaces import ARM, GRIPPER, JOINT_DELTAS, Conversion, conversion_for
@@ -51,7 +50,6 @@ from manip_il.learn.metrics import metric_writers
 from manip_il.learn.mlp.configuration_mlp import MLPConfig
 from manip_il.learn.mlp.modeling_mlp import MLPPolicy
 from manip_il.learn.network import fit_statistics, warm_start
-from manip_il.learn.room import numbers_of, room
 from manip_il.learn.sources import Sources
 
 WARMUP_STEPS, WEIGHT_DECAY, GRAD_CLIP_NORM = 100, 1e-4, 10.0
@@ -78,19 +76,18 @@ def fit(
     there, `label_valid`, `episode_index`, `frame_index`. weights: how often each frame is drawn, relative
     to the others, (N,); by default each once an epoch, or as `sources`, the datasets of the table, have it.
     Statistics are those of all frames learnt from, each counted once. repo_id: what Weights & Biases calls the
-    data. The same table, config and number of threads give the same bits, resumed or not, in memory or not. Metrics go
+    data. The same table, config and number of threads give the same bits, resumed or not. Metrics go
     to `on_log`, `metrics.jsonl`, and where the config says.
     Raises `FolderExistsError` for a folder with a checkpoint unless `resume`, `NotFiniteError` for data or a loss that
-    is not finite, `UsageError` for less memory than a batch needs, `MismatchError` for a table that does not fit `spec`
-    or a run that is resumed on other data or options, and what `conversion_for` raises.
+    is not finite, `MismatchError` for a table that does not fit `spec` or a run that is resumed on other data or
+    options, and what `conversion_for` raises.
     """
     output_dir = Path(output_dir)
     checkpoint = last_checkpoint(output_dir, resume=resume)
     check_table(table, spec)
     lerobot = LeRobotFit(config, spec.action_meaning)
     conversion = conversion_for(lerobot.action_space, spec)
-    allocate = room(config, output_dir, len(table[STATE]), numbers_of(spec))
-    rows = learning_rows(table, conversion, allocate)
+    rows = learning_rows(table, conversion)
     drawn = weights[valid_frames(table)] if weights is not None else _drawn(table, rows, config, sources)
     options = _options(lerobot)
     data = sources.to_json() if sources else ()
@@ -100,7 +97,7 @@ def fit(
     with threads(config.threads):
         if checkpoint is not None:
             check_same_run(checkpoint, digest, json.loads(json.dumps(key["options"])))
-        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn, conversion, allocate)
+        trainer = Trainer(rows, lerobot, spec, checkpoint, drawn, conversion)
         pipeline = lerobot.pipeline(repo_id, None, output_dir)
         with metric_writers(output_dir, trainer.step, config.tensorboard, pipeline) as writers:
             for record in trainer.run():
@@ -124,7 +121,6 @@ class Trainer:
         checkpoint: Path | None = None,
         weights: NDArray[np.float64] | None = None,
         conversion: Conversion = JOINT_DELTAS,
-        allocate: Allocate = in_memory,
     ) -> None:
         config, self.conversion = lerobot.config, conversion
         self.steps, self.batch_size, self.log_freq = config.total_steps, config.samples_per_step, config.log_freq
@@ -147,22 +143,18 @@ class Trainer:
             warm_start(network, config.init_from)
         self.width = rows.inputs.shape[1]
         # One tensor [x | y], so that a batch is one gather of whole rows.
-        self.data, self.held_out = (self._encoded(rows, part, allocate) for part in (train, held_out))
+        self.data, self.held_out = (self._encoded(rows, part) for part in (train, held_out))
         device = self.policy.config.device
         self.held_out_inputs = torch.from_numpy(rows.inputs[held_out]).to(device)
         self.held_out_targets = torch.from_numpy(rows.targets[held_out]).to(device)
         drawn = weights[train] if weights is not None else None
         self.order = order_of(len(train), drawn, self.batch_size, config.seed)
 
-    def _encoded(self, rows: Rows, wanted: NDArray[np.int64], allocate: Allocate) -> torch.Tensor:
+    def _encoded(self, rows: Rows, wanted: NDArray[np.int64]) -> torch.Tensor:
         """Encoded inputs and targets of some rows, (S, n + k + n)."""
         network, device = self.policy.model, self.policy.config.device
-        encoded = torch.from_numpy(allocate((len(wanted), self.width + rows.targets.shape[1]), np.float32))
-        for part in pieces(len(wanted)):
-            inputs, targets = (torch.from_numpy(one[wanted[part]]).to(device) for one in (rows.inputs, rows.targets))
-            encoded[part, : self.width] = network.encode(inputs)
-            encoded[part, self.width :] = network.encode_targets(targets)
-        return encoded.to(device)
+        inputs, targets = (torch.from_numpy(one[wanted]).to(device) for one in (rows.inputs, rows.targets))
+        return torch.cat([network.encode(inputs), network.encode_targets(targets)], dim=1)
 
     def run(self) -> Iterator[dict[str, Any]]:
         """Take the steps that are left; yield the metrics at every `log_freq` and the last, else {}."""

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.data.lerobot_read import read_table, read_tables
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.schema import ACTION, ACTOR, ENVIRONMENT_STATE, LABEL_VALID, STATE, SUCCESS
 from manip_il.errors import MismatchError, NotFiniteError, NothingToLearnError, UsageError
 from manip_il.learn.columns import EPISODE_INDEX, Table, require_finite
@@ -120,10 +120,10 @@ def read_demonstrations(
     """Read the expert's whole episodes from datasets. encode: `Conversion.encode` of actions (T, n), states (T, n).
 
     Left out are episodes that a learner drove at some step, that hold a label that is not valid, or of which a column
-    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `read_tables`
+    says that they failed. Raises `NothingToLearnError` where none is left, `NotFiniteError` and what `joined_columns`
     raises.
     """
-    table = read_tables(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
+    table = joined_columns(roots, [STATE, ENVIRONMENT_STATE, ACTION, EPISODE_INDEX, *_optional(roots)])
     require_finite(table, (STATE, ENVIRONMENT_STATE, ACTION))
     pieces = _episodes(table)
     kept = [piece for piece in pieces if _is_demonstration(table, piece)]
@@ -157,5 +157,5 @@ def _is_demonstration(table: Table, piece: slice) -> bool:
 
 def _optional(roots: Sequence[Path]) -> list[str]:
     """The columns beside those of learning that every dataset has."""
-    known = [set(read_table(root, episodes=[0])) for root in roots]
+    known = [set(Dataset.open(root).features) for root in roots]
     return [name for name in _TELLING if all(name in names for names in known)]

@@ -12,18 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from manip_il.data import foxglove
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES, NUMBERS, PICTURES, Feature, Info, read_info
-from manip_il.data.lerobot_read import read_frames, read_instructions, read_table
-from manip_il.data.parquet_files import UNREADABLE
-from manip_il.data.parquet_limits import check_parquet
-from manip_il.data.pictures import decode_cell
 from manip_il.errors import ManipError
 from manip_il.mcap.mapping import TASK, TEXT, Mapping, Source
 from manip_il.mdp import require_finite
@@ -58,20 +53,19 @@ def export_dataset(root: Path, info: Info, folder: Path) -> Iterator[Path]:
     """
     columns = _columns(info)
     numbers = [one.key for one in columns if one.dtype not in PICTURES]
-    table = read_table(root, [*numbers, layout.EPISODE_INDEX, layout.TASK_INDEX])
+    dataset = Dataset.open(root)
+    table = dataset.columns([*numbers, layout.EPISODE_INDEX, layout.TASK_INDEX])
     for key in numbers:
         require_finite(f"{root}, column {key!r}", table[key])
-    index, texts = table[layout.EPISODE_INDEX], read_instructions(root)
+    index, texts = table[layout.EPISODE_INDEX], dataset.tasks
     if missing := set(table[layout.TASK_INDEX].tolist()) - set(texts):
         raise ManipError(f"{root}: rows have the task {min(missing)}, which {layout.TASKS} does not hold as text")
-    stored = {one.key: stored_pictures(root, one.key) for one in columns if one.dtype == "image"}
-    films = [one.key for one in columns if one.dtype == "video"]
+    cameras = {one.key: dataset.camera(one.key) for one in columns if one.dtype in PICTURES}
     starts = np.flatnonzero(np.diff(index, prepend=-1)).tolist()
     for start, stop in itertools.pairwise([*starts, len(index)]):
         episode = int(index[start])
         rows: dict[str, Any] = {key: table[key][start:stop] for key in numbers}
-        rows |= {key: itertools.islice(pictures, stop - start) for key, pictures in stored.items()}
-        rows |= {key: read_frames(root, key, episode) for key in films}
+        rows |= {key: camera.rows(np.arange(start, stop)) for key, camera in cameras.items()}
         rows[TASK] = [texts[number] for number in table[layout.TASK_INDEX][start:stop].tolist()]
         path = folder / f"episode_{episode:06d}.mcap"
         about = {"info": (root / layout.INFO).read_text(encoding="utf-8"), "episode_index": str(episode)}
@@ -92,18 +86,6 @@ def mapping_of(info: Info) -> Mapping:
             path = "message" if one.dtype == TEXT else "joints[:].position" if _is_joints(one) else "scalars[:].value"
             features[one.key] = Source(_topic(one.key), *near, path, one.dtype, one.names, one.shape)
     return Mapping(fps, Source(_TASK_TOPIC, *near, "message"), features, info.robot or None)
-
-
-def stored_pictures(root: Path, key: str) -> Iterator[NDArray[np.uint8]]:
-    """Yield every picture of an `image` column, (height, width, 3), in stored order."""
-    for path in sorted(root.glob(layout.DATA_FILES)):
-        try:
-            check_parquet([path])
-            with pq.ParquetFile(path) as file:
-                for batch in file.iter_batches(_BATCH, columns=[key], use_threads=False):
-                    yield from map(decode_cell, batch.column(0).to_pylist())
-        except UNREADABLE as error:
-            raise ManipError(f"cannot read the pictures {key!r} in {path}: {error}") from error
 
 
 def _columns(info: Info) -> list[Feature]:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from manip_il.collect.render import render_states
 from manip_il.collect.source import Source, open_source
 from manip_il.data import schema
-from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4
 from manip_il.preferences.answers import FORMAT, VERSION
@@ -42,7 +41,7 @@ def render_films(clips: Clips, robot: str | None = None, on_pair: Callable[[], N
     """
     pairs = clips.pairs
     opened = [open_source(Path(source.root), robot) for source in pairs.sources]
-    states = [read_table(source.root, [schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
+    states = [source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE] for source in opened]
     every = -(-pairs.control_hz // MOST_FPS)
     found: Films = []
     size = 0

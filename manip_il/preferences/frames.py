@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manip_il.data import schema
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
-from manip_il.data.lerobot_read import UNKNOWN_TASK, column_names, read_spec, read_table
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.columns import require_finite
@@ -62,13 +62,14 @@ class Frames:
 
 def read_frames(root: Path) -> Frames:
     """Return the frames of a dataset. Raises `ManipError` for one that lacks our columns, or is not finite."""
-    spec, there = read_spec(root), column_names(root)
+    dataset = Dataset.open(root)
+    spec, there = dataset.spec, list(dataset.features)
     action = schema.EXECUTED_ACTION if schema.EXECUTED_ACTION in there else schema.ACTION
     needed = [schema.STATE, schema.ENVIRONMENT_STATE, action]
     if missing := [name for name in needed if name not in there]:
         raise ManipError(f"{root} lacks {', '.join(missing)}, of which a reward is a function")
     more = [name for name in (schema.PROGRESS, schema.SUCCESS) if name in there]
-    table = read_table(root, [*needed, *more, EPISODE_INDEX])
+    table = dataset.columns([*needed, *more, EPISODE_INDEX])
     require_finite(table, [*needed, *(name for name in more if name == schema.PROGRESS)])
     state, environment, executed = (np.ascontiguousarray(table[name], np.float32) for name in needed)
     progress, success = table.get(schema.PROGRESS), table.get(schema.SUCCESS)

@@ -14,18 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import (
-    UNKNOWN_TASK,
-    DatasetInfo,
-    camera_keys,
-    dataset_info,
-    read_fingerprint,
-    read_frames,
-    read_instructions,
-    read_provenance,
-    read_spec,
-    read_table,
-)
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
+from manip_il.data.info import DatasetInfo
 from manip_il.errors import ManipError, UnknownName
 
 _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
@@ -44,15 +34,16 @@ _INK, _FAINT, _PATH, _START, _GOAL = "#222222", "#dddddd", "#8aa4c8", "#c0392b",
 
 def dataset_fields(root: Path, place: str) -> tuple[DatasetCardData, dict[str, Any]]:
     """Return metadata and fields of the card. place: USER/NAME of the repository."""
-    info = dataset_info(root)
+    dataset = Dataset.open(root)
+    info = dataset.summary
     return _metadata(info), {
         "title": f"{info.robot} {info.task}" if info.task != UNKNOWN_TASK else place,
         "instruction": info.instruction,
         "place": place,
-        "rows": list(_rows(root, info)),
-        "has_labels": _has_labels(root),
-        "provenance": list(_provenance(read_provenance(root))),
-        "fingerprint": read_fingerprint(root).items(),
+        "rows": list(_rows(dataset)),
+        "has_labels": _has_labels(dataset),
+        "provenance": list(_provenance(dataset.provenance)),
+        "fingerprint": dataset.fingerprint.items(),
     }
 
 
@@ -68,36 +59,37 @@ def _metadata(info: DatasetInfo) -> DatasetCardData:
     )
 
 
-def _rows(root: Path, info: DatasetInfo) -> Iterator[tuple[str, object]]:
+def _rows(dataset: Dataset) -> Iterator[tuple[str, object]]:
+    info = dataset.summary
     seconds = info.frames / info.fps
     unit, name = next((unit, name) for unit, name in _UNITS if seconds >= unit or unit == 1)
     time = f"{seconds / unit:.3g} {name}"
     yield "robot", f"`{info.robot}`"
     yield "task", f"`{info.task}`: {info.instruction}"
-    texts = read_instructions(root)
+    texts = dataset.tasks
     if len(texts) > 1:
         yield "texts", f"{len(texts)}, such as: {next(iter(texts.values()))}"
-    cameras = [key.removeprefix(s.IMAGES) for key in camera_keys(root)]
+    cameras = [key.removeprefix(s.IMAGES) for key in dataset.cameras]
     yield "cameras", ", ".join(f"`{name}`" for name in cameras) or "none: states only"
     yield "episodes", f"{info.episodes:,}"
-    yield "frames", f"{info.frames:,} at {info.fps} a second, {time}"
+    yield "frames", f"{info.frames:,} at {info.fps:g} a second, {time}"
     if info.success is not None:
         yield "success", f"{info.success:,} of {info.episodes:,} episodes"
-    if seeds := _seeds(root):
+    if seeds := _seeds(dataset):
         yield "seeds", seeds
 
 
-def _seeds(root: Path) -> str:
+def _seeds(dataset: Dataset) -> str:
     try:
-        seeds = np.unique(read_table(root, [s.SEED])[s.SEED])
+        seeds = np.unique(dataset.columns([s.SEED])[s.SEED])
     except UnknownName:
         return ""
     return f"{len(seeds):,}, from {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else f"{seeds[0]}"
 
 
-def _has_labels(root: Path) -> bool:
+def _has_labels(dataset: Dataset) -> bool:
     try:
-        read_table(root, [s.EXECUTED_ACTION, s.LABEL_VALID], [0])
+        dataset.columns([s.EXECUTED_ACTION, s.LABEL_VALID], [0])
     except UnknownName:
         return False
     return True
@@ -131,9 +123,9 @@ def _provenance(one: Mapping[str, Any], name: str = "") -> Iterator[str]:
 
 def draw_picture(root: Path) -> bytes | None:
     """Return a PNG; None for a dataset without cameras and without an object and a goal among its columns."""
-    keys = camera_keys(root)
-    if keys:
-        return _png(_frames(root, keys))
+    dataset = Dataset.open(root)
+    if dataset.cameras:
+        return _png(_frames(dataset))
     paths = read_paths(root)
     return _png(_drawing(paths)) if paths else None
 
@@ -141,23 +133,24 @@ def draw_picture(root: Path) -> bytes | None:
 def read_paths(root: Path) -> list[tuple[NDArray[Any], NDArray[Any]]]:
     """Return the object's path, (T, 3), and the goal, (3,), of the first episodes [m]; none if no columns hold them."""
     try:
-        names = read_spec(root).environment_state_names
+        dataset = Dataset.open(root)
+        names = dataset.spec.environment_state_names
     except ManipError:
         return []  # another program's dataset
     if not {f"{thing}.{axis}" for thing in ("object", "goal") for axis in "xyz"} <= set(names):
         return []
-    table = read_table(root, [s.ENVIRONMENT_STATE, layout.EPISODE_INDEX])
+    table = dataset.columns([s.ENVIRONMENT_STATE, layout.EPISODE_INDEX])
     index, values = table[layout.EPISODE_INDEX], table[s.ENVIRONMENT_STATE]
     columns, goal = ([names.index(f"{thing}.{axis}") for axis in "xyz"] for thing in ("object", "goal"))
     episodes = [values[index == episode] for episode in np.unique(index)[:EPISODES]]
     return [(rows[:, columns], rows[0, goal]) for rows in episodes]
 
 
-def _frames(root: Path, keys: Sequence[str]) -> Image.Image:
+def _frames(dataset: Dataset) -> Image.Image:
     """Draw one row for each camera: evenly spaced frames of the first episode."""
     rows: list[list[Image.Image]] = []
-    for key in keys:
-        pictures = read_frames(root, key, 0)
+    for key in dataset.cameras:
+        pictures = dataset.frames(key, dataset.rows_of(0))
         picked = np.unique(np.linspace(0, len(pictures) - 1, FRAMES).round().astype(int))
         width = round(HEIGHT * pictures.shape[2] / pictures.shape[1])
         rows.append([Image.fromarray(pictures[i]).resize((width, HEIGHT), Image.Resampling.LANCZOS) for i in picked])

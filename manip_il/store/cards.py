@@ -16,8 +16,8 @@ from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
 from manip_il import checks
 from manip_il.checks import parse_yaml
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_layout import INFO
-from manip_il.data.lerobot_read import dataset_info
 from manip_il.data.schema import ENVIRONMENT_STATE
 from manip_il.errors import ManipError
 from manip_il.store.card_dataset import dataset_fields, draw_picture
@@ -214,7 +214,7 @@ def _rows(root: Path, policy: Policy) -> Iterator[tuple[str, object]]:
     if policy.dataset:
         yield "learnt from", f"`{policy.dataset}`"
     elif (root / _DATASET / INFO).is_file():
-        data = dataset_info(root / _DATASET)
+        data = Dataset.open(root / _DATASET).summary
         yield "learnt from", f"{data.episodes:,} episodes, {data.frames:,} frames"
     options = {**(meta.get("options") or {}), **policy.training}
     fit = [text.format(options[key]) for key, text in _FIT.items() if options.get(key) is not None]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manip_il.data import atomic
-from manip_il.data.lerobot_read import check_all_pictures
+from manip_il.data.gate import check_arrived
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.store.disk import HASHERS, Download, is_whole, sync_disk
 from manip_il.store.errors import NoSpaceError, NotFoundError, Retry
@@ -75,7 +75,7 @@ def pull(
         else:
             raise NotFoundError(f"{url} keeps being changed by pushes; pull again when they are done")
         for dataset in datasets_in(staging / "tree"):
-            check_all_pictures(dataset)
+            check_arrived(dataset)
         _move_to(staging / "tree", target, snapshot.manifest, overwrite)
         shutil.rmtree(staging, ignore_errors=True)
     return Pulled(snapshot.manifest, kept)

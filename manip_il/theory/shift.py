@@ -23,7 +23,7 @@ from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.dataset import joined_columns
 from manip_il.errors import ManipError
 from manip_il.evaluation.intervals import Proportion
 from manip_il.learn.columns import EPISODE_INDEX
@@ -207,7 +207,7 @@ def _visited(episodes: Sequence[Episode], names: Sequence[str]) -> Visited:
 
 def _stored(round_: RoundData, names: Sequence[str]) -> Visited:
     """States of the data that a round's policy was fitted on, but those after success, which rollouts here end at."""
-    table = read_tables(round_.datasets, [*_OBSERVED, schema.SUCCESS, EPISODE_INDEX])
+    table = joined_columns(round_.datasets, [*_OBSERVED, schema.SUCCESS, EPISODE_INDEX])
     rows = np.flatnonzero(~table[schema.SUCCESS].ravel().astype(np.bool_))
     if len(rows) > MOST_STATES:
         rows = np.sort(rng_for(round_.round, "states of the data").choice(rows, MOST_STATES, replace=False))

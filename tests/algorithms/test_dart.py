@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from manip_il.algorithms import dart
-from manip_il.data import lerobot_read
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
 from manip_il.learn.policy import LearnedPolicy
 
@@ -41,7 +42,7 @@ def table() -> dict[str, np.ndarray]:
 
 def noise(table, errors, monkeypatch) -> tuple[np.ndarray, Wrong]:
     policy = Wrong(table, errors)
-    monkeypatch.setattr(lerobot_read, "read_table", lambda root, columns: table)
+    monkeypatch.setattr(Dataset, "open", lambda root: SimpleNamespace(columns=lambda names: table))
     monkeypatch.setattr(LearnedPolicy, "load", lambda path, *, trust: policy)
     return np.array(dart.fitted_noise(Path("p"), Path("d"))), policy
 

@@ -12,7 +12,7 @@ from manip_il.algorithms.config import RunConfig
 from manip_il.algorithms.rounds import Rollouts, RoundResult, mixture
 from manip_il.algorithms.run import Run, Watch
 from manip_il.collect.workers import Engine
-from manip_il.data.lerobot_read import dataset_info
+from manip_il.data.dataset import Dataset
 from manip_il.learn.fit_config import FitConfig
 from manip_il.mdp import Episode
 from manip_il.sim.env import EnvConfig
@@ -59,7 +59,7 @@ def test_a_new_algorithm_goes_on_where_it_was_stopped_to_the_same_bytes(algorith
     assert [result.beta for result in whole] == betas
     assert [result.episodes for result in whole] == [2, 4, 6][:rounds]
     assert [result.labels for result in whole] == sorted({result.labels for result in whole})
-    assert dataset_info(tmp_path / "whole/dataset").episodes == 2 * rounds
+    assert Dataset.open(tmp_path / "whole/dataset").summary.episodes == 2 * rounds
     count = 0
 
     def stop(episode: Episode) -> None:

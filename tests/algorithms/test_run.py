@@ -18,7 +18,7 @@ from manip_il.algorithms.run import Watch, round_folder
 from manip_il.algorithms.table import run_algorithm
 from manip_il.collect.query import Ensemble, Safety
 from manip_il.collect.workers import Engine
-from manip_il.data.lerobot_read import dataset_info, read_table, read_tables
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.errors import MismatchError
 from manip_il.evaluation.results import EpisodeResult, EvalResult
 from manip_il.learn.columns import LEARNING_COLUMNS
@@ -63,7 +63,7 @@ def test_a_round_leaves_its_episodes_dataset_policy_and_evaluation_and_the_run_i
     folder, results, _ = run
     for round_, episodes in enumerate((4, 2)):
         here = round_folder(folder, round_)
-        assert dataset_info(here / "dataset").episodes == episodes
+        assert Dataset.open(here / "dataset").summary.episodes == episodes
         assert (results[round_].policy / "model.safetensors").is_file()
         assert EvalResult.read(here / "eval.json") == results[round_].validation
     assert files(folder / "best" / "pretrained_model") == files(best_round(results).policy)
@@ -75,7 +75,7 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
     assert [result.beta for result in results] == [1.0, 0.5]
     assert [result.episodes for result in results] == [4, 6]
     for result in results:
-        table = read_tables(datasets(folder, result.round), LEARNING_COLUMNS)
+        table = joined_columns(datasets(folder, result.round), LEARNING_COLUMNS)
         assert result.labels == table["label_valid"].sum()
         record = result.to_json()
         assert record["validation_success"] == result.validation.success.rate
@@ -87,7 +87,7 @@ def test_the_numbers_of_a_round_are_those_of_its_data(run):
 def test_every_seed_is_from_its_own_stream(run):
     folder, _, made = run
     for round_, stream, count in ((0, "demonstrations", 4), (1, "round/1", 2)):
-        table = read_table(round_folder(folder, round_) / "dataset", ("seed", "round", "beta"))
+        table = Dataset.open(round_folder(folder, round_) / "dataset").columns(("seed", "round", "beta"))
         assert set(table["seed"].ravel()) == set(stream_seeds(stream, count))
         assert set(table["round"].ravel()) == {round_}
     seeds = {episode.seed for episode in made}
@@ -108,10 +108,10 @@ def test_of_equally_good_rounds_the_later_is_best(run):
 
 def test_the_aggregated_dataset_holds_both_actions_and_who_drove(run):
     folder, _, _ = run
-    table = read_table(folder / "dataset", ("action", "executed_action", "actor", "round", "episode_index"))
+    table = Dataset.open(folder / "dataset").columns(("action", "executed_action", "actor", "round", "episode_index"))
     round_, actor = table["round"].ravel(), table["actor"].ravel()
     assert len(np.unique(table["episode_index"])) == 6
-    np.testing.assert_array_equal(table["action"], read_tables(datasets(folder, 1), LEARNING_COLUMNS)["action"])
+    np.testing.assert_array_equal(table["action"], joined_columns(datasets(folder, 1), LEARNING_COLUMNS)["action"])
     assert set(actor[round_ == 0]) == {Actor.EXPERT}
     np.testing.assert_array_equal(table["action"][round_ == 0], table["executed_action"][round_ == 0])
     assert {Actor.LEARNER} < set(actor[round_ == 1])
@@ -174,12 +174,12 @@ def test_a_run_begins_with_recorded_demonstrations_in_place_of_its_own(run, tmp_
     given = tuple(datasets(run[0], 1))
     config = replace(CONFIG, datasets=given, beta=ALONE)
     results = list(run_algorithm(config, tmp_path / "run", Engine()))
-    assert results[0].episodes == sum(dataset_info(root).episodes for root in given)
-    assert results[0].labels == read_tables(given, ("label_valid",))["label_valid"].sum()
+    assert results[0].episodes == sum(Dataset.open(root).summary.episodes for root in given)
+    assert results[0].labels == joined_columns(given, ("label_valid",))["label_valid"].sum()
     assert not (round_folder(tmp_path / "run", 0) / "journals").exists()
     assert results[1].labels > results[0].labels
-    aggregated = read_table(tmp_path / "run" / "dataset", ("action",))["action"]
-    np.testing.assert_array_equal(aggregated[: results[0].labels], read_tables(given, ("action",))["action"])
+    aggregated = Dataset.open(tmp_path / "run" / "dataset").columns(("action",))["action"]
+    np.testing.assert_array_equal(aggregated[: results[0].labels], joined_columns(given, ("action",))["action"])
     again = list(run_algorithm(config, tmp_path / "run", Engine()))
     assert [result.validation for result in again] == [result.validation for result in results]
 
@@ -217,7 +217,7 @@ def test_a_run_begins_with_a_policy_and_goes_on_from_its_weights(run, tmp_path, 
 
 
 def labels(folder: Path, rounds: int) -> int:
-    return int(read_tables(datasets(folder, rounds), ("label_valid",))["label_valid"].sum())
+    return int(joined_columns(datasets(folder, rounds), ("label_valid",))["label_valid"].sum())
 
 
 def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
@@ -225,13 +225,13 @@ def test_a_budget_of_labels_is_kept_to_the_label_and_ends_the_run(tmp_path):
     results = list(run_algorithm(config, tmp_path, Engine()))
     assert [result.labels for result in results][-1] == 180 == labels(tmp_path, results[-1].round)
     assert results[-1].round < 5
-    assert dataset_info(tmp_path / "dataset").frames >= 180
+    assert Dataset.open(tmp_path / "dataset").summary.frames >= 180
 
 
 @pytest.mark.parametrize("method", ["cloning", "dart"])
 def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path):
     results = list(run_algorithm(replace(CONFIG, method=method, beta=ALONE), tmp_path, Engine()))
-    table = read_tables(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
+    table = joined_columns(datasets(tmp_path, 1), ("actor", "round", "seed", "executed_action", "action"))
     later = table["round"].ravel() == 1
     drove = {"cloning": Actor.EXPERT, "dart": Actor.NOISY_EXPERT}[method]
     assert (table["actor"].ravel()[later] == drove).all()
@@ -239,7 +239,7 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
     assert set(table["seed"].ravel()[later]) <= set(stream_seeds("round/1", 10))
     held_out = tmp_path / "held_out/dataset"
     assert held_out.is_dir() == (method == "dart")
-    extra = dataset_info(held_out).frames if method == "dart" else 0
+    extra = Dataset.open(held_out).summary.frames if method == "dart" else 0
     assert results[1].queries == results[1].labels + extra
 
 
@@ -250,7 +250,7 @@ def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(t
     assert not (round_folder(tmp_path, 1) / "dataset").exists()
     assert "the expert was queried in none of its rollouts" in caplog.text
     assert results[2].queries > results[0].queries  # it was queried in every state, to know
-    assert dataset_info(tmp_path / "dataset").episodes == 4
+    assert Dataset.open(tmp_path / "dataset").summary.episodes == 4
 
 
 def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
@@ -269,7 +269,7 @@ def test_a_policy_that_plans_goes_through_the_loop_with_every_kind_of_label(labe
     results = list(run_algorithm(config, tmp_path, Engine()))
     assert results[1].labels > results[0].labels
     assert json.loads((results[1].policy / "config.json").read_text())["type"] == "act"
-    table = read_tables(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
+    table = joined_columns(datasets(tmp_path, 1), ("episode_index", "round", "actor", "label_valid"))
     later = table["round"].ravel() == 1
     by_learner = table["actor"].ravel()[later] == Actor.LEARNER
     assert by_learner.all() if label == "per_state" else not by_learner.any()
@@ -286,5 +286,5 @@ def test_a_blind_learner_is_taught_by_an_expert_that_sees_everything(tmp_path):
     assert results[1].labels > results[0].labels
     sees = json.loads((results[1].policy / "config.json").read_text())["input_features"]
     assert set(sees) == {"observation.state", "observation.images.front"}
-    merged = dataset_info(tmp_path / "dataset")
-    assert merged.episodes == sum(dataset_info(root).episodes for root in datasets(tmp_path, 1))
+    merged = Dataset.open(tmp_path / "dataset").summary
+    assert merged.episodes == sum(Dataset.open(root).summary.episodes for root in datasets(tmp_path, 1))

@@ -9,6 +9,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.collect.environments import env_spec
+from manip_il.data.dataset import Dataset
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.sim.env import EnvConfig
 
@@ -45,9 +46,8 @@ def test_bad_input_is_one_line(name, words, says, code, here, error):
     ],
 )
 def test_a_policy_that_cannot_be_gone_on_from_is_refused(kind, robot, says, here, error):
-    from manip_il.data.lerobot_read import read_spec
 
-    own = read_spec(SAMPLE)
+    own = Dataset.open(SAMPLE).spec
     env = EnvConfig("fetch" if (robot == "same") == (own.robot == "fetch") else "panda", own.task)
     spec = env_spec(env)
     write_checkpoint(here / "policy", kind, spec, meta=CheckpointMeta.of(spec, {}))

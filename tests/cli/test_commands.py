@@ -26,7 +26,7 @@ from manip_il.cli.options import command_line, options_of
 from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.parsing import from_yaml, parse
 from manip_il.cli.quickstart import quickstart_verdict
-from manip_il.data.lerobot_read import dataset_info, read_provenance, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.evaluation.report_data import PolicyRow
 from manip_il.evaluation.results import EpisodeResult, EvalResult, EvalSettings
 
@@ -76,13 +76,13 @@ def test_a_config_loads_by_the_command_in_its_first_line(path):
 
 
 def test_record_writes_successes_and_their_provenance(demos):
-    info = dataset_info(demos)
+    info = Dataset.open(demos).summary
     assert (info.episodes, info.success, info.robot, info.task) == (3, 3, "panda", "pick_place")
-    table = read_table(demos, ["seed", "actor", "label_valid"])
+    table = Dataset.open(demos).columns(["seed", "actor", "label_valid"])
     assert np.unique(table["seed"]).tolist() == [1_000_000, 1_000_001, 1_000_002]
     assert not table["actor"].any()
     assert table["label_valid"].all()
-    assert read_provenance(demos)["seeds"] == [1_000_000, 1_000_002]
+    assert Dataset.open(demos).provenance["seeds"] == [1_000_000, 1_000_002]
 
 
 def test_record_goes_on_to_more_episodes_as_if_asked_for_them_at_once(demos, tmp_path, capsys, error):
@@ -114,7 +114,7 @@ def test_a_dataset_that_is_there_is_refused_or_replaced(demos, tmp_path, error):
     assert "exists already" in error()
     assert main(record(tmp_path / "d", 1)) == 0
     assert main(record(tmp_path / "d", 1, "--seed=2", "--overwrite=true")) == 0
-    assert read_table(tmp_path / "d", ["seed"])["seed"][0] > 200_000_000
+    assert Dataset.open(tmp_path / "d").columns(["seed"])["seed"][0] > 200_000_000
 
 
 def test_train_refuses_a_dataset_with_nan(demos, tmp_path, error):
@@ -161,7 +161,7 @@ def test_a_dagger_run_may_have_more_rounds_and_no_other_options(tmp_path, error)
     assert "--beta differs" in error()
     assert main([*words, "--resume=true", "--rounds=2"]) == 0
     assert [record["round"] for record in read_jsonl(run / "metrics.jsonl")] == [0, 1, 2]
-    assert dataset_info(run / "dataset").episodes == 3 + 2 * 2
+    assert Dataset.open(run / "dataset").summary.episodes == 3 + 2 * 2
 
 
 @pytest.mark.slow

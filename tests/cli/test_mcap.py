@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_read import read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.schema import RobotTaskSpec
 
@@ -40,7 +40,9 @@ def test_what_is_exported_is_imported_and_what_the_mapping_leaves_out_is_said(da
     lines = capsys.readouterr().out.splitlines()
     assert next(line.split() for line in lines if line.startswith("/action ")) == ["/action", "8", "4", "4"]
     assert next(line for line in lines if line.startswith("/seed ")).endswith("8  not in the mapping")
-    np.testing.assert_array_equal(read_table(tmp_path / "new")["action"], read_table(dataset)["action"][::2, 1])
+    np.testing.assert_array_equal(
+        Dataset.open(tmp_path / "new").columns()["action"], Dataset.open(dataset).columns()["action"][::2, 1]
+    )
 
 
 def test_an_export_is_replaced_only_when_told_to(dataset, tmp_path, error):
@@ -60,7 +62,7 @@ def test_an_export_never_overwrites_its_own_dataset(dataset, error):
     for out in (dataset, dataset / ".." / dataset.name, dataset.parent):
         assert main(["mcap", "export", str(dataset), str(out), "--overwrite=true"]) == 2
         assert "holds the dataset itself" in error()
-    assert len(read_table(dataset)["seed"]) == 8
+    assert len(Dataset.open(dataset).columns()["seed"]) == 8
 
 
 def test_import_refuses_a_full_folder_before_it_reads_anything(dataset, tmp_path, error):

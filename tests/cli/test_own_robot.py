@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_read import read_spec
+from manip_il.data.dataset import Dataset
 
 from ..robots.own import write
 
@@ -29,7 +29,7 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert "the gripper of mine opens to" in capsys.readouterr().err
     assert [one.name for one in tmp_path.iterdir()] == ["arms"]
     assert main(["record", robot, *REACH, "--dataset.num_episodes=2"]) == 0
-    assert read_spec(Path("datasets/mine_reach")).robot == "mine"
+    assert Dataset.open(Path("datasets/mine_reach")).spec.robot == "mine"
     assert main(["train", "--dataset.root=datasets/mine_reach", "--steps=2", "--output_dir=run"]) == 0
     said = capsys.readouterr()
     assert "pretrained_model --robot.type=mine.yaml --output_dir=run/eval" in said.out
@@ -46,4 +46,4 @@ def test_it_is_recorded_learnt_evaluated_improved_and_rendered(
     assert main([*render, "--robot.type=panda"]) == 1
     assert "robot differs" in capsys.readouterr().err
     assert main([*render, robot]) == 0
-    assert read_spec(Path("seen")).cameras == ("front",)
+    assert Dataset.open(Path("seen")).spec.cameras == ("front",)

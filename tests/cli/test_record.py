@@ -13,8 +13,8 @@ from manip_il.cli.main import main
 from manip_il.cli.outputs import atomic_write
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import list_episodes
-from manip_il.data.lerobot_read import dataset_info, read_episodes, read_provenance, read_spec, read_table
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.sim import render
 from manip_il.sim.config import CameraConfig, Look
@@ -59,7 +59,7 @@ def test_a_damaged_journal_is_left_out_and_said(recorded, tmp_path, capsys):
     err = capsys.readouterr().err
     assert f"warning: {cut} is not a complete episode" in err
     assert "error: 1 journal could not be read" in err
-    assert dataset_info(tmp_path / "x").episodes == 2
+    assert Dataset.open(tmp_path / "x").summary.episodes == 2
     capsys.readouterr()
     assert main(["record", *record(tmp_path / "x", "--dataset.repo_id=me/demos", "--resume=true")[1:]]) == 0
     assert files(tmp_path / "x") == files(recorded)
@@ -96,8 +96,8 @@ def test_pictures_are_recorded_and_built_again_to_the_same_bytes_by_one_worker_o
     assert files(tmp_path / "one") == files(tmp_path / "two")
     assert main(["build", str(journals_of(tmp_path / "one")), str(tmp_path / "again")]) == 0
     assert files(tmp_path / "again") == files(tmp_path / "one")
-    frames = read_table(tmp_path / "one", ["index"])["index"]
-    episodes = list(read_episodes(tmp_path / "one"))
+    frames = Dataset.open(tmp_path / "one").columns(["index"])["index"]
+    episodes = list(Dataset.open(tmp_path / "one").read_episodes())
     for camera in ("front", "wrist"):
         decoded = np.concatenate([episode.columns[f"observation.images.{camera}"] for episode in episodes])
         assert decoded.shape == (len(frames), 64, 80, 3)
@@ -127,8 +127,10 @@ def test_the_command_makes_a_dataset_with_the_asked_pictures(demos, capsys):
     said = capsys.readouterr()
     assert "rendered 3 episodes, 18 frames: front, side, wrist, 48 x 64 pixels\ndataset: seen\n" in said.out
     assert "render demos: 3/3" in said.err
-    assert read_spec(Path("seen")) == env_spec(ENV, CameraConfig(("front", "side", "wrist"), 48, 64))
-    np.testing.assert_array_equal(read_table(Path("seen"))["sim_state"], read_table(demos)["sim_state"])
+    assert Dataset.open(Path("seen")).spec == env_spec(ENV, CameraConfig(("front", "side", "wrist"), 48, 64))
+    np.testing.assert_array_equal(
+        Dataset.open(Path("seen")).columns()["sim_state"], Dataset.open(demos).columns()["sim_state"]
+    )
 
 
 @pytest.mark.gl
@@ -139,7 +141,9 @@ def test_two_workers_write_the_bytes_of_one(demos):
     Path("again").mkdir()
     assert main(["render", "demos", "again/one", "--workers=2", *words]) == 0
     assert files(Path("one")) == files(Path("again/one"))
-    assert read_provenance(Path("one"))["rendered"]["cameras"]["look"] == asdict(Look(shadows=True, light_turn=30))
+    assert Dataset.open(Path("one")).provenance["rendered"]["cameras"]["look"] == asdict(
+        Look(shadows=True, light_turn=30)
+    )
 
 
 @pytest.mark.parametrize(

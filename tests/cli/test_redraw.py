@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_read import dataset_info, read_provenance, read_spec, read_table
+from manip_il.data.dataset import Dataset
 
 from ..damage import digests
 from .made_runs import files
@@ -38,17 +38,17 @@ def redrawn(demos, tmp_path_factory) -> Path:
 @pytest.mark.gl
 @pytest.mark.slow
 def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
-    info, spec = dataset_info(redrawn), read_spec(redrawn)
+    info, spec = Dataset.open(redrawn).summary, Dataset.open(redrawn).spec
     assert info.episodes == info.frames == 60
     assert (spec.cameras, spec.image_size, spec.video) == (("front", "side", "wrist"), (32, 32), False)
-    assert read_provenance(redrawn)["redrawn"]["from"] == "demos"
-    points = read_table(redrawn, [one for one in spec.keypoint_keys])
+    assert Dataset.open(redrawn).provenance["redrawn"]["from"] == "demos"
+    points = Dataset.open(redrawn).columns([one for one in spec.keypoint_keys])
     assert spec.keypoints[:2] == ("goal", "object")
     for places in points.values():
         assert places.shape == (60, 3 * len(spec.keypoints))
         assert ((places >= 0) & (places <= 1)).all()
         assert places.reshape(60, -1, 3)[:, :2, 2].any()
-    assert read_table(redrawn, ["label_valid"])["label_valid"].all()
+    assert Dataset.open(redrawn).columns(["label_valid"])["label_valid"].all()
     assert not redrawn.with_name("new.journals").exists()
     assert main(["doctor", str(redrawn)]) == 0
     dataset: Any = LeRobotDataset("local/new", root=redrawn)
@@ -88,8 +88,8 @@ def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
     target = tmp_path / "branches"
     words = ["--frames=6", "--branch_steps=4", *SMALL[1:]]
     assert main(["redraw", str(demos), str(target), *words]) == 0
-    assert (dataset_info(target).episodes, dataset_info(target).frames) == (6, 24)
-    table = read_table(target, ["action", "executed_action"])
+    assert (Dataset.open(target).summary.episodes, Dataset.open(target).summary.frames) == (6, 24)
+    table = Dataset.open(target).columns(["action", "executed_action"])
     np.testing.assert_array_equal(table["action"], table["executed_action"])
 
 
@@ -129,7 +129,7 @@ def test_train_redraws_in_passing_and_goes_on_after_a_kill(demos, tmp_path, caps
     words = ["train", f"--dataset.root={demos}", "--policy.type=cnn", "--policy.width=16", "--redraw=30", "--steps=2"]
     words += ["--batch_size=4", "--log_freq=1", f"--output_dir={run}", "--quiet"]
     assert main(words) == 0
-    assert dataset_info(run / "redrawn").frames == 30
+    assert Dataset.open(run / "redrawn").summary.frames == 30
     config = json.loads((run / "checkpoints/last/pretrained_model/config.json").read_text())
     assert set(config["input_features"]) == {
         "observation.state", "observation.images.front", "observation.images.side", "observation.images.wrist"
@@ -154,12 +154,12 @@ def test_dagger_by_pictures_redraws_every_rounds_states_the_same_after_a_kill(de
     words += ["--validation_episodes=1", *SMALL[1:], f"--output_dir={run}"]
     assert main(words) == 0
     first, second = (run / f"round_{number:03d}" for number in range(2))
-    states = [dataset_info(one / "dataset").frames for one in (first, second)]
-    scenes = [dataset_info(one / "redrawn").frames for one in (first, second)]
+    states = [Dataset.open(one / "dataset").summary.frames for one in (first, second)]
+    scenes = [Dataset.open(one / "redrawn").summary.frames for one in (first, second)]
     assert scenes == [60, 60 * states[1] // states[0]]
-    assert read_spec(first / "redrawn").cameras == ("front", "side", "wrist")
-    assert read_spec(second / "dataset").cameras == read_spec(run / "dataset").cameras == ()
-    seeds = [set(read_table(one / "redrawn", ["seed"])["seed"].tolist()) for one in (first, second)]
+    assert Dataset.open(first / "redrawn").spec.cameras == ("front", "side", "wrist")
+    assert Dataset.open(second / "dataset").spec.cameras == Dataset.open(run / "dataset").spec.cameras == ()
+    seeds = [set(Dataset.open(one / "redrawn").columns(["seed"])["seed"].tolist()) for one in (first, second)]
     assert seeds[0].isdisjoint(seeds[1])
     before = digests(second / "redrawn")
     shutil.rmtree(second / "redrawn")

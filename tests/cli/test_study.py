@@ -16,7 +16,7 @@ from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
 from manip_il.cli.study import ROUND_0, expert_trials, same_start, share_start
 from manip_il.cli.study_file import read_plan
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.dataset import joined_columns
 from manip_il.errors import MismatchError
 
 from .made_runs import files, make_run
@@ -298,7 +298,7 @@ def test_a_shared_start_ends_with_the_same_bytes_and_is_charged_for_it(options, 
     rounds = [read_jsonl(run.output_dir / METRICS_FILE) for run in (options, arm)]
     assert rounds[0][0] == rounds[1][0]
     assert len(rounds[1]) == 2
-    assert set(read_tables([arm.output_dir / "dataset"], ("actor",))["actor"].ravel()) == {0}
+    assert set(joined_columns([arm.output_dir / "dataset"], ("actor",))["actor"].ravel()) == {0}
 
 
 def test_a_run_that_is_there_is_left_alone_and_so_is_one_without_a_twin(options, tmp_path):

@@ -15,8 +15,8 @@ from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
 from manip_il.data import journal as journals
 from manip_il.data.build import Recording, build
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, list_episodes, read_header, read_journal
-from manip_il.data.lerobot_read import read_table
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
@@ -165,7 +165,7 @@ def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):
     episodes = collect_successes(Recorded(failing), JOB, SEEDS, 3, folder)
     info, failed = record(episodes, folder, tmp_path / "dataset", JOB, rule)
     assert (info.episodes, failed) == (3, 1)
-    seeds = read_table(tmp_path / "dataset", ["seed"])["seed"]
+    seeds = Dataset.open(tmp_path / "dataset").columns(["seed"])["seed"]
     assert sorted(set(seeds.tolist())) == [SEEDS[0], SEEDS[2], SEEDS[3]]
     result = build(folder, tmp_path / "again")
     assert (result.info.episodes, result.failed, result.damaged) == (3, 1, ())

@@ -18,7 +18,7 @@ from manip_il.collect.relabel import Changes, label_states, relabel_dataset
 from manip_il.collect.source import open_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
-from manip_il.data.lerobot_read import read_provenance, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.rewrite import rewrite_columns
 from manip_il.errors import ManipError
@@ -76,9 +76,9 @@ def test_a_dataset_of_today_keeps_all_that_it_holds(tmp_path):
     env = EnvConfig()
     root = write(recorded(env), tmp_path / "demos", env)
     changes = relabel(root, tmp_path / "same")
-    assert changes == Changes(episodes=2, frames=len(read_table(root)["index"]))
+    assert changes == Changes(episodes=2, frames=len(Dataset.open(root).columns()["index"]))
     assert content(tmp_path / "same") == content(root)
-    provenance = read_provenance(tmp_path / "same")
+    provenance = Dataset.open(tmp_path / "same").provenance
     assert provenance["round"] == 3
     assert provenance["relabelled"]["from"] == "demos"
 
@@ -92,7 +92,7 @@ def test_lost_labels_come_back_with_their_statistics(tmp_path):
     )
     assert content(bare) != content(whole)
     changes = relabel(bare, tmp_path / "again", workers=2)
-    assert changes.gained == changes.frames == len(read_table(whole)["index"])
+    assert changes.gained == changes.frames == len(Dataset.open(whole).columns()["index"])
     assert (changes.lost, changes.actions, changes.phases) == (0, 0, 0)
     assert content(tmp_path / "again") == content(whole)
 
@@ -115,7 +115,9 @@ def test_stock_environments_are_relabelled_too(tmp_path):
     episodes = recorded(env, 1)
     root = write([without_labels(one) for one in episodes], tmp_path / "stock", env)
     relabel(root, tmp_path / "again")
-    np.testing.assert_array_equal(read_table(tmp_path / "again")[schema.ACTION], episodes[0].columns[schema.ACTION])
+    np.testing.assert_array_equal(
+        Dataset.open(tmp_path / "again").columns()[schema.ACTION], episodes[0].columns[schema.ACTION]
+    )
 
 
 @pytest.mark.gl

@@ -15,7 +15,7 @@ from manip_il.collect.record import provenance
 from manip_il.collect.render import render_dataset, render_episodes, render_states
 from manip_il.collect.source import open_source, recorded_conditions
 from manip_il.data import schema
-from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_provenance, read_spec, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode, State
@@ -91,16 +91,17 @@ def test_a_dataset_gains_pictures_and_keeps_everything_else(source, tmp_path):
     written: list[Episode] = []
     target = tmp_path / "pictured"
     info = render_dataset(open_source(source), target, CAMERAS, repo_id="local/p", on_episode=written.append)
-    assert [episode.seed for episode in written] == [episode.seed for episode in read_episodes(source)]
+    assert [episode.seed for episode in written] == [episode.seed for episode in Dataset.open(source).read_episodes()]
     assert info.episodes == 3
-    before, after = read_table(source), read_table(info.root)
+    before, after = Dataset.open(source).columns(), Dataset.open(info.root).columns()
     assert after.keys() == before.keys() | env_spec(ENV, CAMERAS).keypoint_keys.keys()
     for key, column in before.items():
         np.testing.assert_array_equal(after[key], column)
-    assert read_spec(info.root) == env_spec(ENV, CAMERAS)
-    assert read_fingerprint(info.root) == env_fingerprint(ENV, CAMERAS)
-    rendered = read_provenance(info.root).pop("rendered")
-    assert read_provenance(info.root) == {**PROVENANCE, "rendered": rendered}
+    assert Dataset.open(info.root).spec == env_spec(ENV, CAMERAS)
+    assert Dataset.open(info.root).fingerprint == env_fingerprint(ENV, CAMERAS)
+    provenance = Dataset.open(info.root).provenance
+    rendered = provenance["rendered"]
+    assert provenance == {**PROVENANCE, "rendered": rendered}
     assert rendered["from"] == "demos"
     assert rendered["cameras"]["look"] == {"shadows": False, "brightness": 1.0, "light_turn": 0.0}
 
@@ -111,9 +112,9 @@ def test_a_dataset_with_pictures_gets_other_ones(source, tmp_path):
     pictured, dim = tmp_path / "pictured", CameraConfig(("wrist",), 32, 48, Look(brightness=0.5))
     render_dataset(open_source(source), pictured, CAMERAS, repo_id="local/p")
     info = render_dataset(open_source(pictured), tmp_path / "dim", dim, repo_id="local/dim")
-    assert read_spec(info.root) == env_spec(ENV, dim)
-    assert read_fingerprint(info.root) == env_fingerprint(ENV, dim)
-    for episode in read_episodes(info.root):
+    assert Dataset.open(info.root).spec == env_spec(ENV, dim)
+    assert Dataset.open(info.root).fingerprint == env_fingerprint(ENV, dim)
+    for episode in Dataset.open(info.root).read_episodes():
         images = [key for key in episode.columns if key.startswith(schema.IMAGES)]
         assert images == [schema.IMAGES + "wrist"]
         exact = render_states(ENV, dim, episode.columns[schema.SIM_STATE])[images[0]]
@@ -124,15 +125,15 @@ def test_a_dataset_with_pictures_gets_other_ones(source, tmp_path):
 def test_what_was_there_goes_only_once_the_new_dataset_is_whole(source, tmp_path):
     target = tmp_path / "target"
     source.rename(target)
-    write_dataset(read_episodes(target), source, env_spec(ENV), repo_id="local/d", fingerprint={})
-    before = read_provenance(target)
+    write_dataset(Dataset.open(target).read_episodes(), source, env_spec(ENV), repo_id="local/d", fingerprint={})
+    before = Dataset.open(target).provenance
 
     def stop(_: Episode) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         render_dataset(open_source(source), target, CAMERAS, repo_id="local/d", replace=True, on_episode=stop)
-    assert read_provenance(target) == before == PROVENANCE
+    assert Dataset.open(target).provenance == before == PROVENANCE
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demos", "target"]
 
 

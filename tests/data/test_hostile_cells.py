@@ -17,9 +17,9 @@ import datasets
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import merge_datasets
-from manip_il.data.lazy_frames import LazyFrames
+from manip_il.data.dataset import Dataset
+from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import check_all_pictures, check_dataset
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.store.pull import pull
@@ -69,9 +69,9 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 )
 def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any, opened: list[str], tmp_path: Path):
     set_first(root, cell)
-    with pytest.raises(ManipError, match=rf"cannot read the picture {KEY} in frame 0 of .*lift"):
-        _ = LazyFrames(root, KEY)[np.array([0])]
-    refused = rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"
+    with pytest.raises(ManipError, match=rf"cannot read the pictures {KEY} in frames 0 to 0 of .*lift"):
+        _ = Dataset.open(root).camera(KEY)[np.array([0])]
+    refused = rf"{DATA}: column '{KEY}' has no PNG, JPEG or TIFF in row 0"
     with pytest.raises(ManipError, match=refused):
         merge_datasets([root, root], tmp_path / "two", repo_id="a/b")
     assert not opened
@@ -84,14 +84,9 @@ def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: p
     set_first(root, {"bytes": None, "path": "http://127.0.0.1:1/a.png"})
     monkeypatch.setattr("manip_il.store.push.examine_folder", lambda root: [])  # another program pushed it
     push(root, url, remote, unwatched)
-    with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"):
+    with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG, JPEG or TIFF in row 0"):
         pull(url, remote, tmp_path / "here", unwatched)
     assert not (tmp_path / "here").exists()
-
-
-def check_both(root: Path) -> None:
-    check_dataset(root)
-    check_all_pictures(root)
 
 
 DECODED: dict[str, Any] = {
@@ -111,8 +106,8 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
     table = table.append_column("odd", pa.array(rows, layout.PICTURE))
     about = json.dumps({"info": {"features": {"odd": DECODED[kind]}}})
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), root / name)
-    with pytest.raises(ManipError, match=r"'odd'.* (decoded as|has no PNG or JPEG)"):
-        check_both(root)
+    with pytest.raises(ManipError, match=r"'odd'.* (decoded as|has no PNG, JPEG or TIFF)"):
+        check_arrived(root)
     if kind == "another picture":
         meta: Any = read_metadata(root)
         assert meta.episodes is None or meta.episodes[0]["length"] > 0  # LeRobot's would decode the whole row
@@ -123,7 +118,7 @@ def test_a_playlist_is_no_video_that_lerobot_may_join(tmp_path: Path, two: s.Rob
     root = write(filmed, tmp_path / "film", two)
     path = next(root.glob("videos/**/*.mp4"))
     path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())
-    with pytest.raises(ManipError, match=r"mp4 does not begin as an MP4 file does"):
+    with pytest.raises(ManipError, match=r"mp4: it does not begin as an MP4 file does"):
         merge_datasets([root, root], tmp_path / "two", repo_id="a/b")
 
 

@@ -15,15 +15,15 @@ from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import RECORDING, Recording, local_id
-from manip_il.data.lerobot_read import camera_keys, dataset_info, read_frames, read_spec
-from manip_il.doctor.dataset import Dataset
+from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
+from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError, UsageError
 from manip_il.mcap.export import open_source
 from manip_il.sim.conditions import Condition
 
 from ..damage import digests, edit_json, lines
-from ..pictures import numbered_episodes, with_cameras, write
+from ..pictures import episode_frames, numbered_episodes, with_cameras, write
 from ..synthetic import MakeEpisode
 
 HOSTILE = "x/../../../victim/videos/observation.images.front"
@@ -175,7 +175,7 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
 def test_what_info_says_is_checked_by_every_reader(victim, change, words):
     edit_json(victim / layout.INFO, lambda info: info.update(change))
     assert any(words in line for line in lines(victim))
-    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, FRONT, 0)):
+    for read in (Dataset.open, open_source, lambda root: episode_frames(root, FRONT, 0)):
         with pytest.raises(ManipError) as error:
             read(victim)
         assert words in str(error.value)
@@ -187,7 +187,7 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
     assert (victim / "videos" / key).resolve() == secret
     edit_json(victim / layout.INFO, lambda info: info["features"].update({key: info["features"].pop(FRONT)}))
     assert any("a feature is '../../secret'" in line for line in lines(victim))
-    for read in (dataset_info, camera_keys, open_source, lambda root: read_frames(root, key, 0)):
+    for read in (Dataset.open, open_source, lambda root: episode_frames(root, key, 0)):
         with pytest.raises(ManipError, match=r"a feature is '\.\./\.\./secret'"):
             read(victim)
 
@@ -204,11 +204,10 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
 )
 def test_our_own_file_is_checked(victim, change, words):
     edit_json(victim / layout.OURS, lambda ours: ours.update(change))
-    for read in (dataset_info, read_spec):
-        with pytest.raises(ManipError) as error:
-            read(victim)
-        assert words in str(error.value)
-        assert "manip_il.json" in str(error.value)
+    with pytest.raises(ManipError) as error:
+        _ = Dataset.open(victim).spec
+    assert words in str(error.value)
+    assert "manip_il.json" in str(error.value)
 
 
 def test_a_repair_writes_and_moves_nothing_through_a_link(victim, tmp_path):
@@ -218,7 +217,7 @@ def test_a_repair_writes_and_moves_nothing_through_a_link(victim, tmp_path):
     edit_json(outside / "stats.json", lambda stats: stats.pop(s.ACTION))  # it would be computed again
     (outside / "left.tmp.partial").write_bytes(b"x")  # it would be moved away
     before = digests(outside)
-    said = list(repair(Dataset(victim), examine_folder(victim)))
+    said = list(repair(Patient(victim), examine_folder(victim)))
     assert digests(outside) == before
     assert any("is outside the dataset" in line for line in said)
     assert any(line.startswith("not moved, as it is outside the dataset") for line in said)

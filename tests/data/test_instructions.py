@@ -13,8 +13,8 @@ import pytest
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.build import build, merge_datasets
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, read_journal
-from manip_il.data.lerobot_read import dataset_info, read_episodes, read_table
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
@@ -40,18 +40,18 @@ def root(tmp_path: Path, told: list[Episode], spec: s.RobotTaskSpec) -> Path:
 
 
 def texts(root: Path) -> list[str]:
-    return [episode.instruction for episode in read_episodes(root)]
+    return [episode.instruction for episode in Dataset.open(root).read_episodes()]
 
 
 def test_each_text_is_one_task_and_every_frame_has_its_own(root, spec):
     table = pq.read_table(root / layout.TASKS)
     assert table.to_pydict() == {"task_index": [0, 1], "task": [RED, BLUE]}
     assert json.loads((root / layout.INFO).read_text())["total_tasks"] == 2
-    assert read_table(root, ["task_index"])["task_index"].tolist() == [0] * 7 + [1] + [0] * 12
+    assert Dataset.open(root).columns(["task_index"])["task_index"].tolist() == [0] * 7 + [1] + [0] * 12
     rows = pq.read_table(next(root.glob(layout.EPISODES_FILES)), columns=["tasks"]).column("tasks").to_pylist()
     assert rows == [[text] for text in TEXTS]
     assert texts(root) == TEXTS
-    assert dataset_info(root).instruction == spec.instruction
+    assert Dataset.open(root).summary.instruction == spec.instruction
 
 
 def test_an_episode_without_a_text_has_the_specs(tmp_path, episodes, spec):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.lerobot_read import camera_keys
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
@@ -47,7 +47,7 @@ def roots(
 
 
 def cached(root: Path, folder: Path) -> dict[str, np.ndarray]:
-    frames = open_frame_cache(root, camera_keys(root), max_bytes=10**9, folder=folder)
+    frames = open_frame_cache(root, Dataset.open(root).cameras, max_bytes=10**9, folder=folder)
     assert frames is not None
     return frames
 
@@ -56,8 +56,6 @@ def cached(root: Path, folder: Path) -> dict[str, np.ndarray]:
 def test_the_cache_and_what_is_read_late_are_bit_equal_to_what_lerobot_gives(roots, name, tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from manip_il.data.lazy_frames import LazyFrames
-
     root = roots[name]
     frames = cached(root, tmp_path)
     plain: Any = LeRobotDataset("a/b", root=root)
@@ -65,7 +63,7 @@ def test_the_cache_and_what_is_read_late_are_bit_equal_to_what_lerobot_gives(roo
     assert len(plain) == len(frames[FRONT]) > 20
     rows = np.random.default_rng(0).integers(0, len(plain), (4, 3))
     for key, values in frames.items():
-        late = LazyFrames(root, key)
+        late = Dataset.open(root).camera(key)
         assert late.shape == values.shape
         np.testing.assert_array_equal(late[rows], values[rows], strict=True)
     for row in range(len(plain)):
@@ -96,16 +94,14 @@ def test_processes_of_their_own_read_the_same(roots, tmp_path):
 def test_what_is_not_there_is_one_line(roots, tmp_path, two):
     import shutil
 
-    from manip_il.data.lazy_frames import LazyFrames
-
     for name, change in (("h264", "cut"), ("image", "size")):
         root = tmp_path / name
         shutil.copytree(roots[name], root)
-        late = LazyFrames(root, FRONT)
+        late = Dataset.open(root).camera(FRONT)
         if change == "cut":
             shutil.rmtree(root / "videos")
         else:
             edit_json(root / "meta/info.json", lambda info: info["features"][FRONT].update(shape=[8, 8, 3]))
-            late = LazyFrames(root, FRONT)
+            late = Dataset.open(root).camera(FRONT)
         with pytest.raises((ManipError, MismatchError), match=r"cannot read .*\.mp4|shape of observation"):
             _ = late[np.array([3])]

@@ -16,14 +16,23 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.lerobot_read import dataset_info, read_frames, read_spec, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
 from ..damage import DATA, EPISODES
-from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import (
+    assert_comes_back,
+    count_frames,
+    episode_frames,
+    numbered_episodes,
+    numbers_of,
+    video_rows,
+    with_cameras,
+    write,
+)
 
 pytestmark = pytest.mark.slow
 REPO = "someone/lift"
@@ -176,10 +185,10 @@ def test_episodes_and_statistics_equal_those_of_lerobots_writer_to_their_precisi
 
 
 def test_pictures_equal_those_of_lerobots_writer(films, filmed, two):
-    assert read_spec(films[1]).image_keys == two.image_keys
+    assert Dataset.open(films[1]).spec.image_keys == two.image_keys
     for key in two.image_keys:
         for number, episode in enumerate(filmed):
-            ours, theirs = (read_frames(root, key, number) for root in films)
+            ours, theirs = (episode_frames(root, key, number) for root in films)
             np.testing.assert_array_equal(ours, theirs)
             assert numbers_of(theirs) == numbers_of(episode.columns[key])
 
@@ -218,7 +227,7 @@ def test_many_small_files_load(tmp_path, episodes, spec):
 
 
 def test_lerobots_own_dataset_reads_as_ours(pair):
-    left, right = map(read_table, pair)
+    left, right = (Dataset.open(root).columns() for root in pair)
     assert left.keys() == right.keys()
     for key, values in left.items():
         np.testing.assert_array_equal(values, right[key])
@@ -230,7 +239,7 @@ def test_a_dataset_that_lerobot_left_unfinished_is_refused(tmp_path, spec):
     root = tmp_path / "unfinished"
     LeRobotDataset.create(REPO, fps=spec.fps, features=s.features(spec), root=root, use_videos=False)
     with pytest.raises(ManipError, match="no data"):
-        read_table(root)
+        Dataset.open(root).columns()
 
 
 @pytest.fixture(params=[(), ("front",)], ids=["state", "camera"])
@@ -272,8 +281,8 @@ def test_episodes_deleted_by_lerobots_command(tmp_path, recorded, edit, seen):
     words = ("--operation.type", "delete_episodes", "--operation.episode_indices", "[1, 2]")
     edit("--repo_id", REPO, "--root", str(root), "--new_root", str(kept), *words)
     assert_holds(kept, [episodes[0], *episodes[3:]])
-    s.check_same_spec("before", seen, "after", read_spec(kept))  # LeRobot drops our file
-    assert (read_spec(kept).instruction, dataset_info(kept).success) == (seen.instruction, 3)
+    s.check_same_spec("before", seen, "after", Dataset.open(kept).spec)  # LeRobot drops our file
+    assert (Dataset.open(kept).spec.instruction, Dataset.open(kept).summary.success) == (seen.instruction, 3)
     assert dataset_tools.recompute_stats(load(kept)).meta.stats is not None
 
 
@@ -308,4 +317,4 @@ def test_lerobot_records_on_into_ours(tmp_path, recorded, seen):
     add_episode(dataset, episodes[2], seen)
     dataset.finalize()
     assert_holds(root, episodes[:3])
-    assert dataset_info(root).episodes == 3
+    assert Dataset.open(root).summary.episodes == 3

@@ -13,7 +13,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.collect.expert import Expert
-from manip_il.data.lerobot_read import dataset_info, read_fingerprint, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
@@ -31,13 +31,13 @@ LABEL = """
 import sys
 from pathlib import Path
 import numpy as np
-from manip_il.data.lerobot_read import read_table
 from manip_il.collect.expert import Expert
+from manip_il.data.dataset import Dataset
 from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 
 expert = Expert(build_scene("panda", "pick_place"))
-states = read_table(Path(sys.argv[1]), ["sim_state"])["sim_state"]
+states = Dataset.open(Path(sys.argv[1])).columns(["sim_state"])["sim_state"]
 np.save(sys.argv[2], np.stack([expert.label(State.from_vector(state)).action for state in states]))
 """
 
@@ -49,9 +49,9 @@ def test_it_is_small_and_whole():
 
 
 def test_it_holds_ten_successful_episodes_of_pick_place():
-    info = dataset_info(SAMPLE)
+    info = Dataset.open(SAMPLE).summary
     assert (info.robot, info.task, info.episodes, info.success) == ("panda", "pick_place", 10, 10)
-    table = read_table(SAMPLE, ["label_valid", "actor"])
+    table = Dataset.open(SAMPLE).columns(["label_valid", "actor"])
     assert table["label_valid"].all()
     assert not table["actor"].any()  # the expert drove
 
@@ -73,8 +73,12 @@ def test_git_does_not_ignore_it():
 def test_it_can_be_recorded_again(tmp_path):
     again = tmp_path / "sample"
     assert main(["record", "--dataset.num_episodes=10", f"--dataset.root={again}", "--workers=1"]) == 0
-    assert np.array_equal(read_table(SAMPLE)["seed"], read_table(again)["seed"])
-    differing = {key for key, ours in read_fingerprint(SAMPLE).items() if read_fingerprint(again).get(key) != ours}
+    assert np.array_equal(Dataset.open(SAMPLE).columns()["seed"], Dataset.open(again).columns()["seed"])
+    differing = {
+        key
+        for key, ours in Dataset.open(SAMPLE).fingerprint.items()
+        if Dataset.open(again).fingerprint.get(key) != ours
+    }
     assert "model_sha256" not in differing or "mujoco" in differing  # datasets from before are of the same model
     if not differing:
         assert digests(SAMPLE) == digests(again)
@@ -92,10 +96,10 @@ def test_another_processor_records_the_same_within_the_tolerance(tmp_path):
     plain = {"OPENBLAS_CORETYPE": PLAIN_KERNELS[platform.machine()], "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA"}
     command = [sys.executable, "-m", "manip_il.cli.main", *words, f"--dataset.root={other}"]
     subprocess.run(command, check=True, cwd=ROOT, env=os.environ | plain)
-    assert read_fingerprint(again)["processor"] != read_fingerprint(other)["processor"]
+    assert Dataset.open(again).fingerprint["processor"] != Dataset.open(other).fingerprint["processor"]
     assert digests(again) != digests(other)  # else this shows nothing
     assert_same_within_tolerance(again, other)
-    expert, states = Expert(build_scene("panda", "pick_place")), read_table(again, ["sim_state"])["sim_state"]
+    expert, states = Expert(build_scene("panda", "pick_place")), Dataset.open(again).columns(["sim_state"])["sim_state"]
     ours = np.stack([expert.label(State.from_vector(state)).action for state in states])
     script = tmp_path / "label.py"
     script.write_text(LABEL)
@@ -109,7 +113,7 @@ def test_another_processor_records_the_same_within_the_tolerance(tmp_path):
 
 def assert_same_within_tolerance(left: Path, right: Path) -> None:
     """Steps, outcomes and phases are equal, what was measured and labelled nearly."""
-    ours, theirs = read_table(left), read_table(right)
+    ours, theirs = Dataset.open(left).columns(), Dataset.open(right).columns()
     assert ours.keys() == theirs.keys()
     for key, column in ours.items():
         if key == "sim_state":

@@ -10,9 +10,9 @@ import pytest
 
 from manip_il.data import schema as s
 from manip_il.data.build import Recording, build
+from manip_il.data.dataset import Dataset
 from manip_il.data.episodes import count_labels, first_labels, parts
 from manip_il.data.journal import Journal
-from manip_il.data.lerobot_read import read_table
 from manip_il.errors import NothingToLearnError
 from manip_il.mdp import Episode
 
@@ -51,7 +51,7 @@ def recorded(rollouts: list[Episode], spec, folder: Path, recording: Recording) 
 
 def labels(root: Path) -> list[int]:
     """Sound ones of each episode."""
-    table = read_table(root, (s.LABEL_VALID, "episode_index"))
+    table = Dataset.open(root).columns((s.LABEL_VALID, "episode_index"))
     return np.bincount(table["episode_index"], weights=table[s.LABEL_VALID]).astype(int).tolist()
 
 

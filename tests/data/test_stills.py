@@ -13,13 +13,14 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.frame_cache import open_frame_cache
-from manip_il.data.frame_source import find_frames
-from manip_il.data.lerobot_read import camera_keys, read_episodes, read_frames, read_spec
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.pictures import decode_picture, to_png
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+
+from ..pictures import episode_frames
 
 FRONT, SIDE = s.IMAGES + "front", s.IMAGES + "side"
 
@@ -46,14 +47,14 @@ def root(tmp_path: Path, seen, pictured) -> Path:
 
 
 def test_pictures_come_back_bit_for_bit(root, seen, pictured):
-    assert read_spec(root) == pictured
-    assert camera_keys(root) == [FRONT, SIDE]
+    assert Dataset.open(root).spec == pictured
+    assert Dataset.open(root).cameras == [FRONT, SIDE]
     assert not (root / "videos").exists()
-    for written, read in zip(seen, read_episodes(root), strict=True):
+    for written, read in zip(seen, Dataset.open(root).read_episodes(), strict=True):
         for key, column in read.columns.items():
             np.testing.assert_array_equal(column.reshape(written.columns[key].shape), written.columns[key])
-    np.testing.assert_array_equal(read_frames(root, SIDE, 2), seen[2].columns[SIDE])
-    blind = next(read_episodes(root, pictures=False))
+    np.testing.assert_array_equal(episode_frames(root, SIDE, 2), seen[2].columns[SIDE])
+    blind = next(Dataset.open(root).read_episodes(pictures=False))
     assert FRONT not in blind.columns
 
 
@@ -61,7 +62,7 @@ def test_data_files_with_a_row_group_a_frame_are_read_in_few_parts(root, tmp_pat
     [path] = root.glob("data/*/*.parquet")
     table, whole = pq.read_table(path), open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "before")
     pq.write_table(table, path, row_group_size=1)
-    assert len(find_frames(root, FRONT).parts) == -(-table.num_rows // 500)
+    assert len(Dataset.open(root).camera(FRONT).parts) == -(-table.num_rows // 500)
     again = open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "after")
     assert whole is not None
     assert again is not None
@@ -81,7 +82,7 @@ def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):
 
 def test_lerobots_own_description_is_enough(root, pictured):
     (root / "meta" / "manip_il.json").unlink()
-    spec = read_spec(root)
+    spec = Dataset.open(root).spec
     assert (spec.cameras, spec.image_size, spec.video) == (pictured.cameras, pictured.image_size, False)
 
 
@@ -108,6 +109,8 @@ def test_damage_is_one_line(root, monkeypatch):
     def damaged(_: Any) -> np.ndarray:
         raise ValueError("it is not a PNG or JPEG")
 
-    monkeypatch.setattr("manip_il.data.lerobot_read.decode_cell", damaged)
-    with pytest.raises(ManipError, match=r"cannot read the pictures observation\.images\.front in .*stills: it is not"):
-        next(read_episodes(root))
+    monkeypatch.setattr("manip_il.data.camera.decode_cell", damaged)
+    with pytest.raises(
+        ManipError, match=r"cannot read the pictures observation\.images\.front in frames 0 to 6 of .*: it is not"
+    ):
+        next(Dataset.open(root).read_episodes())

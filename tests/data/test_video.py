@@ -20,24 +20,24 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data import video
 from manip_il.data.build import dataset_sha256, merge_datasets
-from manip_il.data.frame_source import find_frames
-from manip_il.data.lerobot_read import (
-    camera_keys,
-    dataset_info,
-    read_episodes,
-    read_frames,
-    read_provenance,
-    read_spec,
-    read_table,
-)
-from manip_il.data.lerobot_stats import pixel_counts
+from manip_il.data.dataset import Dataset
+from manip_il.data.statistics import pixel_counts
 from manip_il.data.video_config import VideoConfig
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError, MismatchError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 from ..damage import digests
-from ..pictures import assert_comes_back, count_frames, numbered_episodes, numbers_of, video_rows, with_cameras, write
+from ..pictures import (
+    assert_comes_back,
+    count_frames,
+    episode_frames,
+    numbered_episodes,
+    numbers_of,
+    video_rows,
+    with_cameras,
+    write,
+)
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 
@@ -49,9 +49,9 @@ def root(tmp_path_factory: pytest.TempPathFactory, filmed: list[Episode], two: s
 
 def test_every_frame_comes_back_in_its_place_nearly_as_it_was(root, filmed):
     assert_comes_back(root, filmed)
-    assert numbers_of(read_frames(root, FRONT, 2)) == list(range(8, 21))
-    assert numbers_of(read_frames(root, WRIST, 1)) == [28]
-    frames = read_frames(root, FRONT, 0)
+    assert numbers_of(episode_frames(root, FRONT, 2)) == list(range(8, 21))
+    assert numbers_of(episode_frames(root, WRIST, 1)) == [28]
+    frames = episode_frames(root, FRONT, 0)
     assert frames.dtype == np.uint8
     assert np.abs(frames.astype(float) - filmed[0].columns[FRONT]).mean() < 2  # of 255 levels
 
@@ -201,45 +201,48 @@ def test_a_video_cut_short_is_named(tmp_path, filmed, two):
     for size in (0, 100, len(content) // 2, len(content) - 200):
         path.write_bytes(content[:size])
         with pytest.raises(ManipError, match=r"file-000\.mp4"):
-            list(read_episodes(tmp_path / "lift"))
+            list(Dataset.open(tmp_path / "lift").read_episodes())
     path.unlink()
     with pytest.raises(ManipError, match=r"cannot read .*file-000\.mp4: No such file"):
-        read_frames(tmp_path / "lift", FRONT, 0)
+        episode_frames(tmp_path / "lift", FRONT, 0)
 
 
 def test_names_and_numbers_that_are_not_there_are_refused(root):
     with pytest.raises(UnknownName, match=r"did you mean 'observation\.images\.front'"):
-        read_frames(root, "observation.images.fron", 0)
+        episode_frames(root, "observation.images.fron", 0)
     with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
-        read_frames(root, FRONT, 3)
+        episode_frames(root, FRONT, 3)
 
 
 def test_datasets_with_cameras_become_one_with_the_same_pictures(tmp_path, root):
     info = merge_datasets([root, root], tmp_path / "merged", repo_id="x/y", provenance={"made": "here"})
     assert (info.episodes, info.frames) == (6, 42)
     assert not has_errors(examine_folder(tmp_path / "merged"))
-    assert read_spec(tmp_path / "merged") == read_spec(root)
-    assert read_provenance(tmp_path / "merged")["made"] == "here"
+    assert Dataset.open(tmp_path / "merged").spec == Dataset.open(root).spec
+    assert Dataset.open(tmp_path / "merged").provenance["made"] == "here"
     for camera in (FRONT, WRIST):
         for episode in range(6):
-            here, there = read_frames(tmp_path / "merged", camera, episode), read_frames(root, camera, episode % 3)
+            here, there = (
+                episode_frames(tmp_path / "merged", camera, episode),
+                episode_frames(root, camera, episode % 3),
+            )
             np.testing.assert_array_equal(here, there)
 
 
 def test_one_dataset_with_cameras_alone_is_copied_as_it_is(tmp_path, root):
     merge_datasets([root], tmp_path / "copied", repo_id="x/y", provenance={"made": "here"})
-    assert read_provenance(tmp_path / "copied")["made"] == "here"
+    assert Dataset.open(tmp_path / "copied").provenance["made"] == "here"
     assert dataset_sha256(tmp_path / "copied") == dataset_sha256(root)
-    here, there = (find_frames(one, FRONT).fingerprint for one in (tmp_path / "copied", root))
+    here, there = (Dataset.open(one).camera(FRONT).fingerprint for one in (tmp_path / "copied", root))
     assert here == there  # so pictures that are decoded already are found
 
 
 def test_a_dataset_with_cameras_tells_of_itself(tmp_path, root, filmed, two):
-    assert camera_keys(root) == [FRONT, WRIST]
-    assert (dataset_info(root).episodes, dataset_info(root).frames) == (3, 21)
-    assert FRONT not in read_table(root)
-    assert read_spec(root) == two
+    assert Dataset.open(root).cameras == [FRONT, WRIST]
+    assert (Dataset.open(root).summary.episodes, Dataset.open(root).summary.frames) == (3, 21)
+    assert FRONT not in Dataset.open(root).columns()
+    assert Dataset.open(root).spec == two
     write(filmed, tmp_path / "lift", two)
     (tmp_path / "lift" / layout.OURS).unlink()  # as LeRobot's tools do
-    theirs = read_spec(tmp_path / "lift")
+    theirs = Dataset.open(tmp_path / "lift").spec
     assert (theirs.cameras, theirs.image_size) == (two.cameras, two.image_size)

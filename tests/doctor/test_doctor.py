@@ -22,9 +22,9 @@ from manip_il.data.build import Recording
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import Journal
 from manip_il.data.lerobot_write import write_dataset
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine, examine_folder, has_errors, verdict
 from manip_il.doctor.finding import Finding, error
+from manip_il.doctor.patient import Patient
 
 from ..damage import DATA, EPISODES, cut, damage_at_random, edit_json, edit_table, lines
 
@@ -116,7 +116,7 @@ def never_closed(root: Path) -> None:
 
 
 def test_a_whole_dataset_has_no_findings(root, journals, filmed_once):
-    dataset = Dataset(root)
+    dataset = Patient(root)
     assert list(examine(dataset)) == []
     assert verdict(dataset, []) == f"{root}: 3 episodes, 20 frames: whole"
     assert verdict(dataset, [error("a", "b"), error("a", "c")]).endswith("lift: 2 errors")
@@ -260,12 +260,17 @@ _OF_ACTION = "meta/stats.json: action ..."
         (stats(lambda stats: stats[s.ACTION].update(mean=[0])), f"{_OF_ACTION} mean is 1 number; expected 3 numbers"),
         (stats(lambda stats: stats[s.ACTION].update(q50=[9] * 3)), f"{_OF_ACTION} not in order between min and max"),
         (stats(lambda stats: stats[s.ACTION].pop("q10")), f"{_OF_ACTION} are not all there"),
-        (delete(layout.STATS), "meta/stats.json: is missing"),
     ],
 )
 def test_statistics_that_are_wrong(alone, change, text):
     change(alone)
     assert said(alone, text)
+
+
+def test_missing_statistics_are_a_warning_as_a_fit_computes_them(alone):
+    (alone / layout.STATS).unlink()
+    assert said(alone, "meta/stats.json: is missing", kind="warning")
+    assert not said(alone, "stats.json")
 
 
 @pytest.mark.parametrize(
@@ -310,7 +315,7 @@ _START = f"{_CAMERA}/from_timestamp"
     ("change", "texts"),
     [
         (delete(VIDEO), ["is missing; it holds observation.images.front of 3 episodes"]),
-        (never_closed, ["has no moov box: its encoder died before it closed the file"]),
+        (never_closed, ["cannot be decoded, as if its encoder had died before it closed the file"]),
         (lambda root: cut(root / VIDEO, 0.7), ["decoded frames for 21 rows of 3 episodes"]),
         # rows against decoded frames, whatever the file's own index counts
         (
@@ -365,14 +370,14 @@ def test_failed_episodes_that_the_recording_leaves_out_are_not_missed(root, jour
 
 
 def test_a_check_that_fails_hides_no_other(alone):
-    def breaks(dataset: Dataset) -> Iterator[Finding]:
+    def breaks(dataset: Patient) -> Iterator[Finding]:
         yield error("here", "first")
         raise RuntimeError("torn")
 
-    def works(dataset: Dataset) -> Iterator[Finding]:
+    def works(dataset: Patient) -> Iterator[Finding]:
         yield error("there", "second")
 
-    texts = [finding.text for finding in examine(Dataset(alone), [breaks, works])]
+    texts = [finding.text for finding in examine(Patient(alone), [breaks, works])]
     assert texts == ["first", "breaks could not be finished: RuntimeError: torn", "second"]
 
 

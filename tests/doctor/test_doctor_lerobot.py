@@ -12,8 +12,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
+from manip_il.doctor.patient import Patient
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table, lines
 from ..warm import Warm
@@ -110,7 +110,7 @@ def test_a_killed_recorder_that_had_resumed_a_whole_dataset(record, recorded, tm
         assert name in first
         (root / name).unlink()
     edit_json(root / layout.INFO, lambda info: info.update(total_episodes=4, total_frames=66, splits={"train": "0:4"}))
-    list(repair(Dataset(root), examine_folder(root)))
+    list(repair(Patient(root), examine_folder(root)))
     assert not any(line.startswith("error") for line in lines(root))
     assert load(root).num_frames == 66
 

@@ -16,8 +16,8 @@ from manip_il.data.atomic import exclusive
 from manip_il.data.fingerprint import environment_fingerprint
 from manip_il.data.journal import Journal
 from manip_il.doctor import examine as module
-from manip_il.doctor.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
+from manip_il.doctor.patient import Patient
 from manip_il.errors import FolderBusyError, ManipError
 
 from ..damage import DATA, cut, digests, edit_json, edit_table, lines
@@ -26,7 +26,7 @@ FINGERPRINT = environment_fingerprint(b"", {})
 
 
 def mend(root: Path) -> list[str]:
-    return list(repair(Dataset(root), examine_folder(root)))
+    return list(repair(Patient(root), examine_folder(root)))
 
 
 def test_a_damaged_dataset_is_built_again_and_the_old_one_is_kept(root):

@@ -12,9 +12,9 @@ import pytest
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.build import dataset_sha256, merge_datasets
+from manip_il.data.dataset import Dataset
 from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.journal import list_episodes, read_header
-from manip_il.data.lerobot_read import camera_keys, check_dataset, read_episodes, read_table
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
 
@@ -41,11 +41,10 @@ def put_pipe(path: Path) -> None:
 
 
 def read_all(root: Path) -> None:
-    read_table(root)
-    list(read_episodes(root))
-    open_frame_cache(root, camera_keys(root), max_bytes=10**9, folder=root.with_name("cache"))
+    Dataset.open(root).columns()
+    list(Dataset.open(root).read_episodes())
+    open_frame_cache(root, Dataset.open(root).cameras, max_bytes=10**9, folder=root.with_name("cache"))
     dataset_sha256(root)
-    check_dataset(root)
 
 
 @pytest.mark.parametrize("name", [layout.INFO, layout.STATS, layout.TASKS, layout.OURS, DATA, EPISODES, VIDEO, "odd"])

@@ -11,8 +11,8 @@ from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.build import build
+from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal, list_episodes
-from manip_il.data.lerobot_read import read_table
 from manip_il.doctor.examine import examine_folder
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
@@ -40,7 +40,7 @@ def test_no_cut_loses_another_episode_or_stops_the_doctor(journals, tmp_path):
         cut.write_bytes(cut.read_bytes()[: rng.integers(cut.stat().st_size)])
         result = build(folder, root)
         others = [seed for index, seed in enumerate(SEEDS) if index != number % len(SEEDS)]
-        assert np.unique(read_table(root, ["seed"])["seed"]).tolist() == others
+        assert np.unique(Dataset.open(root).columns(["seed"])["seed"]).tolist() == others
         assert len(result.damaged) == 1
         assert cut.name in result.damaged[0]
         assert any(cut.name in finding.place + finding.text for finding in examine_folder(root))

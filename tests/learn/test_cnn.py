@@ -262,7 +262,7 @@ def test_a_heat_map_is_best_where_the_point_is_and_between_cells_where_it_lies_b
 def named(meta, spec, table, monkeypatch):
     """The same dataset with the places of two points."""
     pictured = replace(spec, cameras=("front", "wrist"), image_size=(SIDE, SIDE), keypoints=("cube", "goal"))
-    rng, read = np.random.default_rng(0), modeling_mlp.read_tables
+    rng, read = np.random.default_rng(0), modeling_mlp.joined_columns
 
     def with_places(roots, columns):
         kept = [key for key in columns if key not in pictured.keypoint_keys]
@@ -272,7 +272,7 @@ def named(meta, spec, table, monkeypatch):
             one[:, [2, 5]] = one[:, [2, 5]].round()
         return found | {key: one.astype(np.float32) for key, one in places.items()}
 
-    monkeypatch.setattr(modeling_mlp, "read_tables", with_places)
+    monkeypatch.setattr(modeling_mlp, "joined_columns", with_places)
     return SimpleNamespace(features=features(pictured), root=meta.root, stats={})
 
 

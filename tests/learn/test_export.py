@@ -19,7 +19,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
-from manip_il.data.lerobot_read import read_spec, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ENVIRONMENT_STATE, IMAGES, STATE, RobotTaskSpec
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn import export
@@ -41,7 +41,7 @@ Observation = dict[str, NDArray[Any]]
 @cache
 def sample() -> tuple[RobotTaskSpec, dict[str, NDArray[Any]]]:
     columns = [STATE, ENVIRONMENT_STATE, "action", "label_valid", "episode_index", "frame_index"]
-    return read_spec(SAMPLE), read_table(SAMPLE, columns)
+    return Dataset.open(SAMPLE).spec, Dataset.open(SAMPLE).columns(columns)
 
 
 @pytest.fixture(params=LOSSES)

@@ -17,8 +17,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.cli.main import main
 from manip_il.cli.outputs import read_jsonl
+from manip_il.data.dataset import Dataset
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import read_spec, read_table
 from manip_il.errors import FolderExistsError, ManipError, MismatchError
 from manip_il.learn import fit_policy, train
 from manip_il.learn.checkpoint import CheckpointMeta
@@ -65,7 +65,9 @@ def fit(root: Path, folder: Path, settings=ACT, stop_after: int | None = None, r
         if done == stop_after:
             raise KeyboardInterrupt
 
-    return PolicyTrainer(root, config(settings, **changes), folder, spec=read_spec(root), resume=resume).fit(step)
+    return PolicyTrainer(root, config(settings, **changes), folder, spec=Dataset.open(root).spec, resume=resume).fit(
+        step
+    )
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
@@ -133,15 +135,15 @@ print(*(acts(Path(path)).hex() for path in sys.argv[1:]))
 @pytest.mark.slow
 def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, demos, tmp_path) -> None:
     paths = [fit(demos, tmp_path / settings["type"], settings) for settings in (ACT, DIFFUSION)]
-    table = read_table(demos, LEARNING_COLUMNS)
-    paths.append(train.fit(table, FitConfig(steps=4, batch_size=8), tmp_path / "mlp", spec=read_spec(demos)))
+    table = Dataset.open(demos).columns(LEARNING_COLUMNS)
+    paths.append(train.fit(table, FitConfig(steps=4, batch_size=8), tmp_path / "mlp", spec=Dataset.open(demos).spec))
     done = warm_lerobot.run("python", "-c", ACTS, *paths)
     assert done.returncode == 0, done.stderr
     [line] = done.stdout.splitlines()  # loading prints nothing
     fresh = [bytes.fromhex(word) for word in line.split()]
     assert fresh == [acts(path) for path in paths]
     # Diffusion draws: in a rollout alone its generator is seeded by the episode.
-    trainer = PolicyTrainer(demos, config(ACT), tmp_path / "act", spec=read_spec(demos), resume=True)
+    trainer = PolicyTrainer(demos, config(ACT), tmp_path / "act", spec=Dataset.open(demos).spec, resume=True)
     policy, rng = trainer.policy.eval(), np.random.default_rng(0)
     states, environment = rng.normal(size=(6, 3, 8)), rng.normal(size=(6, 3, 25))
     batch = {
@@ -157,14 +159,14 @@ def test_a_fresh_process_acts_to_the_bit_as_the_trained_policy(warm_lerobot, dem
 def loaded(root: Path, config: FitConfig, observation: str) -> Samples:
     meta, policy = read_metadata(root), policy_config(config.policy)
     set_features(policy, meta, observation)
-    return load_samples([root], policy, config, meta, root.parent)
+    return load_samples([root], policy, config, meta)
 
 
 def loaded_all(roots: list[Path], config: FitConfig) -> Samples:
     """Several datasets for a policy on pictures."""
     meta, policy = read_metadata(*roots), policy_config(config.policy)
     set_features(policy, meta, "images")
-    return load_samples(roots, policy, config, meta, roots[0].parent)
+    return load_samples(roots, policy, config, meta)
 
 
 def edit_tasks(root: Path, text: str) -> None:
@@ -176,7 +178,7 @@ def edit_tasks(root: Path, text: str) -> None:
 
 def test_held_out_episodes_are_never_learnt_from(demos) -> None:
     samples = loaded(demos, config(eval_split=0.4), "state")
-    episodes = read_table(demos, ["episode_index"])["episode_index"]
+    episodes = Dataset.open(demos).columns(["episode_index"])["episode_index"]
     assert len(np.unique(episodes[samples.held_out])) == 2
     assert not set(episodes[samples.held_out]) & set(episodes[samples.train])
     assert len(np.unique(episodes[samples.train])) == 3
@@ -311,7 +313,7 @@ def test_a_checkpoint_has_lerobots_layout_and_a_card(demos, tmp_path) -> None:
     meta = LearnedPolicy.load(path).meta
     assert meta is not None
     assert meta.options["steps"] == 4
-    assert replace(meta, options={}) == CheckpointMeta.of(read_spec(demos), action_space="joint_target")
+    assert replace(meta, options={}) == CheckpointMeta.of(Dataset.open(demos).spec, action_space="joint_target")
 
 
 def test_curves_for_tensorboard_and_weights_and_biases(demos, tmp_path, curves) -> None:

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_read import read_spec
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.fit_policy import begin_fit
@@ -32,7 +32,7 @@ def fit(root: Path, folder: Path, processes: int, steps: int = 4) -> dict[str, t
     config = FitConfig(
         settings, steps=steps, batch_size=8, save_freq=2, log_freq=1, eval_split=0.3, processes=processes
     )
-    with begin_fit(root, config, folder, spec=read_spec(root), resume=folder.is_dir()) as trainer:
+    with begin_fit(root, config, folder, spec=Dataset.open(root).spec, resume=folder.is_dir()) as trainer:
         return load_file(trainer.fit() / "model.safetensors")
 
 

@@ -12,8 +12,8 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 from manip_il.cli.main import main
+from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.data.lerobot_library import read_metadata
-from manip_il.data.lerobot_read import read_spec, read_table, read_tables
 from manip_il.errors import ManipError, MismatchError, UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.fit_policy import PolicyTrainer
@@ -94,15 +94,17 @@ def two(tmp_path_factory) -> list[Path]:
 
 def trainer(roots, folder: Path, weights=None) -> PolicyTrainer:
     config = FitConfig(ACT, steps=4, batch_size=8, save_freq=4, log_freq=2, eval_split=0.0)
-    return PolicyTrainer(roots, config, folder, spec=read_spec(roots[0]), weights=weights)
+    return PolicyTrainer(roots, config, folder, spec=Dataset.open(roots[0]).spec, weights=weights)
 
 
 def test_several_datasets_are_numbered_throughout_and_have_the_statistics_of_all_frames(two):
-    joined = read_tables(two, ("action", "episode_index", "index"))
+    joined = joined_columns(two, ("action", "episode_index", "index"))
     action = joined["action"].astype(np.float64)
     assert np.array_equal(np.unique(joined["episode_index"]), np.arange(5))
     assert np.array_equal(joined["index"].ravel(), np.arange(len(action)))
-    np.testing.assert_array_equal(action, np.concatenate([read_table(root, ("action",))["action"] for root in two]))
+    np.testing.assert_array_equal(
+        action, np.concatenate([Dataset.open(root).columns(("action",))["action"] for root in two])
+    )
     stats = read_metadata(*two).stats
     assert stats is not None
     np.testing.assert_allclose(stats["action"]["mean"], action.mean(0), rtol=1e-4, atol=1e-5)
@@ -113,15 +115,15 @@ def test_several_datasets_are_numbered_throughout_and_have_the_statistics_of_all
 def test_a_chunk_policy_learns_from_several_datasets_with_no_window_over_a_seam(two, tmp_path):
     one = trainer(two, tmp_path)
     samples = one.samples
-    assert len(samples.train) == sum(len(read_table(root, ("index",))["index"]) for root in two)
-    seam = len(read_table(two[0], ("index",))["index"]) - 1
+    assert len(samples.train) == sum(len(Dataset.open(root).columns(("index",))["index"]) for root in two)
+    seam = len(Dataset.open(two[0]).columns(("index",))["index"]) - 1
     batch = next(iter(samples.source.batches([np.array([seam])])))
     assert batch["action_is_pad"][0].tolist() == [False, True, True, True]
     assert one.fit().is_dir()
 
 
 def test_frames_of_no_weight_are_never_drawn(two, tmp_path):
-    frames = len(read_tables(two, ("index",))["index"])
+    frames = len(joined_columns(two, ("index",))["index"])
     weights = (np.arange(frames) < 20).astype(np.float64)
     one = trainer(two, tmp_path, weights)
     assert max(int(one._rows_of(step).max()) for step in range(50)) < 20

@@ -8,8 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from manip_il.data.draws import read_drawn
-from manip_il.data.lerobot_read import read_table
+from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, has_errors
 
 pytestmark = pytest.mark.slow
@@ -40,7 +39,7 @@ def test_lerobot_edit_dataset_removes_a_feature_and_tells_what_is_left(command, 
     )
     assert not has_errors(examine_folder(root))
     for key in ("action", "observation.environment_state", "sim_state", "seed"):
-        np.testing.assert_array_equal(read_table(root, [key])[key], read_table(seen, [key])[key])
+        np.testing.assert_array_equal(Dataset.open(root).columns([key])[key], Dataset.open(seen).columns([key])[key])
     words = ["--operation.type=info", "--operation.show_features=true"]
     said = command("lerobot-edit-dataset", "--repo_id=someone/kept", f"--root={root}", *words)
     assert "observation.environment_state" in said
@@ -76,13 +75,15 @@ def test_lerobot_edit_dataset_merges_varied_worlds_with_plain_ones_and_takes_epi
         "lerobot-edit-dataset", "--new_repo_id=someone/both", f"--new_root={both}", "--operation.type=merge", *sources
     )
     assert not has_errors(examine_folder(both))
-    drawn = read_drawn(varied)
-    assert read_drawn(both) == {**drawn, 2: {}, 3: {}}
+    drawn = Dataset.open(varied).episodes.drawn
+    assert Dataset.open(both).episodes.drawn == {**drawn, 2: {}, 3: {}}
     assert all(drawn.values())
     taken = ["--operation.type=delete_episodes", "--operation.episode_indices=[0]"]
     words = ["--repo_id=someone/both", f"--root={both}", "--new_repo_id=someone/rest", f"--new_root={rest}", *taken]
     command("lerobot-edit-dataset", *words)
     assert not has_errors(examine_folder(rest))
-    assert read_drawn(rest) == {}  # its rows have LeRobot's own columns alone
-    kept = len(read_table(rest, ["sim_state"])["sim_state"])
-    np.testing.assert_array_equal(read_table(rest)["sim_state"], read_table(both, ["sim_state"])["sim_state"][-kept:])
+    assert Dataset.open(rest).episodes.drawn == {}  # its rows have LeRobot's own columns alone
+    kept = len(Dataset.open(rest).columns(["sim_state"])["sim_state"])
+    np.testing.assert_array_equal(
+        Dataset.open(rest).columns()["sim_state"], Dataset.open(both).columns(["sim_state"])["sim_state"][-kept:]
+    )

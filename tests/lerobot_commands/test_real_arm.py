@@ -18,7 +18,7 @@ from lerobot.utils.constants import OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
 from manip_il.cli.main import main
-from manip_il.data.lerobot_read import read_spec, read_table
+from manip_il.data.dataset import Dataset
 from manip_il.data.schema import ACTION, STATE
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.learn.policy import LearnedPolicy
@@ -76,7 +76,7 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
     assert not has_errors(examine_folder(both))
     info = json.loads((both / "meta/info.json").read_text())
     assert (info["robot_type"], info["fps"], info["total_episodes"]) == ("so_follower", 30, 4)
-    merged, first = read_table(both, [STATE, ACTION]), read_table(simulated, [STATE, ACTION])
+    merged, first = Dataset.open(both).columns([STATE, ACTION]), Dataset.open(simulated).columns([STATE, ACTION])
     for key in (STATE, ACTION):
         np.testing.assert_array_equal(merged[key][: len(first[key])], first[key])
         assert merged[key].shape == (len(first[key]) + 40, 6)
@@ -89,7 +89,7 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
 def test_a_dataset_without_our_file_is_still_of_the_robot_that_we_know(simulated, tmp_path):
     root = shutil.copytree(simulated, tmp_path / "copy")
     (root / "meta/manip_il.json").unlink()
-    found, before = read_spec(root), read_spec(simulated)
+    found, before = Dataset.open(root).spec, Dataset.open(simulated).spec
     for name in ("robot", "robot_type", "action_meaning", "joint_names", "fps"):
         assert getattr(found, name) == getattr(before, name)
 

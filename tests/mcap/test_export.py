@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import INDEX_FEATURES
-from manip_il.data.lerobot_read import dataset_info, read_table
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.errors import ManipError, NotFiniteError
 from manip_il.mcap.export import MAPPING, export_dataset, open_source
@@ -90,7 +90,7 @@ def export(root: Path, folder: Path) -> list[Path]:
 def test_an_export_read_by_mcap_holds_the_datasets_values(ours: Path, tmp_path: Path) -> None:
     paths = export(ours, tmp_path / "out")
     assert [path.name for path in paths] == [f"episode_{number:06d}.mcap" for number in range(3)]
-    table = read_table(ours)
+    table = Dataset.open(ours).columns()
     start = 0
     for path in paths:
         found: dict[str, list[Any]] = {}
@@ -161,11 +161,11 @@ def test_ours_comes_back_as_an_equal_dataset(ours: Path, tmp_path: Path) -> None
     done = list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping))
     assert [episode.frames for episode in done] == [7, 1, 12]
     assert all(episode.used == episode.counts for episode in done)
-    left, right = read_table(ours), read_table(tmp_path / "new")
+    left, right = Dataset.open(ours).columns(), Dataset.open(tmp_path / "new").columns()
     assert list(left) == list(right)
     for key, values in left.items():
         assert (right[key].dtype, right[key].tobytes()) == (values.dtype, values.tobytes()), key
-    assert dataset_info(tmp_path / "new").instruction == "Lift the cube, 100 %."
+    assert Dataset.open(tmp_path / "new").summary.instruction == "Lift the cube, 100 %."
     features = [json.loads((root / layout.INFO).read_text())["features"] for root in (ours, tmp_path / "new")]
     assert features[0] == features[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "out"]

@@ -10,6 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError, MismatchError
 from manip_il.learn.preference.fitting import Compared, answer_losses, deal, fit_reward
 from manip_il.learn.preference.modeling_preference import write_reward
@@ -155,12 +156,11 @@ def test_ours_and_lerobots_factory_give_the_same_rewards(folder, clips):
 
 
 def test_a_reward_is_for_one_task_and_observation(folder, clips, datasets):
-    from manip_il.data.lerobot_read import read_spec
 
     reward = LearnedReward.load(folder)
     reward.check_fits("here", clips.frames[0].spec)
     with pytest.raises(MismatchError, match=r"task differs: the reward has lift, .*other has reach"):
-        reward.check_fits(str(datasets / "other"), read_spec(datasets / "other"))
+        reward.check_fits(str(datasets / "other"), Dataset.open(datasets / "other").spec)
     with pytest.raises(MismatchError, match=r"shape of observation.state differs"):
         reward(np.zeros((2, 9), np.float32), np.zeros((2, 15), np.float32), np.zeros((2, 3), np.float32))
 

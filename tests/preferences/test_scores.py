@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lerobot.rewards.sarm.rabc import RABCWeights
 
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
 from manip_il.learn.lerobot_reward import score_by_lerobot
 from manip_il.learn.preference.modeling_preference import write_reward
@@ -154,9 +155,8 @@ def test_a_reward_model_is_scored_through_lerobots_factory(datasets, tmp_path):
     network = RewardNetwork(frames.inputs.shape[1], shape)
     network.initialise(torch.Generator().manual_seed(0))
     write_reward(tmp_path, network, shape, spec, {}, {})
-    from manip_il.data.lerobot_read import read_table
 
-    labels = np.asarray(read_table(datasets / "good", ["action"])["action"])
+    labels = np.asarray(Dataset.open(datasets / "good").columns(["action"])["action"])
     ours = LearnedReward.load(tmp_path)(frames.states, frames.environment_states, labels)
     assert score_by_lerobot(datasets / "good", tmp_path, trust=True) == pytest.approx(ours, abs=1e-5)
     with pytest.raises(ManipError, match="if you trust its source, add --trust=true"):

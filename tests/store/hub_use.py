@@ -11,6 +11,7 @@ import pytest
 from huggingface_hub import constants
 
 from manip_il.cli.push_pull import open_remote
+from manip_il.data.dataset import Dataset
 from manip_il.store.errors import Retry
 from manip_il.store.pull import Pulled, pull
 from manip_il.store.push import push
@@ -64,16 +65,14 @@ def copy_sample(target: Path) -> Path:
 
 def other_version(target: Path) -> Path:
     """A dataset that differs from the sample in every data file: its first seven episodes."""
-    from manip_il.data.lerobot_read import read_episodes, read_fingerprint, read_spec
     from manip_il.data.lerobot_write import write_dataset
 
-    episodes = list(read_episodes(SAMPLE))[:7]
-    write_dataset(episodes, target, read_spec(SAMPLE), repo_id="local/sample", fingerprint=read_fingerprint(SAMPLE))
+    sample = Dataset.open(SAMPLE)
+    episodes = list(sample.read_episodes())[:7]
+    write_dataset(episodes, target, sample.spec, repo_id="local/sample", fingerprint=sample.fingerprint)
     return target
 
 
 def make_policy(target: Path) -> Path:
     """A small ACT for the sample, as LeRobot writes it."""
-    from manip_il.data.lerobot_read import read_spec
-
-    return write_checkpoint(target, "act", read_spec(SAMPLE))
+    return write_checkpoint(target, "act", Dataset.open(SAMPLE).spec)

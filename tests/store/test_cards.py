@@ -13,7 +13,7 @@ import pytest
 from huggingface_hub import DatasetCard, DatasetCardData, ModelCard, ModelCardData
 from PIL import Image
 
-from manip_il.data.lerobot_read import read_spec
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.store.card_dataset import read_paths
@@ -30,7 +30,7 @@ EVALUATION = {"success_rate": 0.84, "interval": [0.756, 0.899], "confidence": 0.
 def run(tmp_path: Path) -> Path:
     """A run with a checkpoint, as `train` leaves it."""
     checkpoints = tmp_path / "run" / "checkpoints"
-    write_checkpoint(checkpoints / "004000" / "pretrained_model", "act", read_spec(SAMPLE))
+    write_checkpoint(checkpoints / "004000" / "pretrained_model", "act", Dataset.open(SAMPLE).spec)
     (checkpoints / "last").symlink_to("004000")
     return tmp_path / "run"
 
@@ -107,7 +107,7 @@ def test_a_policy_that_nobody_evaluated_says_so(run: Path):
 
 
 def test_a_dagger_runs_card_is_of_its_best_policy(tmp_path: Path):
-    spec, run = read_spec(SAMPLE), tmp_path / "run"
+    spec, run = Dataset.open(SAMPLE).spec, tmp_path / "run"
     meta = CheckpointMeta("panda", "pick_place", 20, ("joint",), ("object.x",), "joint targets [rad]", {}, {})
     write_checkpoint(run / "round_00" / "policy" / "checkpoints" / "000002" / "pretrained_model", "diffusion", spec)
     write_checkpoint(run / "best" / "pretrained_model", "act", spec, meta=meta)

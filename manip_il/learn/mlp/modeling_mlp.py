@@ -11,7 +11,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manip_il.data.lerobot_read import read_tables
+from manip_il.data.dataset import joined_columns
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.errors import ManipError
 from manip_il.learn.action_spaces import JointTarget, conversion
@@ -44,7 +44,7 @@ class MLPPolicy(PreTrainedPolicy):
             roots = getattr(dataset_meta, "roots", None) or (dataset_meta.root,)
             wanted = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID, *self._more_columns())
             names = [key for key in wanted if key in dataset_meta.features]
-            table = read_tables(roots, [*names, INDEX])
+            table = joined_columns(roots, [*names, INDEX])
             if config.action_space == EE_DELTA:
                 table[ACTION] = _converted(dataset_meta)
             self._learn_columns(table, config.loss)

@@ -18,10 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES
+from manip_il import checks
+from manip_il.data.info import NUMBERS, PICTURES, Feature, Info, read_object
+from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES, STATS
+from manip_il.errors import ManipError
 
 F64 = NDArray[np.float64]
 Stats = dict[str, dict[str, list[float]]]  # column -> name -> one value a dimension
+Statistics = dict[str, dict[str, NDArray[Any]]]  # the same as arrays
 I64 = NDArray[np.int64]
 _LEVELS = np.arange(256)  # of a pixel
 _BLOCK_BYTES = 16 * 1024 * 1024  # of a dataset's numbers held at once
@@ -140,3 +144,49 @@ def _row_stats(rows: F64) -> dict[str, F64]:
 def quantile_places(count: int) -> dict[str, int]:
     """Return where in a sorted row of `count` values each quantile stands, from 0."""
     return {name: max(int(np.ceil(share * count)), 1) - 1 for name, share in QUANTILES.items()}
+
+
+def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
+    """Return the statistics of columns, (T,) or (T, d), for a dataset that has none."""
+    with tempfile.TemporaryDirectory() as folder:
+        running = RunningStats(Path(folder))
+        running.add(columns)
+        found = running.result()
+        running.close()
+    return {key: {name: np.asarray(values) for name, values in table.items()} for key, table in found.items()}
+
+
+def read_statistics(root: Path, info: Info) -> Statistics:
+    """Read `meta/stats.json`: column -> name -> numbers, (n,), of pictures (channels, 1, 1).
+
+    Raises `ManipError` for a statistic that is missing, that is not numbers, or that is not of the column's shape.
+    """
+    path = root / STATS
+    try:
+        found = read_object(path)
+    except (OSError, ValueError) as error:
+        raise ManipError(f"cannot read {path}: {error}; `manip-il doctor --repair=true` computes it again") from error
+    known = [feature for feature in info.of_dtype(*NUMBERS, *PICTURES) if feature.key in found]
+    return {feature.key: _statistics(path, feature, found[feature.key]) for feature in known}
+
+
+def _statistics(path: Path, feature: Feature, table: Any) -> dict[str, NDArray[Any]]:
+    shapes = {(feature.size,), feature.shape[-1:], feature.shape}
+    if feature.dtype in PICTURES:
+        shapes = {(count, 1, 1) for count in feature.shape}  # the names of its axes may be missing
+    statistics: dict[str, NDArray[Any]] = {}
+    for name in STAT_NAMES:
+        value = table.get(name) if isinstance(table, dict) else None
+        if value is None and name in QUANTILES:
+            continue
+        wanted = {(1,)} if name == "count" else shapes
+        try:
+            numbers = np.atleast_1d(np.asarray(value))
+        except (ValueError, OverflowError):
+            numbers = np.zeros(0, object)
+        if numbers.dtype.kind not in "iuf" or numbers.shape not in wanted:
+            shape = " or ".join(map(str, sorted(wanted)))
+            what = f"{name} of {feature.key} is {checks.shorten(value)}"
+            raise ManipError(f"{path}: {what}; expected numbers of shape {shape} (`manip-il doctor` tells more)")
+        statistics[name] = numbers
+    return statistics

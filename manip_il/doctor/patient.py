@@ -9,44 +9,20 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import pyarrow as pa
 
+from manip_il.data import dataset as data
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.dataset import Own
+from manip_il.data.episode_table import EpisodeTable, concatenate, read_rows
 from manip_il.data.info import NUMBERS, Info, InvalidInfo, read_info, read_object
-from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, find_shards, floats, integers
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, Shard, find_shards
 from manip_il.doctor.finding import Finding, error
-from manip_il.doctor.scan import F64, I64, Scan, concatenate, scan
-
-_WHOLE = ("length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
-
-
-@dataclass(frozen=True)
-class Clips:
-    """Places of one camera's episodes, one entry an episode: a video file, start and stop in it [s]."""
-
-    files: list[str]
-    starts: F64
-    stops: F64
+from manip_il.doctor.scan import F64, Scan, scan
+from manip_il.errors import ManipError
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """Readable rows of `meta/episodes`, one entry an episode. files: the data file that each one names."""
-
-    index: I64
-    length: I64
-    start: I64
-    stop: I64
-    files: list[str]
-    tasks: list[list[str]]
-    clips: dict[str, Clips]  # camera column -> places
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-
-@dataclass(frozen=True)
-class Dataset:
+class Patient:
     """Content of a folder. on_file is called after every data file, video and journal."""
 
     root: Path
@@ -68,6 +44,11 @@ class Dataset:
             return read_info(self.root)
         except InvalidInfo as invalid:
             return invalid
+
+    @cached_property
+    def own(self) -> Own | None:
+        """Content of this program's own file; None if there is none. Raises `ManipError` if it cannot be read."""
+        return None if self.info is None else data.Dataset(self.root, self.info).own
 
     @property
     def is_ours(self) -> bool:
@@ -91,7 +72,7 @@ class Dataset:
         return find_shards(self.root, layout.EPISODES_FILES)
 
     @property
-    def episodes(self) -> Episodes | None:
+    def episodes(self) -> EpisodeTable | None:
         """Readable rows of `meta/episodes`; None where there are none."""
         return self._episodes[0]
 
@@ -101,16 +82,15 @@ class Dataset:
         return self._episodes[1]
 
     @cached_property
-    def _episodes(self) -> tuple[Episodes | None, list[Finding]]:
-        parts: list[Episodes] = []
+    def _episodes(self) -> tuple[EpisodeTable | None, list[Finding]]:
+        parts: list[EpisodeTable] = []
         findings: list[Finding] = []
         for shard in self.episode_shards:
             if self.info is None or shard.problem:
                 continue
             try:
-                for table in shard.tables(rows=500):
-                    parts.append(_read_episodes(table, self.info))
-            except BadColumn as problem:
+                parts += read_rows(shard, self.info)
+            except (BadColumn, ManipError) as problem:
                 findings.append(error(shard.name, str(problem)))
             except UNREADABLE as problem:
                 findings.append(error(shard.name, f"cannot be read: {problem}"))
@@ -163,35 +143,3 @@ class Dataset:
         except (TypeError, ValueError, OverflowError):
             return None
         return values if np.isfinite(values).all() else None
-
-
-def _read_episodes(table: pa.Table, info: Info) -> Episodes:
-    length, start, stop, chunk, file = (integers(table, name) for name in _WHOLE)
-    return Episodes(
-        index=integers(table, layout.EPISODE_INDEX),
-        length=length,
-        start=start,
-        stop=stop,
-        files=[_file_name(info.data_path, *place) for place in zip(chunk, file, strict=True)],
-        tasks=_texts(table),
-        clips={feature.key: _read_clips(table, info, feature.key) for feature in info.of_dtype("video")},
-    )
-
-
-def _read_clips(table: pa.Table, info: Info, key: str) -> Clips:
-    chunk, file = (integers(table, f"videos/{key}/{name}") for name in ("chunk_index", "file_index"))
-    starts, stops = (floats(table, f"videos/{key}/{name}") for name in ("from_timestamp", "to_timestamp"))
-    return Clips([_file_name(info.video_path, *place, key) for place in zip(chunk, file, strict=True)], starts, stops)
-
-
-def _file_name(template: str, chunk: int, file: int, key: str = "") -> str:
-    return template.format(chunk_index=int(chunk), file_index=int(file), video_key=key)
-
-
-def _texts(table: pa.Table) -> list[list[str]]:
-    if "tasks" not in table.column_names:
-        raise BadColumn("has no column 'tasks'")
-    rows = table.column("tasks").to_pylist()
-    if not all(isinstance(row, list) and all(isinstance(text, str) for text in row) for row in rows):
-        raise BadColumn("column 'tasks' does not hold lists of strings")
-    return rows

@@ -1,0 +1,344 @@
+"""Any LeRobot v3.0 dataset, this program's or anybody's: opened once, as numpy arrays, without torch.
+
+Beside LeRobot's files a dataset of this program has `meta/manip_il.json` (`own`); LeRobot's tools drop it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from manip_il import checks
+from manip_il.data import lerobot_layout as layout
+from manip_il.data import schema as s
+from manip_il.data.camera import Camera
+from manip_il.data.episode_table import EpisodeTable, read_episode_table
+from manip_il.data.info import LARGEST_META, NUMBERS, DatasetInfo, Feature, Info, InvalidInfo, read_info
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, read_file, read_tasks, to_numpy
+from manip_il.data.statistics import Statistics, column_statistics, read_statistics
+from manip_il.errors import ManipError, UnknownName, UsageError
+from manip_il.mdp import Episode
+
+UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
+_SEE_CHECK = "run `manip-il doctor` to see what is wrong"
+
+
+@dataclass(frozen=True)
+class Own:
+    """Content of `meta/manip_il.json`: names and sizes, the environment's fingerprint, where the episodes came from."""
+
+    spec: s.RobotTaskSpec
+    fingerprint: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+
+
+class Dataset:
+    """A dataset on disk. Everything is read when it is first asked for, once.
+
+    Reading raises `ManipError` naming the file that cannot be read.
+    """
+
+    def __init__(self, root: Path, info: Info):
+        self.root, self.info = root, info
+
+    @classmethod
+    def open(cls, root: Path) -> Dataset:
+        """Open a folder. Raises `ManipError` for one that is no dataset, or that holds pipes, devices or sockets."""
+        root = Path(root)
+        try:
+            info = read_info(root)
+        except InvalidInfo as error:
+            raise ManipError(str(error)) from None
+        for path in find_irregular(root):
+            raise ManipError(
+                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
+            )
+        return cls(root, info)
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return self.info.frames
+
+    @property
+    def fps(self) -> float:
+        """Frames a second."""
+        return self.info.fps
+
+    @property
+    def features(self) -> Mapping[str, Feature]:
+        """Columns and cameras by name."""
+        return self.info.features
+
+    @property
+    def cameras(self) -> list[str]:
+        """Names of the columns that are pictures, `observation.images.<camera>`."""
+        return [feature.key for feature in self.info.of_dtype("video", "image")]
+
+    @cached_property
+    def own(self) -> Own | None:
+        """Content of this program's own file; None in a dataset of another program."""
+        path = self.root / layout.OURS
+        if not path.exists():
+            return None
+        ours = checks.read_json(path, "what this program says of its datasets", LARGEST_META)
+        if missing := {"spec", "fingerprint", "provenance"} - ours.keys():
+            raise ManipError(f"{path} lacks {', '.join(sorted(missing))}")
+        about = {key: checks.mapping(f"{path}: {key}", ours[key]) for key in ("spec", "fingerprint", "provenance")}
+        try:
+            return Own(s.RobotTaskSpec.from_json(about["spec"]), about["fingerprint"], about["provenance"])
+        except ManipError as error:
+            raise ManipError(f"{path}: {error}") from error
+
+    @property
+    def fingerprint(self) -> Mapping[str, Any]:
+        """The environment's fingerprint; empty in a dataset of another program."""
+        return self.own.fingerprint if self.own else {}
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Origin of the episodes; empty in a dataset of another program."""
+        return self.own.provenance if self.own else {}
+
+    @cached_property
+    def spec(self) -> s.RobotTaskSpec:
+        """The spec that the dataset was written with.
+
+        LeRobot's tools drop our file beside theirs; then it comes from LeRobot's own, the task `unknown`, as for the
+        datasets of other programs: without the columns and cameras that they lack. Raises `ManipError` for a dataset
+        without actions.
+        """
+        if self.own is not None:
+            return self.own.spec
+        features = self.features
+        if s.ACTION not in features:
+            raise ManipError(f"{self.root} has no column {s.ACTION}: there is nothing to learn from it")
+        around = features.get(s.ENVIRONMENT_STATE)
+        return s.RobotTaskSpec(
+            **s.robot_of(self.info.robot or UNKNOWN_ROBOT),
+            task=UNKNOWN_TASK,
+            fps=round(self.fps),
+            joint_names=features[s.ACTION].labels,
+            environment_state_names=around.labels if around else (),
+            sim_state_size=features[s.SIM_STATE].size if s.SIM_STATE in features else 0,
+            instruction=self.instruction,
+            **self._picture_spec(),
+        )
+
+    @cached_property
+    def tasks(self) -> dict[int, str]:
+        """The text of every `task_index`."""
+        try:
+            return dict(zip(*read_tasks(self.root), strict=True))
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read {self.root / layout.TASKS}: {error}; {_SEE_CHECK}") from error
+
+    @property
+    def instruction(self) -> str:
+        """The text of the first task; empty if there is none."""
+        return next(iter(self.tasks.values()), "")
+
+    @cached_property
+    def episodes(self) -> EpisodeTable:
+        """The rows of `meta/episodes`."""
+        try:
+            return read_episode_table(self.root, self.info)
+        except UNREADABLE as error:
+            raise ManipError(f"cannot read meta/episodes of {self.root}: {error}; {_SEE_CHECK}") from error
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """Statistics by column and name, (n,), of pictures (channels, 1, 1); computed if the dataset has none."""
+        if (self.root / layout.STATS).exists():
+            return read_statistics(self.root, self.info)
+        numbers = [feature for feature in self.info.of_dtype(*NUMBERS) if feature.key in self.features]
+        return column_statistics({feature.key: self.columns([feature.key])[feature.key] for feature in numbers})
+
+    @cached_property
+    def data_files(self) -> list[Path]:
+        """The data files, in the order of their rows."""
+        paths = sorted(self.root.glob(layout.DATA_FILES))
+        if not paths:
+            raise ManipError(f"{self.root} has no data: no file matches {layout.DATA_FILES}")
+        self._check_rows(paths)
+        return paths
+
+    def columns(
+        self, names: Sequence[str] | None = None, episodes: Sequence[int] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; read-only views of Arrow's memory.
+
+        names: all numbers by default. episodes: indices of the episodes to keep; all by default. Raises `UnknownName`
+        for a column that is not there, `UsageError` for an episode that is not there.
+        """
+        wanted = self._known(names)
+        needed = wanted if episodes is None else list(dict.fromkeys([*wanted, layout.EPISODE_INDEX]))
+        table = pa.concat_tables(read_file(path, needed) for path in self.data_files)
+        if episodes is not None:
+            table = self._of_episodes(table, episodes)
+        return {name: self._numpy(table, name) for name in wanted}
+
+    def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield the columns, (T,) or (T, d), of one data file after the other. Raises what `columns` raises."""
+        wanted = self._known(names)
+        for path in self.data_files:
+            table = read_file(path, wanted)
+            yield {name: self._numpy(table, name) for name in wanted}
+
+    def camera(self, key: str) -> Camera:
+        """Return a camera's pictures, none of them decoded. Raises what `Camera.of` raises."""
+        return Camera.of(self.root, self.info, self.episodes, self.data_files, key)
+
+    def frames(self, key: str, rows: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return a camera's pictures of these rows (B,), decoded, (B, height, width, 3)."""
+        return self.camera(key).rows(rows)
+
+    def rows_of(self, episode: int) -> NDArray[np.int64]:
+        """Return the rows of an episode, (T,). Raises `UsageError` for one that is not there."""
+        self._require_episodes([episode])
+        table = self.episodes
+        [place] = np.flatnonzero(table.index == episode)[:1]
+        return np.arange(table.start[place], table.start[place] + table.length[place])
+
+    def read_episodes(self, *, pictures: bool = True) -> Iterator[Episode]:
+        """Yield the episodes of a dataset with this program's columns, in order, scalars as (T, 1) columns.
+
+        With pictures and their keypoints if wanted. An episode's success is what `next.success` has. One data file is
+        held at a time.
+        """
+        cameras = {key: self.camera(key) for key in self.spec.image_keys} if pictures else {}
+        left_out = {} if pictures else self.spec.image_keys | self.spec.keypoint_keys
+        shapes = {key: one["shape"] for key, one in s.features(self.spec).items() if key not in left_out}
+        stored = [key for key in shapes if key not in cameras]
+        row = 0
+        for piece in self.pieces([*stored, layout.EPISODE_INDEX, layout.TASK_INDEX]):
+            index, task = (piece[name].reshape(-1) for name in (layout.EPISODE_INDEX, layout.TASK_INDEX))
+            starts = np.flatnonzero(np.diff(index, prepend=-1))
+            for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
+                own: dict[str, NDArray[Any]] = {
+                    key: camera.rows(np.arange(row + start, row + stop)) for key, camera in cameras.items()
+                }
+                own |= {key: piece[key][start:stop].reshape(-1, *shapes[key]) for key in stored}
+                text, drawn = self._text(int(task[start])), self.episodes.drawn.get(int(index[start]), {})
+                yield _episode({key: own[key] for key in shapes}, text, drawn)
+            row += len(index)
+
+    @cached_property
+    def summary(self) -> DatasetInfo:
+        """Names and counts; successes from the column `next.success`, if there is one."""
+        own, success, at_end = self.own, None, None
+        if s.SUCCESS in self.features:
+            columns = self.columns([s.SUCCESS, layout.EPISODE_INDEX])
+            index, flags = (columns[name].reshape(-1) for name in (layout.EPISODE_INDEX, s.SUCCESS))
+            last = np.flatnonzero(np.diff(index, append=-1))
+            success, at_end = len(np.unique(index[flags.astype(bool)])), int(flags[last].sum())
+        return DatasetInfo(
+            root=self.root,
+            robot=own.spec.robot if own else s.robot_of(self.info.robot or UNKNOWN_ROBOT)["robot"],
+            task=own.spec.task if own else UNKNOWN_TASK,
+            instruction=own.spec.instruction if own else self.instruction,
+            fps=self.fps,
+            episodes=self.info.episodes,
+            frames=self.info.frames,
+            success=success,
+            success_at_end=at_end,
+        )
+
+    def _known(self, names: Sequence[str] | None) -> list[str]:
+        known = [key for key, feature in self.features.items() if feature.dtype not in ("video", "image")]
+        if names is None:
+            return [key for key in known if self.features[key].dtype in NUMBERS]
+        for name in names:
+            if name not in known:
+                raise UnknownName(f"column in {self.root}", name, known)
+        return list(names)
+
+    def _numpy(self, table: pa.Table, name: str) -> NDArray[Any]:
+        feature = self.features[name]
+        try:
+            return to_numpy(table.column(name), feature.dtype, feature.shape)
+        except BadColumn as error:
+            raise ManipError(f"{self.root}: column {name!r} {error}") from error
+
+    def _check_rows(self, paths: Sequence[Path]) -> None:
+        """Raise `ManipError` unless the data files hold as many rows as `info.json` counts; no column is read."""
+        found = 0
+        for path in paths:
+            try:
+                found += pq.read_metadata(path).num_rows
+            except UNREADABLE as error:
+                raise ManipError(f"cannot read {path}: {error}; {_SEE_CHECK}") from error
+        if found != len(self):
+            raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {found}")
+
+    def _of_episodes(self, table: pa.Table, episodes: Sequence[int]) -> pa.Table:
+        self._require_episodes(episodes)
+        return table.filter(np.isin(table.column(layout.EPISODE_INDEX).to_numpy(), list(episodes)))
+
+    def _require_episodes(self, episodes: Sequence[int]) -> None:
+        count = self.info.episodes
+        for episode in episodes:
+            if not 0 <= episode < count:
+                raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {count - 1}")
+
+    def _text(self, number: int) -> str:
+        if not isinstance(text := self.tasks.get(number), str):
+            raise ManipError(f"{self.root}: rows have the task {number}, which {layout.TASKS} does not hold as text")
+        return text
+
+    def _picture_spec(self) -> dict[str, Any]:
+        """Cameras and their size for a spec, which has one for all: none if they differ."""
+        features = [
+            self.features[key] for key in self.cameras if key.startswith(s.IMAGES) and self.features[key].is_rgb
+        ]
+        sizes = {one.key.removeprefix(s.IMAGES): one.picture_size for one in features}
+        if len(set(sizes.values())) > 1:
+            return {}
+        video = not any(one.dtype == "image" for one in features)
+        return {"cameras": tuple(sizes), "image_size": next(iter(sizes.values()), (0, 0)), "video": video}
+
+
+def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Read columns, (T,) or (T, d), of several datasets one after the other; frames and episodes are numbered on.
+
+    One data file is held at a time, beside the columns. Raises what `Dataset.columns` raises.
+    """
+    datasets = [Dataset.open(root) for root in roots]
+    total = sum(map(len, datasets))
+    joined: dict[str, NDArray[Any]] = {}
+    row = episode = 0
+    for dataset in datasets:
+        before = {layout.EPISODE_INDEX: episode, layout.INDEX: row}
+        for piece in dataset.pieces(names):
+            for name, values in piece.items():
+                if name not in joined:
+                    joined[name] = np.empty((total, *values.shape[1:]), _dtype(dataset.features[name], values))
+                part = joined[name][row : row + len(values)]
+                part[:] = values.reshape(part.shape)
+                if before.get(name):
+                    part += before[name]
+            row += len(next(iter(piece.values()), ()))
+        episode += dataset.info.episodes
+    return joined
+
+
+def find_irregular(root: Path) -> list[Path]:
+    """Return what a folder holds besides files and folders: pipes, devices, sockets and links to nothing."""
+    return sorted(path for path in root.rglob("*") if not (path.is_file() or path.is_dir()))
+
+
+def _dtype(feature: Feature, values: NDArray[Any]) -> np.dtype[Any]:
+    """The type of numbers that the dataset declares; its files may hold them narrower."""
+    return values.dtype if values.dtype.kind == "O" else np.dtype(feature.dtype)
+
+
+def _episode(columns: dict[str, NDArray[Any]], text: str, drawn: Mapping[str, Any]) -> Episode:
+    seed, solved = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
+    return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), (), text, drawn)

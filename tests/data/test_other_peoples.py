@@ -1,0 +1,198 @@
+"""Datasets as other people have them: each is opened, has no errors, and is trained on from its pictures."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.data import lerobot_layout as layout
+from manip_il.data.dataset import Dataset
+from manip_il.doctor.examine import examine_folder
+from manip_il.doctor.finding import Severity
+
+from ..damage import DATA, EPISODES, edit_json, edit_table
+from ..learn.tiny_policies import ACT
+
+pytestmark = pytest.mark.slow
+TOP, SIDE, DEPTH = "observation.images.top", "observation.image", "observation.images.depth"
+MOTORS = {"motors": ["shoulder_pan.pos", "elbow.pos", "gripper"]}
+NAMES = ["height", "width", "channels"]
+SIZE = (32, 48)
+
+
+def record(root: Path, tasks: list[str], **more: dict[str, Any]) -> Path:
+    """Three episodes by LeRobot's own writer, with pictures in videos of several episodes."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    table = {
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": MOTORS},
+        "action": {"dtype": "float32", "shape": (3,), "names": None},
+        TOP: {"dtype": "video", "shape": (*SIZE, 3), "names": NAMES},
+        **more,
+    }
+    dataset: Any = LeRobotDataset.create("a/b", 30, table, root=root)
+    rng = np.random.default_rng(0)
+    for episode, task in enumerate(tasks):
+        for _ in range(12 + episode):
+            frame: dict[str, Any] = {"task": task}
+            for key, feature in table.items():
+                if feature["dtype"] == "float32":
+                    frame[key] = rng.normal(size=feature["shape"]).astype(np.float32)
+                elif feature["shape"][-1] == 3:
+                    frame[key] = rng.integers(0, 256, feature["shape"], np.uint8)
+                else:
+                    frame[key] = rng.integers(100, 2000, feature["shape"]).astype(np.uint16)
+            dataset.add_frame(frame)
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def check(root: Path, folder: Path) -> str:
+    """Open, examine and train; return what the spec calls the joints."""
+    dataset = Dataset.open(root)
+    assert sum(map(len, map(dataset.rows_of, range(dataset.info.episodes)))) == len(dataset)
+    assert len(dataset.columns()["action"]) == len(dataset) == dataset.summary.frames
+    errors = [str(one) for one in examine_folder(root) if one.severity is Severity.ERROR]
+    assert not errors
+    policy = [f"--policy.{name}={value}" for name, value in (ACT | {"chunk_size": 4, "n_action_steps": 2}).items()]
+    words = [*policy, "--policy.pretrained_backbone_weights=null", "--observation=images", "--batch_size=4"]
+    told = ["train", f"--dataset.root={root}", *words, "--steps=2", f"--output_dir={folder}"]
+    assert main(told) == 0
+    assert (folder / "checkpoints/last/pretrained_model/model.safetensors").is_file()
+    return " ".join(dataset.spec.joint_names)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("theirs") / "plain", ["fold", "unfold", "fold"])
+
+
+@pytest.fixture
+def root(recorded: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(recorded, tmp_path / "plain")
+
+
+def names_of_joints(names: Any) -> Callable[[Path], None]:
+    return lambda root: edit_json(root / layout.INFO, lambda info: info["features"]["action"].update(names=names))
+
+
+def tasks_without_a_named_index(root: Path) -> None:
+    texts = pa.array(["fold", "unfold"])
+    table = pa.table({"task_index": pa.array([0, 1], pa.int64()), "__index_level_0__": texts})
+    pq.write_table(table, root / layout.TASKS)
+
+
+def no_statistics(root: Path) -> None:
+    (root / layout.STATS).unlink()
+
+
+def language(root: Path) -> None:
+    """The columns that LeRobot's annotations add."""
+    from lerobot.datasets import language as theirs
+
+    table = pq.read_table(root / DATA)
+    said = {"role": "user", "content": "fold it", "style": "plan", "timestamp": 0.0}
+    fields = list(theirs.language_persistent_row_arrow_type())
+    columns = [pa.array([said.get(one.name)] * len(table), one.type) for one in fields if one.name != "tool_calls"]
+    rows = pa.StructArray.from_arrays([*columns, pa.nulls(len(table), fields[-1].type)], fields=fields)
+    column = pa.ListArray.from_arrays(np.arange(len(table) + 1, dtype=np.int32), rows)
+    pq.write_table(table.append_column(theirs.LANGUAGE_PERSISTENT, column), root / DATA)
+    feature = {"dtype": "language", "shape": [1], "names": None}
+    edit_json(root / layout.INFO, lambda info: info["features"].update({theirs.LANGUAGE_PERSISTENT: feature}))
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        (names_of_joints(None), "action.0 action.1 action.2"),
+        (names_of_joints(MOTORS), "shoulder_pan.pos elbow.pos gripper"),
+        (tasks_without_a_named_index, "action.0 action.1 action.2"),
+        (no_statistics, "action.0 action.1 action.2"),
+        (language, "action.0 action.1 action.2"),
+    ],
+)
+def test_a_dataset_that_is_written_another_way(root, tmp_path, change, names):
+    change(root)
+    assert check(root, tmp_path / "run") == names
+
+
+def test_empty_tasks_and_tasks_of_many_lines(tmp_path):
+    root = record(tmp_path / "tasks", ["", "fold the\ntowel\n", "fold"])
+    assert list(Dataset.open(root).tasks.values()) == ["", "fold the\ntowel\n", "fold"]
+    check(root, tmp_path / "run")
+
+
+def test_a_rate_that_is_no_whole_number(root, tmp_path):
+    rate, columns = Fraction(2997, 100), ("timestamp", f"videos/{TOP}/from_timestamp", f"videos/{TOP}/to_timestamp")
+    [video] = root.glob("videos/**/*.mp4")
+    pictures = Dataset.open(root).camera(TOP).rows(np.arange(39))
+    with av.open(video, "w") as container:
+        stream: Any = container.add_stream("h264", rate=rate)
+        stream.height, stream.width = SIZE
+        for one in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(one, format="rgb24")))
+        container.mux(stream.encode(None))
+
+    def slow_down(rows: dict[str, list[Any]]) -> None:
+        rows.update({name: [float(30 / rate) * one for one in rows[name]] for name in columns if name in rows})
+
+    edit_table(root / DATA, slow_down)
+    edit_table(root / EPISODES, slow_down)
+    edit_json(root / layout.INFO, lambda info: info.update(fps=29.97))
+    edit_json(root / layout.STATS, lambda stats: stats.pop("timestamp"))
+    assert Dataset.open(root).fps == 29.97
+    assert np.abs(Dataset.open(root).camera(TOP).rows(np.arange(39)).astype(int) - pictures).mean() < 40
+    check(root, tmp_path / "run")
+
+
+def test_pictures_of_two_sizes_and_kinds_one_not_called_a_camera(tmp_path):
+    more = {SIDE: {"dtype": "image", "shape": (24, 24, 3), "names": NAMES}}
+    root = record(tmp_path / "sizes", ["fold"] * 3, **more)
+    check(root, tmp_path / "run")
+    config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
+    assert {TOP, SIDE} < set(config["input_features"])
+
+
+@pytest.mark.parametrize("kind", ["video", "image"])
+def test_depth_is_left_out_and_said(tmp_path, capsys, kind):
+    depth = {"dtype": kind, "shape": (*SIZE, 1), "names": NAMES, "info": {"is_depth_map": True}}
+    root = record(tmp_path / "depth", ["fold"] * 3, **{DEPTH: depth})
+    check(root, tmp_path / "run")
+    assert f"{DEPTH} is left out" in capsys.readouterr().err
+    config = json.loads((tmp_path / "run/checkpoints/last/pretrained_model/config.json").read_text())
+    assert set(config["input_features"]) == {"observation.state", TOP}
+
+
+def test_episodes_deleted_and_merged_by_lerobots_tools(recorded, tmp_path):
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    whole: Any = LeRobotDataset("a/b", root=recorded)
+    fewer: Any = delete_episodes(whole, [1], output_dir=tmp_path / "fewer", repo_id="a/fewer")
+    merge_datasets([whole, fewer], "a/merged", output_dir=tmp_path / "merged")
+    pictures = Dataset.open(recorded).camera(TOP)
+    row = np.arange(len(pictures))
+    kept = np.concatenate([row, row[:12], row[25:]])
+    merged = Dataset.open(tmp_path / "merged")
+    assert len({part.path for part in merged.camera(TOP).parts}) == 1  # a video of several episodes
+    distance = merged.camera(TOP).rows(np.arange(len(merged))).astype(int) - pictures.rows(kept)
+    assert np.abs(distance).mean() < 20  # what was deleted has the rest encoded again
+    for name in ("fewer", "merged"):
+        check(tmp_path / name, tmp_path / f"run_{name}")
