@@ -21,7 +21,7 @@ from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
 from manip_il.data.episode_table import EpisodeTable, read_episode_table
-from manip_il.data.info import LARGEST_META, NUMBERS, DatasetInfo, Feature, Info, InvalidInfo, read_info
+from manip_il.data.info import NUMBERS, DatasetInfo, Feature, Info, InvalidInfo, read_info
 from manip_il.data.parquet_files import UNREADABLE, BadColumn, read_file, read_tasks, to_numpy
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
@@ -88,7 +88,7 @@ class Dataset:
         path = self.root / layout.OURS
         if not path.exists():
             return None
-        ours = checks.read_json(path, "what this program says of its datasets", LARGEST_META)
+        ours = checks.read_json(path, "what this program says of its datasets")
         if missing := {"spec", "fingerprint", "provenance"} - ours.keys():
             raise ManipError(f"{path} lacks {', '.join(sorted(missing))}")
         about = {key: checks.mapping(f"{path}: {key}", ours[key]) for key in ("spec", "fingerprint", "provenance")}

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from manip_il import checks
 from manip_il.data.dataset import find_irregular
-from manip_il.data.info import LARGEST_META, read_object
+from manip_il.data.info import read_object
 from manip_il.data.lerobot_layout import INFO
 from manip_il.data.pictures import open_video
 from manip_il.errors import ManipError
@@ -71,7 +71,7 @@ def open_file(path: Path, declared: Collection[str] = ()) -> None:
             for _ in container.demux(container.streams.video):
                 pass
     elif path.suffix == ".json":
-        checks.parse_json(str(path), checks.read_bytes(path, "JSON", LARGEST_META), nan_is_none=True)
+        checks.parse_json(str(path), checks.read_bytes(path, "JSON", checks.LARGEST_JSON), nan_is_none=True)
 
 
 def _declared_pictures(root: Path) -> list[str]:

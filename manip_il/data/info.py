@@ -12,7 +12,6 @@ from typing import Any, cast
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.schema import LONGEST_SIDE
 from manip_il.errors import ManipError
 
 PICTURES = ("video", "image")
@@ -21,10 +20,6 @@ NUMBERS = (
     *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "bool"),
 )
 INDEX_FEATURES = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
-
-LARGEST_META = 16 * 1024 * 1024  # of a JSON file in `meta` [bytes]
-_LONGEST_PATH = 1_000  # [characters]
-_MOST_AXES = 32  # as many as an array of numpy's has
 
 # LeRobot's placeholders alone: `str.format` would also read attributes
 _TEMPLATE = re.compile(r"(?:[^{}/]|/(?!/)|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
@@ -122,7 +117,7 @@ def read_info(root: Path) -> Info:
     except FileNotFoundError:
         text = f"is missing: {root} is not a LeRobot dataset, or its recorder died before it wrote anything"
         raise InvalidInfo(root, [text]) from None
-    except (OSError, ValueError, RecursionError) as problem:
+    except (OSError, ValueError) as problem:
         raise InvalidInfo(root, [f"cannot be read: {problem}"]) from problem
     version = raw.get("codebase_version")
     if version != layout.VERSION:
@@ -143,13 +138,10 @@ def read_info(root: Path) -> Info:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file of at most 16 MiB. Raises `OSError`, or `ValueError` for any other content."""
-    with open(checks.open_regular(path), "rb") as file:
-        content = file.read(LARGEST_META + 1)
-    if len(content) > LARGEST_META:
-        raise ValueError(f"it has more than {LARGEST_META:,} bytes")
+    """Return the object in a JSON file. Raises `OSError`, or `ValueError` for any other content."""
     try:
-        data = json.loads(content)
+        with open(checks.open_regular(path), "rb") as file:
+            data = json.load(file)
     except RecursionError as problem:
         raise ValueError("it is nested too deeply") from problem
     if not isinstance(data, dict):
@@ -184,9 +176,7 @@ def info_problems(raw: dict[str, Any]) -> Iterator[str]:
 
 
 def _is_template(path: Any) -> bool:
-    if not isinstance(path, str) or len(path) > _LONGEST_PATH or ".." in path or path.startswith("/"):
-        return False
-    return _TEMPLATE.fullmatch(path) is not None
+    return isinstance(path, str) and not (".." in path or path.startswith("/")) and bool(_TEMPLATE.fullmatch(path))
 
 
 def _feature_problems(key: str, value: Any) -> Iterator[str]:
@@ -196,9 +186,6 @@ def _feature_problems(key: str, value: Any) -> Iterator[str]:
         yield str(problem)
     if not _is_feature(value):
         yield f"feature {checks.shorten(key)} is {checks.shorten(value)}; expected dtype and shape"
-    elif value["dtype"] in PICTURES and max(value["shape"], default=0) > LONGEST_SIDE:
-        text = f"feature {checks.shorten(key)} has shape {checks.shorten(value['shape'])}"
-        yield f"{text}; expected at most {LONGEST_SIDE:,} pixels a side"
 
 
 def _is_feature(value: Any) -> bool:
@@ -206,9 +193,9 @@ def _is_feature(value: Any) -> bool:
         return False
     table = cast(dict[str, Any], value)
     shape: Any = table.get("shape")
-    if not isinstance(table.get("dtype"), str) or not isinstance(shape, list) or len(cast(Any, shape)) > _MOST_AXES:
+    if not isinstance(table.get("dtype"), str) or not isinstance(shape, list):
         return False
-    return all(_is_count(size) for size in cast(list[Any], shape)) and math.prod(cast(list[int], shape)) < 2**31
+    return all(_is_count(size) for size in cast(list[Any], shape))
 
 
 def _feature(key: str, value: dict[str, Any]) -> Feature:

@@ -18,7 +18,6 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder
 from manip_il.data.dataset import Dataset
-from manip_il.data.info import LARGEST_META
 from manip_il.data.parquet_files import integers, open_writer, to_table
 from manip_il.data.statistics import RunningStats
 from manip_il.errors import ManipError
@@ -44,7 +43,7 @@ def rewrite_columns(
                 _rewrite_data(path, folder / path.relative_to(source), columns, statistics)
             for path in sorted(source.glob(layout.EPISODES_FILES)):
                 _rewrite_episodes(path, folder / path.relative_to(source), statistics)
-            stats = checks.read_json(source / layout.STATS, "a dataset's statistics", LARGEST_META)
+            stats = checks.read_json(source / layout.STATS, "a dataset's statistics")
             layout.write_json(folder / layout.STATS, stats | statistics.result())
         layout.write_json(folder / layout.OURS, about)
 

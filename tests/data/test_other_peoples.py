@@ -35,7 +35,7 @@ def record(root: Path, tasks: list[str], **more: dict[str, Any]) -> Path:
     """Three episodes by LeRobot's own writer, with pictures in videos of several episodes."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    table = {
+    table: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": (3,), "names": MOTORS},
         "action": {"dtype": "float32", "shape": (3,), "names": None},
         TOP: {"dtype": "video", "shape": (*SIZE, 3), "names": NAMES},

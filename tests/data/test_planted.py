@@ -10,7 +10,6 @@ import pytest
 
 from manip_il.cli.outputs import append_jsonl
 from manip_il.data.atomic import exclusive
-from manip_il.data.frame_cache import _exclusive  # pyright: ignore[reportPrivateUsage]
 from manip_il.errors import ManipError
 from manip_il.learn.metrics import json_lines
 from manip_il.store.disk import Download
@@ -21,11 +20,6 @@ HELD = b"of the user\n"
 
 def lock(folder: Path) -> None:
     with exclusive(folder / "run"):
-        pass
-
-
-def lock_pictures(folder: Path) -> None:
-    with _exclusive(folder):
         pass
 
 
@@ -43,7 +37,6 @@ def download(folder: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".run.lock": lock,
-    ".lock": lock_pictures,
     "records.jsonl": lambda folder: append_jsonl(folder / "records.jsonl", {"a": 1}),
     "planted": write_metrics,
     "part": download,
