@@ -55,7 +55,7 @@ test-fast: setup .venv/.robots  ## the tests that take seconds and need no OpenG
 
 FUZZ ?= 20000
 fuzz: setup  ## FUZZ=20000 mutated inputs of every kind that is read: each accepted, or refused in one line
-	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --inputs=$(FUZZ)
+	OMP_NUM_THREADS=1 FUZZ=$(FUZZ) $(BIN)/pytest -n 2 tests/test_fuzz.py
 
 lint: setup  ## style, types, who may import whom, and the form of docstrings
 	$(BIN)/ruff check

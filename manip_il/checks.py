@@ -55,6 +55,11 @@ def shorten(value: object) -> str:
     return printed if len(printed) <= _LONGEST_PRINTED else f"{printed[: _LONGEST_PRINTED - 3]}..."
 
 
+def one_line(error: BaseException) -> str:
+    """Return a library's message in one line."""
+    return " ".join(str(error).split())
+
+
 def name(what: str, value: object) -> str:
     """Return a name that may become part of a path: letters, digits and `_ . -`, at most 100 characters.
 

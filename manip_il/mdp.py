@@ -179,9 +179,9 @@ def require_finite(what: str, values: NDArray[np.generic]) -> None:
         return
     if np.isfinite(values).all():
         return
-    row = int(np.argwhere(~np.isfinite(values))[0][0])
-    where = f"frame {row}" if values.ndim > 1 else f"index {row}"
-    raise NotFiniteError(f"{what}: {values[row]} at {where} is not finite")
+    place = np.argwhere(~np.isfinite(values))[0]
+    where = f"frame {place[0]}" if values.ndim > 1 else f"index {place[0]}"
+    raise NotFiniteError(f"{what}: {values[tuple(place)]} at {where} is not finite")
 
 
 Images = Mapping[str, NDArray[np.uint8]]  # camera -> (B, H, W, 3)

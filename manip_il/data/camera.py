@@ -16,6 +16,7 @@ import PIL
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import Feature, Info
@@ -146,7 +147,9 @@ class Camera:
                 pictures = np.stack([decode_cell(cell) for cell in cells.to_pylist()])
             except UNREADABLE as error:
                 place = f"frames {rows[0]} to {rows[-1]} of {path}"
-                raise ManipError(f"cannot read the pictures {self.key} in {place}: {error}; {_SEE_CHECK}") from error
+                raise ManipError(
+                    f"cannot read the pictures {self.key} in {place}: {checks.one_line(error)}; {_SEE_CHECK}"
+                ) from error
         if pictures.shape[1:] != (*self.size, 3):
             there = f"{layout.INFO} of {self.root}"
             what, found = f"shape of {self.key}", pictures.shape[1:]
@@ -167,7 +170,9 @@ def _cells(root: Path, key: str, part: ParquetPart, fingerprint: str) -> Any:
         with pq.ParquetFile(root / part.path) as file:
             table = file.read_row_groups(range(part.first, part.last + 1), [key], use_threads=False)
     except UNREADABLE as error:
-        raise ManipError(f"cannot read the pictures {key} in {root / part.path}: {error}; {_SEE_CHECK}") from error
+        raise ManipError(
+            f"cannot read the pictures {key} in {root / part.path}: {checks.one_line(error)}; {_SEE_CHECK}"
+        ) from error
     return table.column(key)
 
 

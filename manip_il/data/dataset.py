@@ -95,7 +95,7 @@ class Dataset:
         try:
             return Own(s.RobotTaskSpec.from_json(about["spec"]), about["fingerprint"], about["provenance"])
         except ManipError as error:
-            raise ManipError(f"{path}: {error}") from error
+            raise ManipError(f"{path}: {checks.one_line(error)}") from error
 
     @property
     def fingerprint(self) -> Mapping[str, Any]:
@@ -138,7 +138,9 @@ class Dataset:
         try:
             return dict(zip(*read_tasks(self.root), strict=True))
         except UNREADABLE as error:
-            raise ManipError(f"cannot read {self.root / layout.TASKS}: {error}; {_SEE_CHECK}") from error
+            raise ManipError(
+                f"cannot read {self.root / layout.TASKS}: {checks.one_line(error)}; {_SEE_CHECK}"
+            ) from error
 
     @property
     def instruction(self) -> str:
@@ -151,7 +153,9 @@ class Dataset:
         try:
             return read_episode_table(self.root, self.info)
         except UNREADABLE as error:
-            raise ManipError(f"cannot read meta/episodes of {self.root}: {error}; {_SEE_CHECK}") from error
+            raise ManipError(
+                f"cannot read meta/episodes of {self.root}: {checks.one_line(error)}; {_SEE_CHECK}"
+            ) from error
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -274,7 +278,7 @@ class Dataset:
             try:
                 found += pq.read_metadata(path).num_rows
             except UNREADABLE as error:
-                raise ManipError(f"cannot read {path}: {error}; {_SEE_CHECK}") from error
+                raise ManipError(f"cannot read {path}: {checks.one_line(error)}; {_SEE_CHECK}") from error
         if found != len(self):
             raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {found}")
 

@@ -52,7 +52,7 @@ def open_files(root: Path, strict: bool = True) -> None:
             open_file(path, declared)
         except (ManipError, OSError, ValueError, pa.ArrowException, av.FFmpegError) as error:
             if strict:
-                named = str(error) if str(path) in str(error) else f"{path}: {error}"
+                named = checks.one_line(error) if str(path) in str(error) else f"{path}: {checks.one_line(error)}"
                 raise ManipError(named) from error
 
 
@@ -122,7 +122,7 @@ def check_pictures(path: Path, declared: Collection[str]) -> None:
                         )
                     row += len(batch)
         except (ValueError, pa.ArrowException) as error:
-            raise ManipError(f"{path}: {error}") from error
+            raise ManipError(f"{path}: {checks.one_line(error)}") from error
 
 
 def _types(feature: Any) -> Iterator[Any]:

@@ -120,7 +120,9 @@ def read_file(path: Path, columns: list[str]) -> pa.Table:
             # one thread: handing out pieces of one episode costs more than reading them
             table = pq.ParquetFile(stream).read(columns, use_threads=False)
     except UNREADABLE as error:
-        raise ManipError(f"cannot read {path}: {error}; run `manip-il doctor` to see what is left") from error
+        raise ManipError(
+            f"cannot read {path}: {checks.one_line(error)}; run `manip-il doctor` to see what is left"
+        ) from error
     for name in columns:
         if name not in table.column_names:
             raise UnknownName(f"column in {path}", name, table.column_names)

@@ -65,6 +65,7 @@ class Source:
             (self.is_camera == bool(self.paths), "expected either field or video"),
             (self.dtype not in dtypes, f"dtype is {self.dtype}; expected one of {', '.join(dtypes)}"),
             (self.resample == "interpolate" and not self.dtype.startswith("float"), "only floats can be interpolated"),
+            (len(self.topic) > checks.LONGEST_NAME, f"topic is {checks.shorten(self.topic)}; expected a topic's name"),
             (not 0 <= self.tolerance < math.inf, f"tolerance is {self.tolerance}; expected seconds, 0 or more"),
         ):
             if is_wrong:

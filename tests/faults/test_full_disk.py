@@ -8,7 +8,7 @@ import pytest
 
 from manip_il.cli.main import main
 
-from ..fuzz.files import make_evals
+from ..cli.made_runs import make_eval
 from .full_disk import small_disk, the_error
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
@@ -20,6 +20,14 @@ DAGGER = (
     *("--steps=4", "--policy.width=64"),
 )
 EVAL = ("eval", "--policy.type=expert", *REACH, "--eval.n_episodes=6", "--eval.films=0")
+
+
+def make_evals(folder: Path) -> None:
+    """`left/eval.json`, and `more/eval.json` of the same policy on other seeds."""
+    make_eval(folder / "left" / "eval.json", [True, False, True])
+    make_eval(folder / "more" / "eval.json", [True, True, False], seed=4_001_000)
+    for path in folder.glob("*/eval.json"):
+        path.write_text(path.read_text().replace(f'"policy": "{path.parent.name}"', '"policy": "expert"'))
 
 
 def error_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:
