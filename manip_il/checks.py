@@ -39,6 +39,7 @@ SECONDS_IN_CHILD = 120.0
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
 _LONGEST_WHY = 300  # of a parser's message [characters]
 _LONGEST_PRINTED = 300  # [characters]
+_LONGEST_MESSAGE = 1_000  # [characters]
 _REFUSED, _OUT_OF_MEMORY = 3, 4  # exit codes of a child process
 _PRINTED = reprlib.Repr()
 _PRINTED.maxstring = _PRINTED.maxother = _PRINTED.maxlong = 80
@@ -56,8 +57,8 @@ def shorten(value: object) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Return a library's message in one line."""
-    return " ".join(str(error).split())
+    """Return a library's message in one line of at most 1,000 characters."""
+    return " ".join(str(error).split())[:_LONGEST_MESSAGE]
 
 
 def name(what: str, value: object) -> str:

@@ -137,7 +137,7 @@ def _source(what: str, table: Any) -> Source:
     try:
         return draccus.decode(Source, checks.mapping("it", table))
     except (ManipError, draccus.ParsingError) as error:
-        raise UsageError(f"{what}: {' '.join(str(error).split())}") from error
+        raise UsageError(f"{what}: {checks.one_line(error)}") from error
 
 
 def _plain(value: Any) -> Any:
