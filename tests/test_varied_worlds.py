@@ -173,7 +173,7 @@ def test_the_doctor_tells_what_was_drawn_and_what_is_no_draw(tmp_path: Path, cap
     table = pq.read_table(path)
     wrong = table.set_column(table.column_names.index(layout.DRAWN), layout.DRAWN, [["[1]", "{}"]])
     pq.write_table(wrong, path, write_page_checksum=True)
-    assert [str(one) for one in examine_folder(root) if "drawn" in one.place] != []
+    assert [str(one) for one in examine_folder(root) if "drawn" in str(one)] != []
     assert main(["doctor", str(root)]) == 1
     assert "drawn" in capsys.readouterr().out
 

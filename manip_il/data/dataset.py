@@ -174,19 +174,13 @@ class Dataset:
         self._check_rows(paths)
         return paths
 
-    def columns(
-        self, names: Sequence[str] | None = None, episodes: Sequence[int] | None = None
-    ) -> dict[str, NDArray[Any]]:
+    def columns(self, names: Sequence[str] | None = None) -> dict[str, NDArray[Any]]:
         """Read whole columns in stored order: (T,) for scalars, (T, d) for vectors; read-only views of Arrow's memory.
 
-        names: all numbers by default. episodes: indices of the episodes to keep; all by default. Raises `UnknownName`
-        for a column that is not there, `UsageError` for an episode that is not there.
+        names: all numbers by default. Raises `UnknownName` for a column that is not there.
         """
         wanted = self._known(names)
-        needed = wanted if episodes is None else list(dict.fromkeys([*wanted, layout.EPISODE_INDEX]))
-        table = pa.concat_tables(read_file(path, needed) for path in self.data_files)
-        if episodes is not None:
-            table = self._of_episodes(table, episodes)
+        table = pa.concat_tables(read_file(path, wanted) for path in self.data_files)
         return {name: self._numpy(table, name) for name in wanted}
 
     def pieces(self, names: Sequence[str]) -> Iterator[dict[str, NDArray[Any]]]:
@@ -206,7 +200,8 @@ class Dataset:
 
     def rows_of(self, episode: int) -> NDArray[np.int64]:
         """Return the rows of an episode, (T,). Raises `UsageError` for one that is not there."""
-        self._require_episodes([episode])
+        if not 0 <= episode < self.info.episodes:
+            raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {self.info.episodes - 1}")
         table = self.episodes
         [place] = np.flatnonzero(table.index == episode)[:1]
         return np.arange(table.start[place], table.start[place] + table.length[place])
@@ -281,16 +276,6 @@ class Dataset:
                 raise ManipError(f"cannot read {path}: {checks.one_line(error)}; {_SEE_CHECK}") from error
         if found != len(self):
             raise ManipError(f"{self.root}: {layout.INFO} counts {len(self)} frames, its data files {found}")
-
-    def _of_episodes(self, table: pa.Table, episodes: Sequence[int]) -> pa.Table:
-        self._require_episodes(episodes)
-        return table.filter(np.isin(table.column(layout.EPISODE_INDEX).to_numpy(), list(episodes)))
-
-    def _require_episodes(self, episodes: Sequence[int]) -> None:
-        count = self.info.episodes
-        for episode in episodes:
-            if not 0 <= episode < count:
-                raise UsageError(f"{self.root} has no episode {episode}; it has 0 to {count - 1}")
 
     def _text(self, number: int) -> str:
         if not isinstance(text := self.tasks.get(number), str):

@@ -71,6 +71,8 @@ def read_rows(shard: Shard, info: Info) -> Iterable[EpisodeTable]:
 def concatenate(parts: Sequence[Any]) -> Any:
     """Join values of one type: arrays (T, ...), lists, tables of those by the same names, or dataclasses of them."""
     first = parts[0]
+    if len(parts) == 1:
+        return first
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
     if isinstance(first, list):

@@ -7,7 +7,7 @@ bytes, what its `path` leads to, an address too. Such files are refused.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 
 from manip_il import checks
 from manip_il.data.dataset import find_irregular
-from manip_il.data.info import read_object
-from manip_il.data.lerobot_layout import INFO
+from manip_il.data.info import InvalidInfo, read_info
 from manip_il.data.pictures import open_video
 from manip_il.errors import ManipError
 
@@ -29,7 +28,8 @@ _PLAIN = (
     *("Value", "ClassLabel", "List", "LargeList", "Sequence", "Json", "Translation", "TranslationVariableLanguages"),
     *("Array2D", "Array3D", "Array4D", "Array5D"),
 )  # types of `datasets` that hold numbers and text as they are stored
-_BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  # PNG, JPEG, and TIFF, which depth is
+_BEGIN = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")  # PNG and JPEG
+_DEPTH = (b"II*\0", b"MM\0*")  # TIFF, which this program does not open
 _BATCH = 64  # cells held at once
 
 
@@ -56,10 +56,10 @@ def open_files(root: Path, strict: bool = True) -> None:
                 raise ManipError(named) from error
 
 
-def open_file(path: Path, declared: Collection[str] = ()) -> None:
+def open_file(path: Path, declared: Mapping[str, bool]) -> None:
     """Read a file of a dataset to its end, by its suffix. Raises whatever reading it raises.
 
-    declared: the columns that the dataset's description calls pictures.
+    declared: the columns that the dataset's description calls pictures, and whether each is depth.
     """
     if path.suffix == ".parquet":
         check_pictures(path, declared)
@@ -74,13 +74,13 @@ def open_file(path: Path, declared: Collection[str] = ()) -> None:
         checks.parse_json(str(path), checks.read_bytes(path, "JSON", checks.LARGEST_JSON), nan_is_none=True)
 
 
-def _declared_pictures(root: Path) -> list[str]:
+def _declared_pictures(root: Path) -> dict[str, bool]:
+    """The columns that the dataset's description calls pictures, and whether each is depth."""
     try:
-        features = read_object(root / INFO).get("features")
-    except (OSError, ValueError):
-        return []  # no reader gets to its pictures
-    found = cast(dict[str, Any], features).items() if isinstance(features, dict) else ()
-    return [key for key, one in found if isinstance(one, dict) and one.get("dtype") == "image"]
+        features = read_info(root).of_dtype("image")
+    except InvalidInfo:
+        return {}  # no reader gets to its pictures
+    return {feature.key: not feature.is_rgb for feature in features}
 
 
 def picture_columns(schema: pa.Schema) -> list[str]:
@@ -97,30 +97,21 @@ def picture_columns(schema: pa.Schema) -> list[str]:
     return found
 
 
-def check_pictures(path: Path, declared: Collection[str]) -> None:
-    """Raise `ManipError` unless every picture of a data file is in it, as PNG, JPEG or TIFF.
+def check_pictures(path: Path, declared: Mapping[str, bool]) -> None:
+    """Raise `ManipError` unless every picture of a data file is in it, as PNG or JPEG, depth as TIFF, too.
 
-    declared: the columns that the dataset's description calls pictures; those that the file does count too.
+    declared: as for `open_file`; columns that the file's own metadata calls pictures count, too.
     """
     with pq.ParquetFile(path) as file:
         try:
             columns = {*declared, *picture_columns(file.schema_arrow)} & set(file.schema_arrow.names)
             for key in sorted(columns):
-                row = 0
+                allowed, row = (*_BEGIN, *(_DEPTH if declared.get(key) else ())), 0
                 for batch in file.iter_batches(_BATCH, columns=[key], use_threads=False):
-                    bad = next(
-                        (
-                            i
-                            for i, begin in enumerate(_begins(batch.column(0)))
-                            if not (begin or b"").startswith(_BEGIN)
-                        ),
-                        None,
-                    )
-                    if bad is not None:
-                        raise ValueError(
-                            f"column {key!r} has no PNG, JPEG or TIFF in row {row + bad:,}; expected its bytes"
-                        )
-                    row += len(batch)
+                    for begin in _begins(batch.column(0)):
+                        if not (begin or b"").startswith(allowed):
+                            raise ValueError(f"column {key!r} has no PNG or JPEG in row {row:,}; expected its bytes")
+                        row += 1
         except (ValueError, pa.ArrowException) as error:
             raise ManipError(f"{path}: {checks.one_line(error)}") from error
 

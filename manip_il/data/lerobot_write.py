@@ -153,8 +153,7 @@ class DatasetWriter:
     def finish(self, provenance: Mapping[str, Any] | None = None) -> DatasetInfo:
         """Write everything that is written once a dataset. provenance: where the episodes came from.
 
-        Raises `ManipError` where there was no episode, where something cannot be written, and where a video file does
-        not hold as many frames as it was given.
+        Raises `ManipError` if there was no episode, or something cannot be written.
         """
         if not self._episodes:
             raise ManipError("no episodes: there is no dataset to write")

@@ -7,7 +7,6 @@ Pillow hands other formats to other programs (EPS to Ghostscript).
 from __future__ import annotations
 
 import itertools
-from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -110,15 +109,6 @@ class VideoReader:
         if self._container is not None:
             self._container.close()
             self._path = self._container = None
-
-
-def count_packets(path: Path) -> int:
-    """Count the coded frames of a video file without decoding them. Raises `ManipError` for an unreadable one."""
-    try:
-        with closing(open_video(path)) as container:
-            return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
 
 
 def _decode(container: InputContainer, first: int, count: int, fps: float) -> list[NDArray[np.uint8]]:

@@ -25,7 +25,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.pictures import Pictures, count_packets, open_video
+from manip_il.data.pictures import Pictures, open_video
 from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.statistics import I64, pixel_counts
 from manip_il.data.video_config import VideoConfig
@@ -74,7 +74,7 @@ class CameraFiles:
         return clip
 
     def close(self) -> None:
-        """Finish the open file, if any. Raises `ManipError` where it does not hold all frames that it was given."""
+        """Finish the open file, if any. Raises `ManipError` if it cannot be written."""
         if self._file is None:
             return
         file, self._file = self._file, None  # first: a full disk lets no file be closed twice
@@ -84,8 +84,6 @@ class CameraFiles:
             file.close()
         except (av.FFmpegError, OSError) as error:
             raise ManipError(f"cannot write {name}: {error.strerror}") from error
-        if (found := count_packets(file.path)) != file.frames:
-            raise ManipError(f"{name} holds {found} frames; {file.frames} were encoded")
 
     def info(self) -> dict[str, Any]:
         """Return `video_info` of the first file, which must be closed."""

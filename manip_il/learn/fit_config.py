@@ -99,7 +99,9 @@ class FitConfig:
     image_augment: bool | None = option(
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
-    image_cache_gb: float = option(20.0, "disk limit of decoded pictures [GB]; beyond it each step decodes its own")
+    image_cache_gb: float = option(
+        20.0, "most that decoded pictures take on disk [GB]; beyond it each step decodes its own"
+    )
     num_workers: int = option(4, "processes that decode pictures beyond image_cache_gb")
     threads: int = option(1, "PyTorch threads; more help only on free cores")
     processes: int = option(1, "processes that share each batch of a policy other than mlp; one a free core")

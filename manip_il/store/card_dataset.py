@@ -88,11 +88,7 @@ def _seeds(dataset: Dataset) -> str:
 
 
 def _has_labels(dataset: Dataset) -> bool:
-    try:
-        dataset.columns([s.EXECUTED_ACTION, s.LABEL_VALID], [0])
-    except UnknownName:
-        return False
-    return True
+    return {s.EXECUTED_ACTION, s.LABEL_VALID} <= dataset.features.keys()
 
 
 def _provenance(one: Mapping[str, Any], name: str = "") -> Iterator[str]:

@@ -54,11 +54,11 @@ def test_a_table_holds_whole_columns(root, episodes, spec):
     np.testing.assert_array_equal(table["timestamp"], (table["frame_index"] / spec.fps).astype(np.float32))
 
 
-def test_a_table_can_be_of_some_columns_and_episodes(root, episodes):
-    table = Dataset.open(root).columns([s.ACTION, s.SUCCESS], episodes=[2, 0])
+def test_a_table_can_be_of_some_columns_and_an_episode_is_rows_of_it(root, episodes):
+    dataset = Dataset.open(root)
+    table = dataset.columns([s.ACTION, s.SUCCESS])
     assert list(table) == [s.ACTION, s.SUCCESS]
-    expected = np.concatenate([episodes[0].columns[s.ACTION], episodes[2].columns[s.ACTION]])
-    np.testing.assert_array_equal(table[s.ACTION], expected)
+    np.testing.assert_array_equal(table[s.ACTION][dataset.rows_of(2)], episodes[2].columns[s.ACTION])
 
 
 def test_scalars_may_be_columns_without_width(root, tmp_path, episodes, spec):
@@ -223,7 +223,7 @@ def test_what_is_not_there_is_named(root, tmp_path):
     with pytest.raises(UnknownName, match=r"did you mean 'observation\.state'"):
         Dataset.open(root).columns(["observation.stat"])
     with pytest.raises(UsageError, match="has no episode 3; it has 0 to 2"):
-        Dataset.open(root).columns(episodes=[3])
+        Dataset.open(root).rows_of(3)
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.99])
