@@ -45,7 +45,7 @@ def read_carried(root: Path, on_episode: Callable[[], None] = lambda: None) -> l
     """Return what was carried in a dataset's episodes that reached the goal, in order.
 
     Raises `ManipError` for a dataset that lacks what tells layouts and paths, naming it, for a robot that is not known
-    here, and where no episode reached the goal; and what `read_spec` and `read_table` raise.
+    here, and where no episode reached the goal; and what reading a `Dataset` raises.
     """
     dataset = Dataset.open(root)
     spec = dataset.spec

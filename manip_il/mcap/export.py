@@ -49,7 +49,7 @@ def export_dataset(root: Path, info: Info, folder: Path) -> Iterator[Path]:
     """Write every episode to `folder/episode_<index>.mcap` and yield its path, then write the mapping.
 
     info: as `open_source` gives it. The same dataset gives the same bytes. Raises `NotFiniteError` for a number that
-    JSON has not, and what `read_table` raises.
+    JSON has not, and what `Dataset.columns` raises.
     """
     columns = _columns(info)
     numbers = [one.key for one in columns if one.dtype not in PICTURES]
