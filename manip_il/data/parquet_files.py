@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
+from manip_il.data.info import NUMBERS
 from manip_il.data.pictures import to_png
 from manip_il.errors import ManipError, UnknownName
 
 MAGIC = b"PAR1"
 NO_FOOTER = "has no footer: its writer died before it closed the file, or the file was cut"
-_TEXT = ("string", "language")
 _ROWS = 16_384  # held at once
 _TASK_NAMES = ("task", "__index_level_0__")  # pandas' for an index with a name and for one without
 UNREADABLE = (OSError, pa.ArrowException, ValueError, MemoryError)  # ArrowInvalid and its like are ValueErrors too
@@ -145,7 +144,7 @@ def to_numpy(column: pa.ChunkedArray, dtype: str, shape: Sequence[int], *, exact
         if not _is_list(array.type):
             break
         array, nested = array.flatten(), True
-    found, wanted = _numpy_type(array.type), np.dtype(object if dtype in _TEXT else dtype)
+    found, wanted = _numpy_type(array.type), np.dtype(object if dtype not in NUMBERS else dtype)
     if found.kind != wanted.kind or (exact and found != wanted):
         raise BadColumn(f"is {array.type} in the file; info.json says {dtype}")
     if len(array) != rows * size:
@@ -175,25 +174,13 @@ class Shard:
     columns: tuple[str, ...] = ()
 
     def tables(self, columns: Sequence[str] | None = None, rows: int = _ROWS) -> Iterator[pa.Table]:
-        """Yield the rows in order, about `rows` at a time. Raises one of `UNREADABLE`.
+        """Yield the rows in order, at most `rows` at a time. Raises one of `UNREADABLE`.
 
         Checksums of pages are compared.
         """
         with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
-            groups: list[int] = []
-            held = 0
-            for group in range(file.num_row_groups):
-                groups.append(group)
-                held += file.metadata.row_group(group).num_rows
-                if held >= rows or group == file.num_row_groups - 1:
-                    yield file.read_row_groups(groups, columns=columns, use_threads=False)
-                    groups, held = [], 0
-
-    def batches(self, column: str, rows: int) -> Iterator[pa.Array]:
-        """Yield one column's values, (T,) of at most `rows` at a time: pictures need not fit in memory."""
-        with pq.ParquetFile(self.path, page_checksum_verification=True) as file:
-            for batch in file.iter_batches(rows, columns=[column], use_threads=False):
-                yield batch.column(0)
+            for batch in file.iter_batches(rows, columns=columns, use_threads=False):
+                yield pa.Table.from_batches([batch])
 
 
 def find_shards(root: Path, pattern: str) -> list[Shard]:
@@ -205,26 +192,17 @@ def open_shard(name: str, path: Path) -> Shard:
     """Return the file with its footer read."""
     try:
         with open(checks.open_regular(path), "rb") as stream:
-            size = stream.seek(0, 2)
+            if (size := stream.seek(0, 2)) == 0:
+                return Shard(name, path, "is empty")
             stream.seek(0)
-            first = stream.read(4)
-            stream.seek(max(0, size - 4))
-            last = stream.read(4)
-        if size == 0:
-            return Shard(name, path, "is empty")
-        if first != MAGIC:
-            return Shard(name, path, "is not a parquet file")
-        if last != MAGIC or size < 12:
-            return Shard(name, path, NO_FOOTER)
-        return Shard(name, path, columns=_column_names(path, size, path.stat().st_mtime_ns))
+            if stream.read(4) != MAGIC:
+                return Shard(name, path, "is not a parquet file")
+            stream.seek(size - 4)
+            if stream.read(4) != MAGIC or size < 12:
+                return Shard(name, path, NO_FOOTER)
+            return Shard(name, path, columns=tuple(pq.read_schema(stream).names))
     except UNREADABLE as problem:
         return Shard(name, path, f"cannot be read: {problem}")
-
-
-@lru_cache(100)
-def _column_names(path: Path, size: int, changed: int) -> tuple[str, ...]:
-    """Names of a file's columns, parsed once a version of it: of `meta/episodes` that takes longer than its rows."""
-    return tuple(pq.read_metadata(path).schema.to_arrow_schema().names)
 
 
 def read_tasks(root: Path) -> tuple[list[int], list[str]]:

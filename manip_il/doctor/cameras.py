@@ -153,8 +153,8 @@ def _check_shard(shard: Shard, feature: Feature, levels: list[F64]) -> Iterator[
     bad: list[tuple[int, str]] = []
     row = 0
     try:
-        for batch in shard.batches(feature.key, _BATCH):
-            for cell in batch.to_pylist():
+        for table in shard.tables([feature.key], _BATCH):
+            for cell in table.column(0).to_pylist():
                 if problem := _check_picture(cell, feature, levels if row % _SAMPLE_EVERY == 0 else None):
                     bad.append((row, problem))
                 row += 1
