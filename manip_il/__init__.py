@@ -17,35 +17,28 @@ if TYPE_CHECKING:
     from importlib.machinery import ModuleSpec
     from types import ModuleType
 
-    from manip_il.collect.expert import Expert
-    from manip_il.collect.record import record
-    from manip_il.sim.env import make_env
-
 from manip_il.sim.gl import choose_backend, require_known_backend
 
 choose_backend()
 
 __version__ = "0.1.0"
-__all__ = ["Expert", "make_env", "record"]
 _HOMES = {"Expert": "collect.expert", "make_env": "sim.env", "record": "collect.record"}
 
 
 def __getattr__(name: str) -> Any:
-    """Return what `__all__` names, imported when it is first asked for."""
+    """Return what a user wants first, imported when it is asked for; `__init__.pyi` has the types."""
     if name not in _HOMES:
         raise AttributeError(f"module 'manip_il' has no attribute {name!r}")
     return getattr(import_module(f"manip_il.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*_HOMES, "__version__"]
 
 
 def _register() -> None:
     require_known_backend()  # before mujoco is imported
-    from manip_il.sim.register import register_envs
-
-    register_envs()
+    import_module("manip_il.sim.register").register_envs()
 
 
 class _WaitForGymnasium:
