@@ -48,22 +48,22 @@ def build_scene(robot: str, task: str, shape: str = "", step: float = DT_SIM) ->
 
     shape: of its object, as `EnvConfig.object`; empty for the task's own. step: of physics [s].
     """
-    return _build(robot, task, shape, step)
+    return _build(get_robot(robot), task, shape, step)
 
 
 @lru_cache(SCENES_KEPT)
-def _build(robot: str, task: str, shape: str, step: float) -> Scene:
-    the_robot, the_task = get_robot(robot), get_task(task, shape)
+def _build(robot: Robot, task: str, shape: str, step: float) -> Scene:
+    the_task = get_task(task, shape)
     try:
-        spec = scene_spec(the_robot, the_task)
+        spec = scene_spec(robot, the_task)
         spec.option.timestep = step
         model = spec.compile()
     except ValueError as error:
         why = " ".join(str(error).split())
         raise UsageError(
-            f"robot {the_robot.name} and task {the_task.name} make no scene of {the_robot.files.model}: {why}"
+            f"robot {robot.name} and task {the_task.name} make no scene of {robot.files.model}: {why}"
         ) from None
-    return _index(the_robot, the_task, model, shape)
+    return _index(robot, the_task, model, shape)
 
 
 def scene_spec(robot: Robot, task: Task) -> mujoco.MjSpec:

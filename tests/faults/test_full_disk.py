@@ -23,11 +23,13 @@ EVAL = ("eval", "--policy.type=expert", *REACH, "--eval.n_episodes=6", "--eval.f
 
 
 def make_evals(folder: Path) -> None:
-    """`left/eval.json`, and `more/eval.json` of the same policy on other seeds."""
+    """`left/eval.json`, `right/eval.json` of another policy on the same seeds, `more/eval.json` of left's on others."""
     make_eval(folder / "left" / "eval.json", [True, False, True])
+    make_eval(folder / "right" / "eval.json", [True, True, False])
     make_eval(folder / "more" / "eval.json", [True, True, False], seed=4_001_000)
-    for path in folder.glob("*/eval.json"):
-        path.write_text(path.read_text().replace(f'"policy": "{path.parent.name}"', '"policy": "expert"'))
+    for name in ("left", "more"):
+        path = folder / name / "eval.json"
+        path.write_text(path.read_text().replace(f'"policy": "{name}"', '"policy": "expert"'))
 
 
 def error_of(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -68,9 +71,9 @@ def read(monkeypatch):
         table["actor"] = np.full(EPISODES * LENGTH, Actor.EXPERT)
         table["next.success"] = table["frame_index"] >= LENGTH - 5
         table |= {name.replace("__", "."): value for name, value in changes.items()}
-        monkeypatch.setattr(transitions, "read_tables", lambda roots, columns: {name: table[name] for name in columns})
-        monkeypatch.setattr(transitions, "read_table", lambda root, episodes: table)
-        return read_demonstrations(["demos"], lambda actions, states: actions - states)
+        monkeypatch.setattr(transitions, "joined_columns", lambda roots, names: {name: table[name] for name in names})
+        monkeypatch.setattr(transitions.Dataset, "open", lambda root: SimpleNamespace(features=table))
+        return read_demonstrations([Path("demos")], lambda actions, states: actions - states)
 
     return run
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from manip_il.errors import UnknownName
+from manip_il.robots.robot import get_robot
 from manip_il.sim.scene import DT_SIM, _build, build_scene, camera_id
 from manip_il.sim.variation import PER_OBJECT, WORLD_SIZE
 from manip_il.tasks.objects import CUBE_HALF
@@ -46,7 +47,7 @@ def test_a_held_cube_creeps_less_than_a_millimetre_in_5_s(robot: str):
 def test_a_scene_is_compiled_once_and_is_the_same_bytes_again(robot: str, task: str):
     scene = build_scene(robot, task)
     assert build_scene(robot, task) is scene
-    assert _build.__wrapped__(robot, task, "", DT_SIM).model_bytes() == scene.model_bytes()
+    assert _build.__wrapped__(get_robot(robot), task, "", DT_SIM).model_bytes() == scene.model_bytes()
 
 
 def test_no_two_scenes_are_the_same_model():

@@ -152,7 +152,7 @@ def test_extents_are_the_lengths_along_a_things_own_axes(shape: str):
 
 
 def test_a_shape_that_nobody_grasps_is_refused():
-    with pytest.raises(ManipError, match="expected a box, sphere, cylinder or capsule"):
+    with pytest.raises(ManipError, match="expected a box, cylinder, sphere or capsule"):
         extents(int(mujoco.mjtGeom.mjGEOM_MESH), np.ones(3))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from manip_il.collect import environments
+from manip_il.collect.drivers import driver_of
 from manip_il.collect.environments import env_fingerprint, env_spec, positions
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
@@ -101,7 +102,7 @@ def test_the_last_rung_holds_everywhere(robot: str, task: str):
 def test_every_rung_of_the_ladder_occurs(task: str):
     seen = set[str]()
     for driver, conditions, horizon in (("expert", (), 0), ("expert", (STANDARD,), 120), ("random", (), 45)):
-        job = RolloutJob(EnvConfig("panda", task, horizon=horizon), driver, hold=2, conditions=conditions)
+        job = RolloutJob(EnvConfig("panda", task, horizon=horizon), driver_of(driver), hold=2, conditions=conditions)
         for episode in job.run(SEEDS):
             seen |= {phases(TASKS[task])[phase] for phase in set(episode.columns[EXPERT_PHASE].ravel().tolist())}
     missing = {rung.name for rung in TASKS[task].rungs} - seen
