@@ -98,14 +98,17 @@ class RayCluster:
         return self._folders[folder]
 
 
-# Deaths are counted by the engine: Ray itself is to try once.
-@ray.remote(num_cpus=1, max_retries=0)
-def _run_remote(version: str, job: Job, files: Files | None, seeds: Seeds, journal: Journal | None) -> bytes:
-    """Return the packed answer. Raises `ManipError` on a node with another version of the program."""
+def run_there(version: str, job: Job, files: Files | None, seeds: Seeds, journal: Journal | None) -> bytes:
+    """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
     return packed(run_seeds(job if files is None else job.with_files(_unpack(files)), seeds, journal, store=False))
+
+
+# Deaths are counted by the engine: Ray itself is to try once. Its function keeps a name of its own, so that what is
+# sent is the name and a node runs the function that it has, else the version would be this process's everywhere.
+_run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
 
 
 def packed(answer: Answer) -> bytes:

@@ -96,8 +96,24 @@ def test_a_node_that_is_killed_costs_no_episode(cluster, tmp_path, expected):
 STUBS = {"No module named 'manip_il": None, "has manip_il 0.0.0, not": '__version__ = "0.0.0"'}
 
 
+@ray.remote(num_cpus=1)
+def sleep() -> None:
+    time.sleep(600)
+
+
+@pytest.fixture
+def only_new_nodes(cluster) -> Iterator[None]:
+    """The nodes that are there have something else to do."""
+    busy = [sleep.remote() for _ in range(2)]
+    while ray.available_resources().get("CPU", 0):
+        time.sleep(0.1)
+    yield
+    for reference in busy:
+        ray.cancel(reference, force=True)
+
+
 @pytest.mark.parametrize("words", STUBS)
-def test_a_node_with_another_version_is_one_line(cluster, tmp_path, monkeypatch, words: str):
+def test_a_node_with_another_version_is_one_line(cluster, only_new_nodes, tmp_path, monkeypatch, words: str):
     """Or without the program."""
     package = tmp_path / "stub" / "manip_il"
     package.mkdir(parents=True)
@@ -106,9 +122,11 @@ def test_a_node_with_another_version_is_one_line(cluster, tmp_path, monkeypatch,
     monkeypatch.setenv("PYTHONPATH", str(package.parent))
     node = cluster.add_node(num_cpus=4)
     cluster.wait_for_nodes()
-    with Engine(6, "ray") as engine, pytest.raises(ManipError, match=words) as caught:
-        list(engine.run(JOB, SEEDS))
-    cluster.remove_node(node)
+    try:
+        with Engine(6, "ray") as engine, pytest.raises(ManipError, match=words) as caught:
+            list(engine.run(JOB, SEEDS))
+    finally:
+        cluster.remove_node(node)
     assert "\n" not in str(caught.value)
 
 
