@@ -1,14 +1,12 @@
 """Check what is read from outside (JSON, YAML, names that become paths, numbers, text) where its type is made.
 
 Every check returns the value with its declared type, or raises `ManipError` with one short line that names the thing,
-its value and what was expected. Values are printed shortened, so that a hostile one can neither flood a terminal nor
-take time to print.
+its value, shortened, and what was expected. `in_child` opens what arrives from outside.
 """
 
 from __future__ import annotations
 
 import errno
-import functools
 import json
 import math
 import os
@@ -29,15 +27,11 @@ from manip_il.errors import ManipError, UsageError
 LONGEST_NAME = 100  # [characters]
 LONGEST_TEXT = 10_000  # [characters]
 LARGEST_JSON = 256 * 1024 * 1024  # [bytes]; an eval.json of half a million episodes
-LARGEST_YAML = 256 * 1024  # [bytes]: the parser takes a second for 100 kB
-DEEPEST_YAML = 50  # levels
-LONGEST_INTEGER = 1_000  # in YAML [characters]
 LARGEST_SEED = 2**63 - 1  # datasets store seeds as int64
 MEMORY_IN_CHILD = 4 * 1024**3  # [bytes]
 SECONDS_IN_CHILD = 120.0
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_.\-]*")
-_LONGEST_WHY = 300  # of a parser's message [characters]
 _LONGEST_PRINTED = 300  # [characters]
 _LONGEST_MESSAGE = 1_000  # [characters]
 _REFUSED, _OUT_OF_MEMORY = 3, 4  # exit codes of a child process
@@ -107,7 +101,8 @@ def whole(what: str, value: object, low: int, high: int) -> int:
 
 def number(what: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
     """Return a finite float within [low, high]."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and _is_float(value):
+    most = sys.float_info.max  # beyond it an int is no float
+    if isinstance(value, int | float) and not isinstance(value, bool) and max(low, -most) <= value <= min(high, most):
         return float(value)
     limits = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
     raise ManipError(f"{what} is {shorten(value)}; expected a finite number{limits}")
@@ -132,17 +127,52 @@ def parse_json(what: str, data: str | bytes, *, nan_is_none: bool = False) -> An
 
     nan_is_none: NaN and Infinity are read as None instead.
     """
+
+    def other(constant: str) -> None:
+        if not nan_is_none:
+            raise ValueError(f"{constant} is not a number in JSON")
+
     try:
-        return json.loads(data, parse_constant=_to_none if nan_is_none else _refuse_constant)
+        return json.loads(data, parse_constant=other)
     except RecursionError as error:
         raise ManipError(f"{what} is not valid JSON: it is nested too deeply") from error
     except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are
         raise ManipError(f"{what} is not valid JSON: {error}") from error
 
 
-def read_json(path: Path, what: str, largest: int = LARGEST_JSON) -> dict[str, Any]:
+def read_json(path: Path, what: str, largest: int = LARGEST_JSON, *, nan_is_none: bool = False) -> dict[str, Any]:
     """Return the object in a JSON file of at most `largest` bytes. what: the file should be, for the message."""
-    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest)))
+    return mapping(str(path), parse_json(str(path), read_bytes(path, what, largest), nan_is_none=nan_is_none))
+
+
+def parse_yaml(text: str) -> Any:
+    """Return what a YAML text holds, by the safe loader. Raises `ValueError`, in one line, for what is none."""
+    import yaml  # here, as most of what checks something reads no YAML
+
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # besides its own errors it raises whatever int() or datetime() do
+        raise ValueError(one_line(error)) from error
+
+
+def read_yaml(path: Path, what: str) -> Any:
+    """Return what is in a file; `UsageError` if it cannot be read. what: the file should be, for the message."""
+    try:
+        return parse_yaml(read_bytes(path, what, LARGEST_JSON, UsageError).decode())
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise UsageError(f"{path} is not YAML: {error}") from error
+
+
+def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
+    """Return a regular file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
+    try:
+        with open(open_regular(path), "rb") as file:
+            data = file.read(largest + 1)
+    except OSError as error:
+        raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
+    if len(data) > largest:
+        raise refusal(f"{path} has more than {largest} bytes; expected {what}")
+    return data
 
 
 def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
@@ -151,19 +181,17 @@ def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
     A file opened for writing is not reached through a link, which could lead to any other file. Raises `OSError` as
     `os.open` does, with the reason "not a regular file" for another kind.
     """
-    writes = flags & (os.O_WRONLY | os.O_RDWR)
-    late = flags & os.O_TRUNC  # only once it is known to be a regular file
-    wanted = (flags & ~late) | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_NOFOLLOW if writes else 0)
+    no_link = os.O_NOFOLLOW if flags & (os.O_WRONLY | os.O_RDWR) else 0
     try:
-        handle = os.open(path, wanted, 0o666)
+        handle = os.open(path, flags & ~os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC | no_link, 0o666)
     except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO) and os.path.lexists(path):
+        if error.errno in (errno.ELOOP, errno.ENXIO):  # a link, or a pipe that nobody reads
             raise OSError(error.errno, "not a regular file", str(path)) from None
         raise
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
         raise OSError(errno.EINVAL, "not a regular file", str(path))
-    if late:
+    if flags & os.O_TRUNC:  # only once it is known to be a regular file
         os.ftruncate(handle, 0)
     return handle
 
@@ -213,79 +241,3 @@ def answer_parent() -> None:
         sys.stdout.flush()
         os._exit(_REFUSED)
     os._exit(0)
-
-
-def read_bytes(path: Path, what: str, largest: int, refusal: type[ManipError] = ManipError) -> bytes:
-    """Return a regular file's content; raises `refusal` for more than `largest` bytes and for what cannot be read."""
-    try:
-        with open(open_regular(path), "rb") as file:
-            data = file.read(largest + 1)
-    except OSError as error:
-        raise refusal(f"cannot read {path}: {error.strerror}; expected {what}") from error
-    if len(data) > largest:
-        raise refusal(f"{path} has more than {largest} bytes; expected {what}")
-    return data
-
-
-def _is_float(value: float) -> bool:
-    """Whether a number is finite and no int beyond what a float holds."""
-    return abs(value) <= sys.float_info.max
-
-
-def _to_none(constant: str) -> None:
-    return None
-
-
-def _refuse_constant(constant: str) -> Any:
-    raise ValueError(f"{constant} is not a number in JSON")
-
-
-def parse_yaml(text: str) -> Any:
-    """Return what a YAML text holds. Raises `ValueError`, in one line, for what is none, has aliases or is too deep."""
-    import yaml  # here, as most of what checks something reads no YAML
-
-    try:
-        return yaml.load(text, _loader())
-    except Exception as error:  # besides its own errors it raises whatever int() or datetime() do
-        raise ValueError(" ".join(str(error).split())[:_LONGEST_WHY]) from error
-
-
-def read_yaml(path: Path, what: str) -> Any:
-    """Return what is in a file; `UsageError` where it cannot be read. what: the file should be, for the message."""
-    data = read_bytes(path, what, LARGEST_YAML, UsageError)
-    try:
-        return parse_yaml(data.decode())
-    except ValueError as error:  # UnicodeDecodeError is one
-        raise UsageError(f"{path} is not YAML: {error}") from error
-
-
-@functools.cache
-def _loader() -> Any:
-    """Return a loader without tags that run code, and without aliases, which can grow beyond any memory."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        _depth = 0
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.AliasEvent):
-                raise yaml.YAMLError(
-                    f"an alias (*) in line {self.peek_event().start_mark.line + 1}; write the value out"
-                )
-            self._depth += 1
-            if self._depth > DEEPEST_YAML:
-                raise yaml.YAMLError(f"nested deeper than {DEEPEST_YAML} levels")
-            node = super().compose_node(parent, index)
-            self._depth -= 1
-            return node
-
-        def construct_yaml_int(self, node: Any) -> int:
-            if len(node.value) > LONGEST_INTEGER:  # such a one could be read, and not printed
-                raise yaml.YAMLError(
-                    f"a number of {len(node.value)} characters in line {node.start_mark.line + 1}; expected at most "
-                    f"{LONGEST_INTEGER}"
-                )
-            return super().construct_yaml_int(node)
-
-    Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
-    return Loader

@@ -1,29 +1,16 @@
 """Errors that explain themselves: the thing, its value, what was expected, what to do next.
 
-The command line turns every `ManipError` into one line on standard error and its `exit_code`. LeRobot's warning of
-missing FFmpeg libraries becomes one line, too.
+The command line turns every `ManipError` into one line on standard error and its `exit_code`.
 """
 
 from __future__ import annotations
 
 import difflib
-import functools
-import sys
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import logging
 
 _FEW = 3  # names that an error offers
 _BEGINNING = 3  # characters of a name that tell it from others
 _LONGEST_NAME = 200  # [characters] of a name that is compared or printed
-_LOGGER = "lerobot.utils.import_utils"  # logs a traceback of 90 lines where torchcodec finds no FFmpeg
-_MARK = "'torchcodec' is installed but cannot be loaded"
-NO_FFMPEG = (
-    "manip-il: warning: FFmpeg's shared libraries are missing, so LeRobot reads videos with PyAV (slower); on Debian: "
-    "apt-get install -y ffmpeg"
-)
 
 
 class ManipError(Exception):
@@ -137,20 +124,8 @@ def shorten(text: str) -> str:
     return repr(text if len(text) <= _LONGEST_NAME else f"{text[:_LONGEST_NAME]}...")
 
 
-def shorten_ffmpeg_warning() -> None:
-    """Replace LeRobot's warning of missing FFmpeg libraries by one line; a second call changes nothing."""
+def silence_ffmpeg_warning() -> None:
+    """Silence LeRobot's page of warning of missing FFmpeg libraries: pictures are read with PyAV, which has its own."""
     import logging  # here, as help needs none
 
-    logging.getLogger(_LOGGER).addFilter(_passes)
-
-
-def _passes(record: logging.LogRecord) -> bool:
-    if _MARK not in record.getMessage():
-        return True
-    _print_once()
-    return False
-
-
-@functools.cache
-def _print_once() -> None:
-    print(NO_FFMPEG, file=sys.stderr, flush=True)  # as every other warning of ours, whatever handlers there are
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)

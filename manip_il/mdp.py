@@ -112,8 +112,7 @@ class Transition:
     """One control step of one episode: all of a dataset's frame.
 
     `state`, `observation` and `progress` are from before the step; `reward`, `success`, `done` from after it.
-    `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame, and there
-    `final` is the observation after it.
+    `success` is: within the tolerance for the required steps in a row, now. `done` marks the last frame.
     """
 
     seed: int
@@ -127,7 +126,6 @@ class Transition:
     success: bool
     done: bool
     progress: float = 0.0
-    final: Observation | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +133,15 @@ class Episode:
     """A finished episode as columns, keyed as the dataset is (without LeRobot's own index columns).
 
     columns: name -> array (T, ...). seed: the episode's own. success: held the goal for the required steps in a row
-    at some time. success_at_end: within the tolerance for the required steps at the last frame. final: the
-    observation after every frame that is `next.done`, in order, so that algorithms can bootstrap; empty where none was
-    made. instruction: its text for policies that read language; empty where it is that of the task. drawn: how its
-    world differed from the nominal one, plain JSON values by the names of their ranges.
+    at some time. success_at_end: within the tolerance for the required steps at the last frame. instruction: its
+    text for policies that read language; empty if it is that of the task. drawn: how its world differed from the
+    nominal one, plain JSON values by the names of their ranges.
     """
 
     seed: int
     columns: dict[str, NDArray[np.generic]]
     success: bool
     success_at_end: bool
-    final: tuple[Observation, ...] = ()
     instruction: str = ""
     drawn: Mapping[str, Any] = field(default_factory=dict)
 
@@ -168,7 +164,7 @@ class Episode:
         }
         if len(columns) == len(self.columns):
             return self
-        return replace(self, columns=columns, final=tuple(replace(one, images={}) for one in self.final))
+        return replace(self, columns=columns)
 
 
 def require_finite(what: str, values: NDArray[np.generic]) -> None:

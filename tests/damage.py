@@ -13,13 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from manip_il.data import lerobot_layout as layout
-from manip_il.doctor.examine import examine_folder
 
 DATA = layout.DATA_PATH.format(chunk_index=0, file_index=0)
 EPISODES = layout.EPISODES_PATH.format(chunk_index=0, file_index=0)
 
 
 def lines(root: Path) -> list[str]:
+    from manip_il.doctor.examine import examine_folder
+
     return [str(finding) for finding in examine_folder(root)]
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manip_il import checks
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -116,3 +116,18 @@ def test_a_child_process_is_bounded_and_its_refusal_comes_home(monkeypatch: pyte
     monkeypatch.setattr(checks, "SECONDS_IN_CHILD", 0.5)
     with pytest.raises(ManipError, match=r"x\.xml took more than 0\.5 s"):
         checks.in_child("x.xml", time.sleep, 30)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: !!python/object/apply:os.getcwd []", "2001-99-99", "9" * 5_000, "a: [", "\0", b"a: \xff", "[" * 100_000],
+)
+def test_what_is_no_sound_yaml_is_refused_in_a_line(tmp_path: Path, text: str | bytes):
+    path = tmp_path / "c.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(UsageError, match="is not YAML") as error:
+        checks.read_yaml(path, "a YAML file of options")
+    assert len(str(error.value)) < 1_500
+    assert "\n" not in str(error.value)
+    path.write_text("a: [1, 2.5, yes, null, '*b']")
+    assert checks.read_yaml(path, "a YAML file") == {"a": [1, 2.5, True, None, "*b"]}

@@ -160,11 +160,11 @@ def _dispatch(words: list[str]) -> None:
         options = parse(load(name), words, command=name)
         if hasattr(options, "check"):
             options.check()
-        from manip_il.errors import shorten_ffmpeg_warning
+        from manip_il.errors import silence_ffmpeg_warning
         from manip_il.sim.gl import require_known_backend
 
         require_known_backend()
-        shorten_ffmpeg_warning()
+        silence_ffmpeg_warning()
         options.run()
 
 

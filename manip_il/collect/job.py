@@ -160,8 +160,7 @@ def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, bra
 
 
 def _without_pictures(transition: Transition) -> Transition:
-    final = replace(transition.final, images={}, keypoints={}) if transition.final else None
-    return replace(transition, observation=replace(transition.observation, images={}, keypoints={}), final=final)
+    return replace(transition, observation=replace(transition.observation, images={}, keypoints={}))
 
 
 @lru_cache(SCENES_KEPT)

@@ -18,8 +18,7 @@ from manip_il.collect.rollout import Labeller
 from manip_il.collect.source import Source
 from manip_il.data import schema
 from manip_il.data.build import dataset_sha256
-from manip_il.data.lerobot_write import own_file
-from manip_il.data.rewrite import rewrite_columns
+from manip_il.data.lerobot_write import rewrite_columns
 from manip_il.mdp import Episode, State
 from manip_il.sim.config import EnvConfig
 
@@ -78,10 +77,10 @@ def relabel_dataset(
     simulated = {key: value for key, value in source.dataset.fingerprint.items() if key.endswith("_sha256")}
     fingerprint = {**env_fingerprint(source.env), **simulated}
     provenance = {**source.dataset.provenance, "relabelled": origin}
-    about = own_file(repo_id, source.spec, fingerprint, provenance)
+    about: dict[str, Any] = {"repo_id": repo_id, "fingerprint": fingerprint, "replace": replace}
     episodes = source.dataset.read_episodes(pictures=False)
     with closing(map_in_order(partial(_label_episode, source.env), episodes, workers)) as found:
-        rewrite_columns(source.root, target, relabelled(), about, replace=replace)
+        rewrite_columns(source.dataset, target, relabelled(), provenance, **about)
     return changes
 
 

@@ -49,7 +49,7 @@ def render_dataset(
     spec = dataclasses.replace(source.spec, cameras=cameras.names, image_size=cameras.size, keypoints=names)
     fingerprint = {**source.dataset.fingerprint, "cameras_sha256": look}
     rendered = {"from": source.root.name, "cameras": dataclasses.asdict(cameras)}
-    states = source.dataset.read_episodes(pictures=False)
+    states = (one.without_pictures() for one in source.dataset.read_episodes(pictures=False))
     with (
         new_dataset(target, spec, repo_id=repo_id, fingerprint=fingerprint, replace=replace) as writer,
         closing(render_episodes(states, source.env, cameras, workers, source.conditions)) as episodes,

@@ -241,5 +241,4 @@ def _advance(slot: _Slot, rules: Rules) -> Transition:
         success=solved,
         done=done,
         progress=slot.turn.progress,
-        final=slot.env.observe() if done else None,
     )

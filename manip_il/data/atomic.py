@@ -57,8 +57,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     """Give an empty sibling of `root` to write into; on leaving, sync it to disk and rename it to `root`.
 
     An exception removes the sibling; what a killed writer left of one is removed by the next writer.
-    Raises `FolderExistsError` where `root` holds something, before and after; with `replace` that stays until the
-    new folder is whole, and is removed then. Raises `WriteError` where the disk is full or read-only.
+    Raises `FolderExistsError` if `root` holds something, before and after; with `replace` that stays until the
+    new folder is whole, and is removed then. Raises `WriteError` if the disk is full or read-only.
     """
     root = root.absolute()
     if not (replace and root.is_dir()):
@@ -66,7 +66,9 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
     with writing(root):
         root.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(root)
-        partial, lock = _held_sibling(root)
+        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
+    lock = os.open(partial, os.O_RDONLY)
+    try_lock(lock)  # the kernel lets go when the writer dies: so leftovers are known
     try:
         partial.chmod(0o777 & ~umask())
         with writing(root):
@@ -77,7 +79,8 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
             _exchange(partial, root)
             shutil.rmtree(partial, ignore_errors=True)
         else:
-            _rename(partial, root)
+            _refuse_full(root)
+            partial.rename(root)
         sync(root.parent)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -86,79 +89,29 @@ def new_folder(root: Path, *, replace: bool = False) -> Generator[Path]:
         os.close(lock)
 
 
-def _held_sibling(root: Path) -> tuple[Path, int]:
-    """Make a hidden folder beside `root`; return it and its descriptor, which holds it.
-
-    One that another writer took for a leftover, before it was held, is made again.
-    """
-    while True:
-        partial = Path(tempfile.mkdtemp(prefix=f".{root.name}.", suffix=PARTIAL, dir=root.parent))
-        with contextlib.suppress(FileNotFoundError):
-            lock = os.open(partial, os.O_RDONLY)
-            with contextlib.suppress(OSError):  # a network file system may know no locks; then leftovers stay
-                fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel lets go when the writer dies: so leftovers are known
-            if partial.is_dir():
-                return partial, lock
-            os.close(lock)
-
-
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Generator[None]:
     """Hold `folder`, which need not exist, for this process; others see a file `.<name>.lock` beside it.
 
-    Where nothing may be written beside it (a container's volume), the folder itself is what is held. Raises
-    `FolderBusyError`, with the holder's process id, where another process holds it. The kernel lets go of what a killed
-    process held.
+    If nothing may be written beside it (a container's volume), it is not held. Raises `FolderBusyError`, with the
+    holder's process id, if another process holds it. The kernel lets go of what a killed process held.
     """
-    folder = folder.absolute()
-    path = folder.with_name(f".{folder.name}.lock")
+    path = folder.absolute().with_name(f".{folder.absolute().name}.lock")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+    handle = None
     try:
         handle = _lock(folder, path)
     except OSError as error:
         if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS) or not folder.is_dir():
             with writing(path):
                 raise
-        with descriptor(folder, os.O_RDONLY | os.O_DIRECTORY) as itself:
-            if not try_lock(itself):
-                raise FolderBusyError(folder, "unknown") from None
-            yield
-        return
     try:
-        with writing(path):
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
-        path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
-        os.close(handle)
-
-
-@contextlib.contextmanager
-def descriptor(path: Path, flags: int = os.O_RDONLY) -> Generator[int]:
-    """Give the descriptor of a file or folder, and close it on leaving. For writing it must be a regular file."""
-    handle = (
-        checks.open_regular(path, flags) if flags & (os.O_WRONLY | os.O_RDWR) else os.open(path, flags | os.O_NONBLOCK)
-    )
-    try:
-        yield handle
-    finally:
-        os.close(handle)
-
-
-def try_lock(handle: int, kind: int = fcntl.LOCK_EX) -> bool:
-    """Lock an open file or folder until it is closed; return False where another process holds it.
-
-    True also on a network file system that knows no locks.
-    """
-    try:
-        fcntl.flock(handle, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass
-    return True
+        if handle is not None:
+            path.unlink(missing_ok=True)  # while it is held, so that nobody else's is removed
+            os.close(handle)
 
 
 def _lock(folder: Path, path: Path) -> int:
@@ -169,8 +122,24 @@ def _lock(folder: Path, path: Path) -> int:
             os.close(handle)
             raise FolderBusyError(folder, holder or "unknown")
         if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
             return handle
         os.close(handle)  # its last holder removed it meanwhile: take the new one
+
+
+def try_lock(handle: int) -> bool:
+    """Lock an open file or folder until it is closed; return False if another process holds it.
+
+    True also on a network file system that knows no locks.
+    """
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -196,16 +165,11 @@ def write_file(path: Path, data: bytes) -> None:
 
 def sync(path: Path) -> None:
     """Have the disk hold a file's content, or a folder's list of names."""
-    with descriptor(path) as handle:
-        os.fsync(handle)
-
-
-def _rename(partial: Path, root: Path) -> None:
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        partial.rename(root)
-    except OSError:
-        _refuse_full(root)
-        raise
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _exchange(left: Path, right: Path) -> None:
@@ -224,9 +188,10 @@ def _refuse_full(root: Path) -> None:
 
 def _remove_leftovers(root: Path) -> None:
     for partial in root.parent.glob(f".{root.name}.*{PARTIAL}"):
-        with contextlib.suppress(OSError), descriptor(partial, os.O_RDONLY | os.O_DIRECTORY) as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # refused while its writer lives
+        lock = os.open(partial, os.O_RDONLY)
+        if try_lock(lock):  # refused while its writer lives
             shutil.rmtree(partial, ignore_errors=True)
+        os.close(lock)
 
 
 def umask() -> int:

@@ -8,7 +8,6 @@ import itertools
 import json
 import logging
 import re
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
@@ -17,13 +16,13 @@ from typing import Any
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
-from manip_il.data.atomic import new_folder, write_file
+from manip_il.data.atomic import write_file
 from manip_il.data.dataset import UNKNOWN_TASK, Dataset
 from manip_il.data.episodes import Selection
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import Header, list_episodes, read_journal
-from manip_il.data.lerobot_write import DatasetWriter, new_dataset, own_file, write_dataset
+from manip_il.data.lerobot_write import DatasetWriter, new_dataset
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
@@ -31,7 +30,6 @@ from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 RECORDING = "recording.json"
-_LARGEST = 16 * 1024 * 1024  # of a recording.json [bytes]
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,6 @@ class Recording:
     labels: at most so many valid ones; after the last one `label_valid` is 0, episodes beyond it are left out.
     provenance: who drove, for the dataset's own. video: how pictures are compressed, as `VideoConfig` has it. stills:
     they are PNGs in the data files, for frames that have nothing to do with each other.
-    Raises `ManipError` naming what is wrong.
     """
 
     repo_id: str
@@ -54,16 +51,6 @@ class Recording:
     only_labelled: bool = False
     labels: int | None = None
     stills: bool = False
-
-    def __post_init__(self) -> None:
-        checks.repo_id("repo_id", self.repo_id)
-        for what in ("only_successes", "only_labelled", "stills"):
-            checks.truth(what, getattr(self, what))
-        for what in ("episodes", "labels"):
-            if getattr(self, what) is not None:
-                checks.whole(what, getattr(self, what), 0, checks.LARGEST_SEED)
-        checks.mapping("provenance", self.provenance)
-        VideoConfig.from_json(self.video)
 
     def selection(self) -> Selection:
         """Return its rules, with nothing taken yet."""
@@ -87,14 +74,10 @@ class Recording:
         path = journals / RECORDING
         if not path.is_file():
             return cls(local_id(journals.absolute().name.removesuffix(".journals") or "journals"))
-        data = checks.read_json(path, "what a recording's journals become", _LARGEST)
+        data = checks.read_json(path, "what a recording's journals become")
         known = {one.name: data[one.name] for one in fields(cls) if one.name in data}
-        if "repo_id" not in known:
-            raise ManipError(f"{path} lacks repo_id; expected what `manip-il record` writes")
-        try:
-            return cls(**known)
-        except ManipError as error:
-            raise ManipError(f"{path}: {error}") from error
+        checks.repo_id(f"{path}: repo_id", known.get("repo_id"))
+        return cls(**known)
 
 
 def local_id(folder: str) -> str:
@@ -157,10 +140,9 @@ def merge_datasets(
 ) -> DatasetInfo:
     """Merge the episodes of several datasets, in order, into one: equal to `write_dataset` of them.
 
-    The fingerprint is the first one's unless given; where theirs differ, a warning is logged. The provenance names the
-    sources and theirs, beside what is given. Datasets with cameras are joined by LeRobot, which copies their videos;
-    its statistics of pictures are approximate. One of them alone is copied as it is. Raises `MismatchError` naming both
-    sides where the specs differ.
+    The fingerprint is the first one's unless given; if theirs differ, a warning is logged. The provenance names the
+    sources and theirs, beside what is given. Films are copied. Raises `MismatchError` naming both sides if the specs
+    differ.
     """
     if not roots:
         raise ManipError("no datasets to merge")
@@ -172,13 +154,12 @@ def merge_datasets(
             _LOG.warning("%s", warning)
     sources = [{"name": one.root.name, "provenance": dict(one.provenance)} for one in opened]
     spec = next((spec for spec in specs if spec.task != UNKNOWN_TASK), specs[0])
-    origin = {**(provenance or {}), "merged": sources}
-    fingerprint = first if fingerprint is None else fingerprint
-    if any(one.cameras for one in opened):
-        about = own_file(repo_id, spec, fingerprint, origin)
-        return _copy(roots[0], root, about) if len(roots) == 1 else _join_by_lerobot(roots, root, repo_id, about)
-    episodes = itertools.chain.from_iterable(one.read_episodes() for one in opened)
-    return write_dataset(episodes, root, spec, repo_id=repo_id, fingerprint=fingerprint, provenance=origin)
+    films = bool(spec.cameras and spec.video)
+    with new_dataset(root, spec, repo_id=repo_id, fingerprint=first if fingerprint is None else fingerprint) as writer:
+        for one in opened:
+            for number, episode in enumerate(one.read_episodes(pictures=not films)):
+                writer.add(episode, (one, number) if films else None)
+        return writer.finish({**(provenance or {}), "merged": sources})
 
 
 def dataset_sha256(root: Path) -> str:
@@ -188,28 +169,6 @@ def dataset_sha256(root: Path) -> str:
         with open(checks.open_regular(path), "rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
-
-
-def _copy(source: Path, root: Path, about: Mapping[str, Any]) -> DatasetInfo:
-    """Copy files with their times of change, by which decoded pictures are found again."""
-    Dataset.open(source)
-    with new_folder(root) as folder:
-        shutil.copytree(source, folder, dirs_exist_ok=True)
-        layout.write_json(folder / layout.OURS, about)
-    return Dataset.open(root).summary
-
-
-def _join_by_lerobot(roots: Sequence[Path], root: Path, repo_id: str, about: Mapping[str, Any]) -> DatasetInfo:
-    from manip_il.data.lerobot_library import join_datasets  # imports torch
-
-    with new_folder(root) as folder:
-        work = folder / root.name  # LeRobot makes its folder itself
-        join_datasets(roots, work, repo_id)
-        for path in list(work.iterdir()):
-            path.rename(folder / path.name)
-        work.rmdir()
-        layout.write_json(folder / layout.OURS, about)
-    return Dataset.open(root).summary
 
 
 def _check_mergeable(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:

@@ -20,15 +20,15 @@ from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
 from manip_il.data.camera import Camera
-from manip_il.data.episode_table import EpisodeTable, read_episode_table
-from manip_il.data.info import NUMBERS, DatasetInfo, Feature, Info, InvalidInfo, read_info
+from manip_il.data.episode_table import EpisodeTable, read_episode_table, read_picture_statistics
+from manip_il.data.info import NUMBERS, DatasetInfo, Feature, Info, read_info
 from manip_il.data.parquet_files import UNREADABLE, BadColumn, read_file, read_tasks, to_numpy
 from manip_il.data.statistics import Statistics, column_statistics, read_statistics
 from manip_il.errors import ManipError, UnknownName, UsageError
 from manip_il.mdp import Episode
 
 UNKNOWN_TASK = UNKNOWN_ROBOT = "unknown"
-_SEE_CHECK = "run `manip-il doctor` to see what is wrong"
+_SEE_CHECK = "run `manip-il data check` to see what is wrong"
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,8 @@ class Dataset:
     def open(cls, root: Path) -> Dataset:
         """Open a folder. Raises `ManipError` for one that is no dataset, or that holds pipes, devices or sockets."""
         root = Path(root)
-        try:
-            info = read_info(root)
-        except InvalidInfo as error:
-            raise ManipError(str(error)) from None
-        for path in find_irregular(root):
-            raise ManipError(
-                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
-            )
+        info = read_info(root)
+        refuse_irregular(root)
         return cls(root, info)
 
     def __len__(self) -> int:
@@ -135,12 +129,7 @@ class Dataset:
     @cached_property
     def tasks(self) -> dict[int, str]:
         """The text of every `task_index`."""
-        try:
-            return dict(zip(*read_tasks(self.root), strict=True))
-        except UNREADABLE as error:
-            raise ManipError(
-                f"cannot read {self.root / layout.TASKS}: {checks.one_line(error)}; {_SEE_CHECK}"
-            ) from error
+        return read_tasks(self.root)
 
     @property
     def instruction(self) -> str:
@@ -150,20 +139,14 @@ class Dataset:
     @cached_property
     def episodes(self) -> EpisodeTable:
         """The rows of `meta/episodes`."""
-        try:
-            return read_episode_table(self.root, self.info)
-        except UNREADABLE as error:
-            raise ManipError(
-                f"cannot read meta/episodes of {self.root}: {checks.one_line(error)}; {_SEE_CHECK}"
-            ) from error
+        return read_episode_table(self.root, self.info)
 
     @cached_property
     def statistics(self) -> Statistics:
         """Statistics by column and name, (n,), of pictures (channels, 1, 1); computed if the dataset has none."""
         if (self.root / layout.STATS).exists():
-            return read_statistics(self.root, self.info)
-        numbers = [feature for feature in self.info.of_dtype(*NUMBERS) if feature.key in self.features]
-        return column_statistics({feature.key: self.columns([feature.key])[feature.key] for feature in numbers})
+            return read_statistics(self.root)
+        return column_statistics(self.columns())
 
     @cached_property
     def data_files(self) -> list[Path]:
@@ -198,6 +181,17 @@ class Dataset:
         """Return a camera's pictures of these rows (B,), decoded, (B, height, width, 3)."""
         return self.camera(key).rows(rows)
 
+    def clip(self, key: str, episode: int) -> tuple[Path, int, int]:
+        """Return where a camera's pictures of an episode are: a film, the first frame in it, and their number."""
+        clips, [place] = self.episodes.clips[key], np.flatnonzero(self.episodes.index == episode)[:1]
+        first = round(float(clips.starts[place]) * self.fps)
+        return self.root / clips.files[place], first, int(self.episodes.length[place])
+
+    @cached_property
+    def picture_statistics(self) -> list[Statistics]:
+        """Statistics of every episode's pictures, by camera."""
+        return read_picture_statistics(self.root, self.cameras)
+
     def rows_of(self, episode: int) -> NDArray[np.int64]:
         """Return the rows of an episode, (T,). Raises `UsageError` for one that is not there."""
         if not 0 <= episode < self.info.episodes:
@@ -209,11 +203,10 @@ class Dataset:
     def read_episodes(self, *, pictures: bool = True) -> Iterator[Episode]:
         """Yield the episodes of a dataset with this program's columns, in order, scalars as (T, 1) columns.
 
-        With pictures and their keypoints if wanted. An episode's success is what `next.success` has. One data file is
-        held at a time.
+        With pictures if wanted. An episode's success is what `next.success` has. One data file is held at a time.
         """
         cameras = {key: self.camera(key) for key in self.spec.image_keys} if pictures else {}
-        left_out = {} if pictures else self.spec.image_keys | self.spec.keypoint_keys
+        left_out = {} if pictures else self.spec.image_keys
         shapes = {key: one["shape"] for key, one in s.features(self.spec).items() if key not in left_out}
         stored = [key for key in shapes if key not in cameras]
         row = 0
@@ -318,9 +311,13 @@ def joined_columns(roots: Sequence[Path], names: Sequence[str]) -> dict[str, NDA
     return joined
 
 
-def find_irregular(root: Path) -> list[Path]:
-    """Return what a folder holds besides files and folders: pipes, devices, sockets and links to nothing."""
-    return sorted(path for path in root.rglob("*") if not (path.is_file() or path.is_dir()))
+def refuse_irregular(root: Path) -> None:
+    """Raise `ManipError` for a folder that holds anything besides files and folders."""
+    for path in root.rglob("*"):
+        if not (path.is_file() or path.is_dir()):
+            raise ManipError(
+                f"{path} is not a regular file; a dataset holds no pipes, devices, sockets or broken links"
+            )
 
 
 def _dtype(feature: Feature, values: NDArray[Any]) -> np.dtype[Any]:
@@ -330,4 +327,4 @@ def _dtype(feature: Feature, values: NDArray[Any]) -> np.dtype[Any]:
 
 def _episode(columns: dict[str, NDArray[Any]], text: str, drawn: Mapping[str, Any]) -> Episode:
     seed, solved = int(columns[s.SEED].flat[0]), columns[s.SUCCESS]
-    return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), (), text, drawn)
+    return Episode(seed, columns, bool(solved.any()), bool(solved[-1]), text, drawn)

@@ -6,24 +6,24 @@ keeps the column, its split and delete drop it; every frame's `sim_state` has th
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.info import Info
-from manip_il.data.parquet_files import BadColumn, Shard, find_shards, floats, integers
+from manip_il.data.parquet_files import UNREADABLE, BadColumn, floats, integers, read_file
+from manip_il.data.statistics import Statistics
+from manip_il.errors import ManipError
 
 I64, F64 = NDArray[np.int64], NDArray[np.float64]
-_WHOLE = ("length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
-_ROWS = 500  # held at once
 
 
 @dataclass(frozen=True)
@@ -53,104 +53,71 @@ class EpisodeTable:
 
 
 def read_episode_table(root: Path, info: Info) -> EpisodeTable:
-    """Read all files of `meta/episodes`. Raises one of `UNREADABLE`."""
-    shards = find_shards(root, layout.EPISODES_FILES)
-    if bad := next((shard for shard in shards if shard.problem), None):
-        raise BadColumn(f"{bad.name} {bad.problem}")
-    if not shards:
-        raise BadColumn(f"no file matches {layout.EPISODES_FILES}")
-    return concatenate([rows for shard in shards for rows in read_rows(shard, info)])
+    """Read all files of `meta/episodes`, but for statistics. Raises `ManipError` naming what cannot be read."""
+    paths = sorted(root.glob(layout.EPISODES_FILES))
+    if not paths:
+        raise ManipError(f"{root} has no episodes: no file matches {layout.EPISODES_FILES}")
+    try:
+        names = [[name for name in pq.read_schema(path).names if not name.startswith("stats/")] for path in paths]
+        tables = [read_file(path, wanted) for path, wanted in zip(paths, names, strict=True)]
+        return _parse(pa.concat_tables(tables, promote_options="permissive"), info)
+    except UNREADABLE as error:
+        raise ManipError(f"cannot read meta/episodes of {root}: {checks.one_line(error)}") from error
 
 
-def read_rows(shard: Shard, info: Info) -> Iterable[EpisodeTable]:
-    """Yield the rows of one file. Raises one of `UNREADABLE`."""
-    wanted = [name for name in shard.columns if not name.startswith("stats/")]
-    return (_parse(table, info) for table in shard.tables(wanted, _ROWS))
-
-
-def concatenate(parts: Sequence[Any]) -> Any:
-    """Join values of one type: arrays (T, ...), lists, tables of those by the same names, or dataclasses of them."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    if isinstance(first, np.ndarray):
-        return np.concatenate(parts)
-    if isinstance(first, list):
-        return [value for part in parts for value in part]
-    if isinstance(first, dict):
-        if all(part.keys() == first.keys() for part in parts):
-            return {key: concatenate([part[key] for part in parts]) for key in first}
-        return {key: value for part in parts for key, value in part.items()}
-    return type(first)(**concatenate([vars(part) for part in parts]))
-
-
-def drawn_text(drawn: Mapping[str, Any]) -> str:
-    """Return an episode's draws, by the names of their ranges, as JSON."""
-    return json.dumps(dict(drawn))
-
-
-def parse_drawn(what: str, text: Any) -> dict[str, Any]:
-    """Return the inverse of `drawn_text`; of no text nothing. Raises `ManipError` naming `what` for anything else."""
-    if text is None:  # as in the rows of a dataset that was merged with one that has none
-        return {}
-    return dict(checks.mapping(what, checks.parse_json(what, checks.text(what, text))))
-
-
-def summarise_drawn(drawn: Iterable[Mapping[str, Any]]) -> str:
-    """Return the ranges that numbers were drawn from, and what was drawn of words; the names alone of anything else."""
-    values: dict[str, list[Any]] = {}
-    for one in drawn:
-        for name, value in one.items():
-            values.setdefault(name, []).append(value)
-    return ", ".join(name + _span(found) for name, found in sorted(values.items()))
+def read_picture_statistics(root: Path, cameras: Sequence[str]) -> list[Statistics]:
+    """Return the statistics of every episode's pictures, of cameras by their column, as far as there are any."""
+    found: list[Statistics] = []
+    for path in sorted(root.glob(layout.EPISODES_FILES)):
+        names = {f"stats/{key}/{name}": (key, name) for key in cameras for name in layout.STAT_NAMES}
+        here = [name for name in pq.read_schema(path).names if name in names]
+        for row in read_file(path, [layout.EPISODE_INDEX, *here]).to_pylist():
+            own: Statistics = {}
+            for column in here:
+                key, name = names[column]
+                own.setdefault(key, {})[name] = np.array(row[column])
+            found.append(own)
+    return found
 
 
 def _parse(table: pa.Table, info: Info) -> EpisodeTable:
-    length, start, stop, chunk, file = (integers(table, name) for name in _WHOLE)
+    whole = ("length", "dataset_from_index", "dataset_to_index")
+    length, start, stop = (integers(table, name) for name in whole)
     index = integers(table, layout.EPISODE_INDEX)
+    tasks = table.column("tasks").to_pylist() if "tasks" in table.column_names else [[]] * len(table)
+    cameras = [feature.key for feature in info.of_dtype("video")]
     return EpisodeTable(
         index=index,
         length=length,
         start=start,
         stop=stop,
-        files=[_file_name(info.data_path, *place) for place in zip(chunk, file, strict=True)],
-        tasks=_texts(table),
-        clips={feature.key: _clips(table, info, feature.key) for feature in info.of_dtype("video")},
+        files=_files(table, "data", info.data_path),
+        tasks=[[str(text) for text in texts or []] for texts in tasks],
+        clips={key: _clips(table, info, key) for key in cameras},
         drawn=_drawn(table, index),
     )
 
 
+def _files(table: pa.Table, prefix: str, template: str, key: str = "") -> list[str]:
+    """The file that each row's `PREFIX/chunk_index` and `PREFIX/file_index` name."""
+    places = zip(integers(table, f"{prefix}/chunk_index"), integers(table, f"{prefix}/file_index"), strict=True)
+    return [template.format(chunk_index=int(chunk), file_index=int(file), video_key=key) for chunk, file in places]
+
+
 def _clips(table: pa.Table, info: Info, key: str) -> Clips:
-    chunk, file = (integers(table, f"videos/{key}/{name}") for name in ("chunk_index", "file_index"))
     starts, stops = (floats(table, f"videos/{key}/{name}") for name in ("from_timestamp", "to_timestamp"))
-    return Clips([_file_name(info.video_path, *place, key) for place in zip(chunk, file, strict=True)], starts, stops)
-
-
-def _file_name(template: str, chunk: int, file: int, key: str = "") -> str:
-    return template.format(chunk_index=int(chunk), file_index=int(file), video_key=key)
-
-
-def _texts(table: pa.Table) -> list[list[str]]:
-    if "tasks" not in table.column_names:
-        raise BadColumn("has no column 'tasks'")
-    rows = table.column("tasks").to_pylist()
-    if not all(isinstance(row, list) and all(isinstance(text, str) for text in row) for row in rows):
-        raise BadColumn("column 'tasks' does not hold lists of strings")
-    return rows
+    return Clips(_files(table, f"videos/{key}", info.video_path, key), starts, stops)
 
 
 def _drawn(table: pa.Table, index: I64) -> dict[int, dict[str, Any]]:
-    """What the episodes drew; none in datasets from before."""
+    """What the episodes drew; none in datasets from before, and in rows merged with those of such a dataset."""
     if layout.DRAWN not in table.column_names:
         return {}
-    texts = zip(index.tolist(), table.column(layout.DRAWN).to_pylist(), strict=True)
-    return {number: parse_drawn(f"{layout.DRAWN} of episode {number}", text) for number, text in texts}
-
-
-def _span(values: list[Any]) -> str:
-    if all(isinstance(value, str) for value in values):
-        return f" {' or '.join(sorted(set(values)))}"
-    if not all(isinstance(value, int | float) for value in values):
-        return ""
-    low, high = min(values), max(values)
-    return f" {low:.3g}" if low == high else f" {low:.3g} to {high:.3g}"
+    found: dict[int, dict[str, Any]] = {}
+    for number, text in zip(index.tolist(), table.column(layout.DRAWN).to_pylist(), strict=True):
+        what = f"{layout.DRAWN} of episode {number}"
+        try:
+            found[number] = {} if text is None else checks.mapping(what, checks.parse_json(what, text))
+        except ManipError as error:
+            raise BadColumn(str(error)) from error
+    return found

@@ -18,7 +18,7 @@ from manip_il.data import schema
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.journal import Header
 from manip_il.errors import MismatchError, NothingToLearnError
-from manip_il.mdp import Episode, Observation, Transition
+from manip_il.mdp import Episode, Transition
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,7 +73,6 @@ def to_episode(
         columns=columns,
         success=any(frame.success for frame in decides),
         success_at_end=decides[-1].success,
-        final=tuple(frame.final for frame in frames if frame.done and frame.final is not None),
         instruction=frames[0].observation.instruction,
     )
 
@@ -84,8 +83,7 @@ def parts(episode: Episode) -> list[Episode]:
     if len(ends) < 2:
         return [episode]
     starts = [0, *ends[:-1].tolist()]
-    finals = [(one,) for one in episode.final] if len(episode.final) == len(ends) else [()] * len(ends)
-    return [_part(episode, slice(*rows), final) for *rows, final in zip(starts, ends.tolist(), finals, strict=True)]
+    return [_part(episode, slice(*rows)) for rows in zip(starts, ends.tolist(), strict=True)]
 
 
 def count_labels(episode: Episode) -> int:
@@ -166,11 +164,11 @@ class Selection:
         self._labels += labels
 
 
-def _part(episode: Episode, rows: slice, final: tuple[Observation, ...]) -> Episode:
+def _part(episode: Episode, rows: slice) -> Episode:
     columns = {key: column[rows] for key, column in episode.columns.items()}
     solved = columns[schema.SUCCESS]
     ends = {"success": bool(solved.any()), "success_at_end": bool(solved[-1].any())}
-    return replace(episode, columns=columns, final=final, **ends)
+    return replace(episode, columns=columns, **ends)
 
 
 def _column(values: list[Any], dtype: type) -> NDArray[Any]:

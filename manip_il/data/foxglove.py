@@ -20,11 +20,14 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.reader import McapReader
-from mcap.records import Schema
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, Schema
+from mcap.records import Message as MessageRecord
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from manip_il.data import schema as s
 from manip_il.errors import ManipError
@@ -168,18 +171,22 @@ def add_channels(writer: Writer, channels: Sequence[Channel], times: Times) -> N
             writer.add_message(channel_id, time, message, time, frame)
 
 
-def read_images(reader: McapReader, cameras: Iterable[str], shape: tuple[int, ...]) -> dict[str, U8]:
+def read_images(chunks: Iterable[Chunk], shape: tuple[int, ...]) -> dict[str, U8]:
     """Return every camera's pictures as `images` wrote them; a camera without any is left out.
 
-    shape: of what each camera has, (T, height, width, 3).
+    chunks: of a file, in order. shape: of what each camera has, (T, height, width, 3).
     """
     pictures: dict[str, U8] = {}
-    for _, channel, message in reader.iter_messages([IMAGE_TOPICS + one for one in cameras], log_time_order=False):
-        camera = channel.topic.removeprefix(IMAGE_TOPICS)
-        if camera not in pictures:
-            pictures[camera] = np.empty(shape, np.uint8)
-        data = RawImage.FromString(message.data).data
-        pictures[camera][message.sequence] = np.frombuffer(data, np.uint8).reshape(shape[1:])
+    cameras: dict[int, str] = {}  # by the id of their channel
+    for record in (record for chunk in chunks for record in breakup_chunk(chunk)):
+        if isinstance(record, ChannelRecord) and record.topic.startswith(IMAGE_TOPICS):
+            cameras[record.id] = record.topic.removeprefix(IMAGE_TOPICS)
+        elif isinstance(record, MessageRecord) and record.channel_id in cameras:
+            camera = cameras[record.channel_id]
+            if camera not in pictures:
+                pictures[camera] = np.empty(shape, np.uint8)
+            data = RawImage.FromString(record.data).data
+            pictures[camera][record.sequence] = np.frombuffer(data, np.uint8).reshape(shape[1:])
     return pictures
 
 
@@ -224,31 +231,14 @@ def _rotations(frame: str, states: dict[str, F64]) -> F64:
     y_axis, z_axis = (f"rx{axis} ry{axis} rz{axis}".split() for axis in "yz")
     if all(f"{frame}.{name}" in states for name in y_axis + z_axis):
         y, z = (np.clip(_stack(states, frame, axis), -1, 1) for axis in (y_axis, z_axis))
-        return _quaternions(np.stack([np.cross(y, z), y, z], axis=2))
+        turned = Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=2))
+        return turned.as_quat(canonical=True, scalar_first=True)
     x = states[f"{frame}.x"]
     zero = np.zeros(len(x))
     if f"{frame}.cos4yaw" in states:
         yaw = np.arctan2(states[f"{frame}.sin4yaw"], states[f"{frame}.cos4yaw"]) / 4
         return np.stack([np.cos(yaw / 2), zero, zero, np.sin(yaw / 2)], axis=1)
     return np.stack([zero + 1, zero, zero, zero], axis=1)
-
-
-def _quaternions(rotation: NDArray[np.floating[Any]]) -> F64:
-    """Convert rotation matrices (T, 3, 3) to quaternions wxyz (T, 4).
-
-    The eigenvector of the largest eigenvalue: Bar-Itzhack (2000), New method for extracting the quaternion from a
-    rotation matrix, eq. 12; good for matrices that are rotations only nearly.
-    """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = rotation.reshape(-1, 9).T
-    rows = [
-        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-    ]
-    _, vectors = np.linalg.eigh(np.moveaxis(np.array(rows), 2, 0))
-    quaternion = vectors[:, :, -1]
-    return quaternion * np.where(quaternion[:, :1] < 0, -1.0, 1.0)
 
 
 def _stack(states: dict[str, F64], frame: str, names: str | list[str]) -> F64:

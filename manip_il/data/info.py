@@ -1,11 +1,9 @@
-"""Read `meta/info.json` of any LeRobot dataset and check it field by field."""
+"""Read `meta/info.json` of any LeRobot dataset."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -21,8 +19,8 @@ NUMBERS = (
 )
 INDEX_FEATURES = (layout.TIMESTAMP, layout.FRAME_INDEX, layout.EPISODE_INDEX, layout.INDEX, layout.TASK_INDEX)
 
-# LeRobot's placeholders alone: `str.format` would also read attributes
-_TEMPLATE = re.compile(r"(?:[^{}/]|/(?!/)|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
+# LeRobot's placeholders alone (`str.format` would also read attributes), and no way out of the dataset
+_TEMPLATE = re.compile(r"(?!/)(?!.*\.\.)(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0\dd)?)\})+")
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Info:
-    """Content of `meta/info.json`, checked."""
+    """Content of `meta/info.json`."""
 
     fps: float
     features: dict[str, Feature]
@@ -102,107 +100,48 @@ class DatasetInfo:
     success_at_end: int | None
 
 
-class InvalidInfo(ManipError):
-    """Raised for a `meta/info.json` that cannot be used. problems: all that is wrong with it, one line each."""
-
-    def __init__(self, root: Path, problems: list[str]):
-        super().__init__(f"{root}: {layout.INFO} {problems[0]}")
-        self.problems = problems
-
-
 def read_info(root: Path) -> Info:
-    """Read and check `meta/info.json` of a dataset. Raises `InvalidInfo`."""
-    try:
-        raw = read_object(root / layout.INFO)
-    except FileNotFoundError:
-        text = f"is missing: {root} is not a LeRobot dataset, or its recorder died before it wrote anything"
-        raise InvalidInfo(root, [text]) from None
-    except (OSError, ValueError) as problem:
-        raise InvalidInfo(root, [f"cannot be read: {problem}"]) from problem
+    """Read `meta/info.json` of a dataset.
+
+    Raises `ManipError` for a folder that has none, for another version, and for a value of the wrong type or a path
+    that leads out of the dataset.
+    """
+    path = root / layout.INFO
+    if not path.exists():
+        raise ManipError(f"{root} is not a LeRobot dataset: {layout.INFO} is missing")
+    raw = checks.read_json(path, "a dataset's description")
     version = raw.get("codebase_version")
     if version != layout.VERSION:
         older = "; LeRobot converts datasets of v2.1" if version == "v2.1" else ""
-        raise InvalidInfo(root, [f"codebase_version is {version!r}; expected {layout.VERSION!r}{older}"])
-    if problems := list(info_problems(raw)):
-        raise InvalidInfo(root, problems)
+        raise ManipError(f"{path}: codebase_version is {checks.shorten(version)}; expected {layout.VERSION!r}{older}")
+    features = checks.mapping(f"{path}: features", raw.get("features"))
     return Info(
-        fps=float(raw["fps"]),
-        features={key: _feature(key, value) for key, value in raw["features"].items()},
-        episodes=raw["total_episodes"],
-        frames=raw["total_frames"],
-        tasks=raw.get("total_tasks"),
-        robot=str(raw.get("robot_type") or ""),
-        data_path=raw.get("data_path", layout.DATA_PATH),
-        video_path=raw.get("video_path") or layout.VIDEO_PATH,
+        fps=checks.number(f"{path}: fps", raw.get("fps"), 1, 1e6),
+        features={key: _feature(path, key, value) for key, value in features.items()},
+        episodes=_count(f"{path}: total_episodes", raw.get("total_episodes")),
+        frames=_count(f"{path}: total_frames", raw.get("total_frames")),
+        tasks=None if raw.get("total_tasks") is None else _count(f"{path}: total_tasks", raw["total_tasks"]),
+        robot=checks.text(f"{path}: robot_type", raw.get("robot_type") or "", checks.LONGEST_NAME),
+        data_path=_template(f"{path}: data_path", raw.get("data_path") or layout.DATA_PATH),
+        video_path=_template(f"{path}: video_path", raw.get("video_path") or layout.VIDEO_PATH),
     )
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file. Raises `OSError`, or `ValueError` for any other content."""
-    try:
-        with open(checks.open_regular(path), "rb") as file:
-            data = json.load(file)
-    except RecursionError as problem:
-        raise ValueError("it is nested too deeply") from problem
-    if not isinstance(data, dict):
-        raise ValueError(f"it holds {type(data).__name__}; expected an object")
-    return cast(dict[str, Any], data)
+def _feature(path: Path, key: str, value: Any) -> Feature:
+    checks.name(f"{path}: a feature", key)  # folders and files are named by it
+    table = checks.mapping(f"{path}: feature {key}", value)
+    dtype = checks.text(f"{path}: dtype of {key}", table.get("dtype"), checks.LONGEST_NAME)
+    what = f"{path}: a size in the shape of {key}"
+    shape = tuple(_count(what, size) for size in checks.array(f"{path}: shape of {key}", table.get("shape")))
+    details = table.get("info") or table.get("video_info") or {}
+    return Feature(key, dtype, shape, table.get("names"), checks.mapping(f"{path}: info of {key}", details))
 
 
-def info_problems(raw: dict[str, Any]) -> Iterator[str]:
-    """Yield what is wrong with the file's content, one line each: values of wrong types, paths out of the dataset."""
-    fps: Any = raw.get("fps")
-    if type(fps) not in (int, float) or not 1 <= fps < 1e6:
-        yield f"fps is {checks.shorten(fps)}; expected a number of at least 1"
-    for key in ("total_episodes", "total_frames"):
-        if not _is_count(raw.get(key)):
-            yield f"{key} is {checks.shorten(raw.get(key))}; expected a count"
-    if not _is_count(raw.get("total_tasks", 0)):
-        yield f"total_tasks is {checks.shorten(raw['total_tasks'])}; expected a count"
-    robot: Any = raw.get("robot_type")
-    if robot is not None and (not isinstance(robot, str) or len(robot) > checks.LONGEST_NAME):
-        yield f"robot_type is {checks.shorten(robot)}; expected a name or null"
-    for key in ("data_path", "video_path"):
-        path: Any = raw.get(key) or layout.DATA_PATH
-        if not _is_template(path):
-            text = f"{key} is {checks.shorten(path)}"
-            yield f"{text}; expected a path with {{chunk_index:03d}} and {{file_index:03d}}"
-    features = raw.get("features")
-    if not isinstance(features, dict) or not features:
-        yield f"features is {checks.shorten(features)}; expected a table of columns"
-        return
-    for key, value in cast(dict[str, Any], features).items():
-        yield from _feature_problems(key, value)
+def _count(what: str, value: Any) -> int:
+    return checks.whole(what, value, 0, 2**53)
 
 
-def _is_template(path: Any) -> bool:
-    return isinstance(path, str) and not (".." in path or path.startswith("/")) and bool(_TEMPLATE.fullmatch(path))
-
-
-def _feature_problems(key: str, value: Any) -> Iterator[str]:
-    try:
-        checks.name("a feature", key)  # LeRobot names folders and files by it
-    except ManipError as problem:
-        yield str(problem)
-    if not _is_feature(value):
-        yield f"feature {checks.shorten(key)} is {checks.shorten(value)}; expected dtype and shape"
-
-
-def _is_feature(value: Any) -> bool:
-    if not isinstance(value, dict):
-        return False
-    table = cast(dict[str, Any], value)
-    shape: Any = table.get("shape")
-    if not isinstance(table.get("dtype"), str) or not isinstance(shape, list):
-        return False
-    return all(_is_count(size) for size in cast(list[Any], shape))
-
-
-def _feature(key: str, value: dict[str, Any]) -> Feature:
-    details = value.get("info") or value.get("video_info") or {}
-    details = cast(dict[str, Any], details) if isinstance(details, dict) else {}
-    return Feature(key, value["dtype"], tuple(value["shape"]), value.get("names"), details)
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
+def _template(what: str, value: Any) -> str:
+    if not isinstance(value, str) or not _TEMPLATE.fullmatch(value):
+        raise ManipError(f"{what} is {checks.shorten(value)}; expected a path with {{chunk_index}} and {{file_index}}")
+    return value

@@ -9,17 +9,15 @@ from __future__ import annotations
 import json
 import logging
 import re
-import struct
-import zlib
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.reader import McapReader, make_reader
+from mcap.records import Attachment, Chunk, DataEnd, Metadata
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
@@ -29,7 +27,7 @@ from manip_il.data.atomic import PARTIAL, write_file
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.schema import IMAGES, RobotTaskSpec, check_same_spec
 from manip_il.errors import ManipError, MismatchError, OlderSchemaError
-from manip_il.mdp import Episode, Observation
+from manip_il.mdp import Episode
 
 _LOG = logging.getLogger(__name__)
 _FORMAT = "2"
@@ -37,11 +35,8 @@ _RECORD = "manip_il"  # name of our metadata record
 _NPY = ".npy"
 _DAMAGED = ".damaged"
 _NAME = re.compile(r"episode-(\d{12,})\.mcap")
-_FINAL = "final/"  # before the number of a part and a column: the observation after its last frame
-_MAGIC = b"\x89MCAP0\r\n"
-_END = struct.Struct("<QQI8s")  # of a file: start of the summary, start of its offsets, its checksum, magic
-_DATA_END = b"\x0f\x04" + bytes(7)  # opcode and size of the record before the summary; then comes the data's checksum
-LARGEST_EPISODE = 2 * 1024**3  # all columns and pictures [bytes]: 21,000 frames of two cameras of 128 x 128 pixels
+_FINAL = "final/"  # what journals of before had of the observation after the last frame
+_LARGEST = 4 * 1024**3  # [bytes]
 
 
 @dataclass(frozen=True)
@@ -56,13 +51,6 @@ class Header:
     fingerprint: dict[str, Any]
     instruction: str = ""  # of the episode, where it is not that of the spec
     drawn: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        checks.whole("an episode's seed", self.seed, 0, checks.LARGEST_SEED)
-        checks.whole("an episode's number of frames", self.frames, 1, schema.MOST_FRAMES)
-        checks.mapping("an episode's fingerprint", self.fingerprint)
-        checks.text("an episode's instruction", self.instruction)
-        checks.mapping("what an episode drew", dict(self.drawn))
 
 
 @dataclass(frozen=True)
@@ -82,19 +70,15 @@ class Journal:
     def encode(self, episode: Episode) -> bytes:
         """Return the content of an episode's journal; the same episode gives the same bytes.
 
-        Raises `ManipError` for a column that numpy can only pickle, and for an episode that is too large.
+        Raises `ManipError` for a column that numpy can only pickle.
         """
-        columns = episode.columns | _final_columns(episode.final)
-        if (size := sum(column.nbytes for column in columns.values())) > LARGEST_EPISODE:
-            why = f"the episode with seed {episode.seed} has {size:,} bytes; expected at most {LARGEST_EPISODE:,}"
-            raise ManipError(f"{why}: record a shorter one, or smaller or fewer pictures")
         stream = BytesIO()
         writer = Writer(stream, compression=CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library=_RECORD)
         writer.add_metadata(_RECORD, {"format": _FORMAT} | _to_texts(self.header(episode)))
         channels, times = foxglove.episode_channels(episode, self.spec), foxglove.frame_times(episode, self.spec)
         foxglove.add_channels(writer, list(channels), times)
-        for key, column in columns.items():
+        for key, column in episode.columns.items():
             if key.startswith(IMAGES):
                 continue  # pictures travel as messages, without loss as well
             writer.add_attachment(0, 0, key + _NPY, "application/octet-stream", _to_npy(episode.seed, key, column))
@@ -172,55 +156,52 @@ def list_episodes(folder: Path) -> list[Path]:
 def read_journal(path: Path) -> tuple[Header, Episode]:
     """Return the header and the episode as they were written, bit for bit.
 
-    Raises `ManipError` naming the file where it is cut short, changed, or none of ours.
+    Raises `ManipError` naming the file if it is cut short, changed, or none of ours.
     """
-    with _open(path) as (reader, header):
-        columns: dict[str, NDArray[Any]] = {}
-        for one in reader.iter_attachments():
-            columns[one.name.removesuffix(_NPY)] = np.load(BytesIO(one.data), allow_pickle=False)
-        if header.spec.cameras:  # else nothing in the messages is needed
-            shape = (header.frames, *header.spec.image_size, 3)
-            pictures = foxglove.read_images(reader, header.spec.cameras, shape)
-            columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
-        final = _take_final(columns)
-        ends = header.success, header.success_at_end
-        return header, Episode(header.seed, columns, *ends, final, header.instruction, header.drawn)
+    return _read_file(path)
 
 
 def read_header(path: Path) -> Header:
-    """Return the header alone, after the same check of the file's checksums. Raises what `read_journal` raises."""
-    with _open(path) as (_, header):
-        return header
+    """Return the header of a whole journal. Raises what `read_journal` raises."""
+    return _read_file(path)[0]
 
 
-@contextmanager
-def _open(path: Path) -> Generator[tuple[McapReader, Header]]:
-    """Give a whole journal's reader and header; any error meanwhile becomes a `ManipError` that names the file."""
-    content = checks.read_bytes(path, "an episode's journal", LARGEST_EPISODE)
+def _read_file(path: Path) -> tuple[Header, Episode]:
+    """What `read_journal` gives; every error names the file."""
     try:
-        _check_sums(content)
-        reader = make_reader(BytesIO(content))
-        (texts,) = [one.metadata for one in reader.iter_metadata() if one.name == _RECORD]
-        yield reader, _from_texts(texts)
+        return _read(checks.read_bytes(path, "an episode's journal", _LARGEST))
     except OlderSchemaError as error:
         error.args = (f"{path}: {error}",)
         raise
     except Exception as error:  # what has right checksums and is none of ours can make a parser raise anything
+        if str(path) in str(error):
+            raise
         why = str(error) or type(error).__name__
         raise ManipError(f"{path} is not a complete episode: {why}; --resume=true records it again") from error
 
 
-def _check_sums(content: bytes) -> None:
-    """Raise `ValueError` unless a file's data and its summary have the checksums that are in it."""
-    if not content.startswith(_MAGIC) or len(content) < len(_MAGIC) + _END.size:
-        raise ValueError("it is no MCAP file, or ends too early")
-    view = memoryview(content)
-    start, _, summary_sum, magic = _END.unpack(view[-_END.size :])
-    end, data_sum = start - 4 - len(_DATA_END), int.from_bytes(view[start - 4 : start], "little")
-    if magic != _MAGIC or bytes(view[end : start - 4]) != _DATA_END:
-        raise ValueError("it ends too early")
-    if zlib.crc32(view[:end]) != data_sum or zlib.crc32(view[start:-12]) != summary_sum:
-        raise ValueError("it does not match its checksums")
+def _read(content: bytes) -> tuple[Header, Episode]:
+    """Take a file apart whose checksum is right."""
+    header: Header | None = None
+    columns: dict[str, NDArray[Any]] = {}
+    chunks: list[Chunk] = []
+    for record in StreamReader(BytesIO(content), emit_chunks=True, validate_crcs=True).records:
+        if isinstance(record, Metadata) and record.name == _RECORD:
+            header = _from_texts(record.metadata)
+        elif isinstance(record, Attachment) and not record.name.startswith(_FINAL):
+            columns[record.name.removesuffix(_NPY)] = np.load(BytesIO(record.data), allow_pickle=False)
+        elif isinstance(record, Chunk):
+            chunks.append(record)
+        elif isinstance(record, DataEnd):  # the checksum that it holds was right
+            break
+    if header is None:
+        raise ValueError(f"it has no record called {_RECORD}")
+    if header.spec.cameras:  # else nothing in the messages is needed
+        shape = (header.frames, *header.spec.image_size, 3)
+        pictures = foxglove.read_images(chunks, shape)
+        columns |= {IMAGES + camera: frames for camera, frames in pictures.items()}
+    ends = header.success, header.success_at_end
+    return header, Episode(header.seed, columns, *ends, instruction=header.instruction, drawn=header.drawn)
 
 
 def _header_or_none(path: Path) -> Header | None:
@@ -260,27 +241,3 @@ def _to_npy(seed: int, key: str, column: NDArray[Any]) -> bytes:
     except ValueError as error:
         raise ManipError(f"episode with seed {seed}, column {key!r} of dtype {column.dtype}: {error}") from error
     return stream.getvalue()
-
-
-def _final_columns(final: Sequence[Observation]) -> dict[str, NDArray[Any]]:
-    """Return the observations after each part of an episode as named arrays, (n,), (k,) and (height, width, 3)."""
-    columns: dict[str, NDArray[Any]] = {}
-    for number, one in enumerate(final):
-        pictures = {IMAGES + camera: picture for camera, picture in one.images.items()}
-        arrays = {schema.STATE: one.state, schema.ENVIRONMENT_STATE: one.environment_state, **pictures}
-        columns |= {f"{_FINAL}{number}/{key}": values for key, values in arrays.items()}
-    return columns
-
-
-def _take_final(columns: dict[str, NDArray[Any]]) -> tuple[Observation, ...]:
-    """Remove from `columns` the arrays that `_final_columns` gave, and return their observations."""
-    found: dict[int, dict[str, NDArray[Any]]] = {}
-    for name in [name for name in columns if name.startswith(_FINAL)]:
-        number, _, key = name.removeprefix(_FINAL).partition("/")
-        found.setdefault(int(number), {})[key] = columns.pop(name)
-    return tuple(_observation(arrays) for _, arrays in sorted(found.items()))
-
-
-def _observation(arrays: dict[str, NDArray[Any]]) -> Observation:
-    pictures = {key.removeprefix(IMAGES): one for key, one in arrays.items() if key.startswith(IMAGES)}
-    return Observation(arrays[schema.STATE], arrays[schema.ENVIRONMENT_STATE], pictures)

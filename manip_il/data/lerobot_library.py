@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import shutil
 from collections.abc import Generator, Iterable, Sequence
@@ -14,8 +13,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
-from lerobot.datasets.aggregate import aggregate_datasets
-from lerobot.datasets.compute_stats import aggregate_stats, get_feature_stats
+from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -23,13 +21,13 @@ from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.atomic import PARTIAL, writing
+from manip_il.data.atomic import PARTIAL
 from manip_il.data.dataset import Dataset
-from manip_il.data.gate import check_arrived
-from manip_il.data.info import read_info, read_object
+from manip_il.data.info import read_info
 from manip_il.data.lerobot_layout import DATA_FILES, STATS, TASK_INDEX, TASKS, write_json
-from manip_il.data.scheduling import scheduling_kept
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
+from manip_il.data.statistics import column_statistics
+from manip_il.data.video import scheduling_kept
 from manip_il.errors import ManipError, MismatchError
 
 I64 = NDArray[np.int64]
@@ -85,31 +83,9 @@ def _save(dataset: LeRobotDataset) -> None:
             enable_progress_bar()
 
 
-def join_datasets(roots: Sequence[Path], root: Path, repo_id: str) -> None:
-    """Join datasets into `root`, which must not exist, by LeRobot; every video stays a file of its own.
-
-    Raises `ManipError` for one that its readers must not open, or that it cannot join.
-    """
-    for source in roots:
-        check_arrived(source)
-    names = [f"local/{source.name}_{i}" for i, source in enumerate(roots)]
-    try:
-        with writing(root), contextlib.redirect_stderr(io.StringIO()):  # its progress bars
-            aggregate_datasets(names, repo_id, roots=list(roots), aggr_root=root, concatenate_videos=False)
-            _remove_chance(root)
-    except ManipError:
-        raise
-    except Exception as error:  # of every kind: it takes what the files say
-        told = checks.shorten(" ".join(str(error).split()))
-        joined = ", ".join(map(str, roots))
-        raise ManipError(
-            f"LeRobot cannot join {joined} ({type(error).__name__}: {told}); see `manip-il doctor`"
-        ) from error
-
-
 def _remove_chance(root: Path) -> None:
     """Order the statistics, which LeRobot leaves in a set's order, and drop the random fingerprint of data files."""
-    stats = read_object(root / STATS)
+    stats = checks.read_json(root / STATS, "a dataset's statistics")
     write_json(root / STATS, {key: stats[key] for key in read_info(root).features if key in stats})
     for path in sorted(root.glob(DATA_FILES)):
         with pq.ParquetFile(path) as file:
@@ -173,7 +149,7 @@ class Metadata(LeRobotDatasetMetadata):
 def learn_actions(meta: Metadata, actions: NDArray[np.float32]) -> None:
     """Set what is learnt in place of the column `action`, (N, n), with statistics of its own."""
     meta.learnt_actions = actions
-    meta.stats = {**(meta.stats or {}), ACTION: get_feature_stats(actions, axis=0, keepdims=False)}
+    meta.stats = {**(meta.stats or {}), **column_statistics({ACTION: actions})}
 
 
 def read_metadata(*roots: Path) -> Metadata:

@@ -7,9 +7,9 @@ files in a few milliseconds an episode, and the dataset is there whole or not at
 from __future__ import annotations
 
 import contextlib
-from collections import deque
+import dataclasses
+import json
 from collections.abc import Generator, Iterable, Mapping
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +21,26 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data import lerobot_layout as layout
 from manip_il.data.atomic import new_folder, writing
-from manip_il.data.episode_table import drawn_text
+from manip_il.data.dataset import Dataset
 from manip_il.data.info import DatasetInfo
 from manip_il.data.parquet_files import ParquetFiles, to_table
 from manip_il.data.schema import RobotTaskSpec, fitted_columns
-from manip_il.data.statistics import I64, RunningStats, picture_stats, pixel_counts
-from manip_il.data.video import CameraFiles, CameraThreads, Clip, try_encoder
+from manip_il.data.statistics import (
+    PooledStatistics,
+    Statistics,
+    column_statistics,
+    picture_statistics,
+    to_lists,
+)
+from manip_il.data.video import CameraFiles, try_encoder
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 
-_MIB = 1024 * 1024
 _GROUP_ROWS = 1_000  # frames in a row group
 _EPISODE_ROWS = 100  # rows of meta/episodes held before they are written
 FORMAT = 1  # of meta/manip_il.json
+Columns = Mapping[str, NDArray[Any]]
 
 
 def own_file(
@@ -60,7 +66,7 @@ def new_dataset(
     """Give a writer that takes episodes; the dataset appears at `root` on leaving, after `finish`, whole and on disk.
 
     The same episodes in the same order give the same bytes, videos included. video: LeRobot's settings by default.
-    replace: as in `new_folder`. Raises `FolderExistsError` where `root` holds something, `UsageError` for pictures or
+    replace: as in `new_folder`. Raises `FolderExistsError` if `root` holds something, `UsageError` for pictures or
     settings that the encoder refuses, both before anything is written; `ManipError` on leaving without `finish`.
     """
     video = video or VideoConfig()
@@ -99,6 +105,24 @@ def write_dataset(
         return writer.finish(provenance)
 
 
+def rewrite_columns(
+    dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
+) -> DatasetInfo:
+    """Write a dataset to `target` with these columns in place of its own; films are copied.
+
+    columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `new_dataset`. Raises what
+    `new_dataset` and `DatasetWriter` raise, `ManipError` for columns of other lengths than the episodes.
+    """
+    spec = dataset.spec
+    episodes = dataset.read_episodes(pictures=not spec.video)
+    with new_dataset(target, spec, **options) as writer:
+        for number, (episode, fresh) in enumerate(zip(episodes, columns, strict=True)):
+            own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
+            changed = dataclasses.replace(episode, columns=own)
+            writer.add(changed, (dataset, number) if spec.video and spec.cameras else None)
+        return writer.finish(provenance)
+
+
 class DatasetWriter:
     """Writes a dataset's episodes as they come; made by `new_dataset`."""
 
@@ -112,39 +136,46 @@ class DatasetWriter:
         file_sizes: tuple[float, float],
     ):
         self._folder, self._root, self._spec, self._ours, self._file_sizes = folder, root, spec, ours, file_sizes
-        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(spec), _GROUP_ROWS)
-        self._meta = ParquetFiles(folder, layout.EPISODES_PATH, layout.episodes_schema(spec))
-        self._cameras = CameraThreads(
-            {key: CameraFiles(folder, key, video, spec.fps, file_sizes[1]) for key in spec.image_keys if spec.video}
-        )
-        self._stats = RunningStats(folder)
-        self._counts: dict[str, I64] = {}  # camera column -> pixels of all episodes
-        self._encoding: deque[tuple[dict[str, Any], dict[str, Future[Clip]]]] = deque()
+        self._data = ParquetFiles(folder, layout.DATA_PATH, layout.data_schema(spec), file_sizes[0], _GROUP_ROWS)
+        self._meta = ParquetFiles(folder, layout.EPISODES_PATH, layout.episodes_schema(spec), file_sizes[0])
+        films = spec.image_keys if spec.video else ()
+        self._films = {key: CameraFiles(folder, key, video, spec.fps, file_sizes[1]) for key in films}
+        self._pooled = PooledStatistics()
         self._rows: list[dict[str, Any]] = []
         self._tasks: dict[str, int] = {}  # text -> its number, in the order of the first episodes
         self._episodes = self._frames = self._success = self._success_at_end = 0
         self.finished = False
 
-    def add(self, episode: Episode) -> None:
-        """Append one episode. Its pictures are encoded in other threads and must not be changed any more.
+    def add(self, episode: Episode, films: tuple[Dataset, int] | None = None) -> None:
+        """Append one episode. films: a dataset and the number of its episode that has the same pictures, in films.
 
-        Raises what `schema.fitted_columns` raises for an episode that does not fit, `ManipError` where an episode,
-        this one or one before it, cannot be written.
+        Raises what `schema.fitted_columns` raises for an episode that does not fit, `ManipError` if it cannot be
+        written.
         """
         if self.finished:
             raise ManipError(f"{self._root} is finished: no episodes can be added")
-        columns = fitted_columns(episode, self._spec)
-        pictures = {key: columns.pop(key) for key in self._spec.image_keys}
-        films, stills = (pictures, {}) if self._spec.video else ({}, pictures)
+        columns = fitted_columns(episode, self._spec, self._films if films else ())
+        pictures = {key: columns.pop(key) for key in self._spec.image_keys if key in columns}
         task = checks.text("instruction", episode.instruction or self._spec.instruction)
         columns |= self._index_columns(len(episode), self._tasks.setdefault(task, len(self._tasks)))
+        statistics = column_statistics(columns) | {key: picture_statistics(one) for key, one in pictures.items()}
+        if films:
+            statistics |= films[0].picture_statistics[films[1]]
         with _explained(self._root):
-            row = self._write_data(columns | stills, len(episode), task) | _flat(self._stats.add(columns))
-            row[layout.DRAWN] = drawn_text(episode.drawn)
-            for key, frames in stills.items():
-                row |= self._picture_columns(key, pixel_counts(frames), len(episode))
-            self._encoding.append((row, self._cameras.write(films)))
-            self._settle()
+            stills = {} if self._films else pictures
+            row = self._write_data(columns | stills, len(episode), task)
+            for key, film in self._films.items():
+                clip = film.copy(*films[0].clip(key, films[1])) if films else film.write(pictures[key])
+                row |= {
+                    f"videos/{key}/chunk_index": clip.chunk,
+                    f"videos/{key}/file_index": clip.file,
+                    f"videos/{key}/from_timestamp": clip.first / self._spec.fps,
+                    f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._spec.fps,
+                }
+            self._rows.append(row | {layout.DRAWN: json.dumps(dict(episode.drawn))} | _flat(statistics))
+            if len(self._rows) >= _EPISODE_ROWS:
+                self._write_rows()
+        self._pooled.add(statistics)
         self._episodes += 1
         self._frames += len(episode)
         self._success += episode.success
@@ -158,12 +189,12 @@ class DatasetWriter:
         if not self._episodes:
             raise ManipError("no episodes: there is no dataset to write")
         with _explained(self._root):
-            videos = self._cameras.finish()
-            self._settle()
             self._write_rows()
             self._data.close()
             self._meta.close()
-            self._write_meta(videos, provenance or {})
+            for film in self._films.values():
+                film.close()
+            self._write_meta({key: film.info() for key, film in self._films.items()}, provenance or {})
         self.finished = True
         return DatasetInfo(
             root=self._root,
@@ -177,17 +208,10 @@ class DatasetWriter:
             success_at_end=self._success_at_end,
         )
 
-    def wait(self) -> None:
-        """Wait until every picture so far is encoded."""
-        for _, clips in self._encoding:
-            for clip in clips.values():
-                clip.result()
-
     def close(self) -> None:
-        """Close files and end threads, finished or not."""
-        self._cameras.stop()
-        for files in (self._data, self._meta, self._stats):
-            with contextlib.suppress(OSError):  # a full disk was reported by `add` or `finish`
+        """Close files, finished or not."""
+        for files in (self._data, self._meta, *self._films.values()):
+            with contextlib.suppress(OSError, ManipError):  # a full disk was reported by `add` or `finish`
                 files.close()
 
     def _index_columns(self, length: int, task: int) -> dict[str, NDArray[Any]]:
@@ -202,10 +226,6 @@ class DatasetWriter:
 
     def _write_data(self, columns: Mapping[str, NDArray[Any]], length: int, task: str) -> dict[str, Any]:
         """The episode's rows; returns the episode's row of meta/episodes without statistics."""
-        # LeRobot's rule: a new file where this episode, at the file's size a frame so far, would fill it
-        size, frames = self._data.size, self._data.rows
-        if frames and size + size / frames * length >= self._file_sizes[0] * _MIB:
-            self._data.close()
         chunk, file = self._data.write(to_table(columns, self._data.schema))
         return {
             layout.EPISODE_INDEX: self._episodes,
@@ -217,37 +237,11 @@ class DatasetWriter:
             "dataset_to_index": self._frames + length,
         }
 
-    def _settle(self) -> None:
-        """Write rows of meta/episodes as far as their pictures are encoded."""
-        while self._encoding and all(clip.done() for clip in self._encoding[0][1].values()):
-            row, clips = self._encoding.popleft()
-            for key, future in clips.items():
-                clip = future.result()
-                row |= self._clip_columns(key, clip)
-                row |= self._picture_columns(key, clip.counts, clip.frames)
-            self._rows.append(row)
-            if len(self._rows) >= _EPISODE_ROWS:
-                self._write_rows()
-
-    def _clip_columns(self, key: str, clip: Clip) -> dict[str, Any]:
-        return {
-            f"videos/{key}/chunk_index": clip.chunk,
-            f"videos/{key}/file_index": clip.file,
-            f"videos/{key}/from_timestamp": clip.first / self._spec.fps,
-            f"videos/{key}/to_timestamp": (clip.first + clip.frames) / self._spec.fps,
-        }
-
-    def _picture_columns(self, key: str, counts: I64, frames: int) -> dict[str, Any]:
-        """Statistics of an episode's pictures from one camera; they count for the dataset's."""
-        self._counts[key] = self._counts.get(key, 0) + counts
-        return _flat({key: picture_stats(counts, frames)})
-
     def _write_rows(self) -> None:
+        """The rows of meta/episodes that are held."""
         if not self._rows:
             return
-        if self._meta.size >= self._file_sizes[0] * _MIB:
-            self._meta.close()
-        chunk, file = self._meta.next_place
+        chunk, file = self._meta.next_place()
         place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
         self._meta.write(pa.Table.from_pylist([row | place for row in self._rows], self._meta.schema))
         self._rows.clear()
@@ -258,9 +252,7 @@ class DatasetWriter:
         layout.write_json(self._folder / layout.OURS, {**self._ours, "provenance": dict(provenance)})
         table = layout.tasks_table(list(self._tasks))
         pq.write_table(table, self._folder / layout.TASKS, write_page_checksum=True)
-        stats = self._stats.result() | {
-            key: picture_stats(counts, self._frames) for key, counts in self._counts.items()
-        }
+        stats = to_lists(self._pooled.result())
         layout.write_json(self._folder / layout.STATS, {key: stats[key] for key in layout.all_features(self._spec)})
 
 
@@ -273,5 +265,6 @@ def _explained(root: Path) -> Generator[None]:
         raise ManipError(f"cannot write {root}: {error.strerror or error}") from error
 
 
-def _flat(stats: Mapping[str, Mapping[str, list[Any]]]) -> dict[str, list[Any]]:
-    return {f"stats/{key}/{name}": values for key, table in stats.items() for name, values in table.items()}
+def _flat(statistics: Statistics) -> dict[str, list[Any]]:
+    lists = to_lists(statistics)
+    return {f"stats/{key}/{name}": values for key, table in lists.items() for name, values in table.items()}

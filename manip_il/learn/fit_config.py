@@ -100,7 +100,7 @@ class FitConfig:
         None, "random crops and colour jitter of pictures while training; by default for all but cnn"
     )
     image_cache_gb: float = option(
-        20.0, "most that decoded pictures take on disk [GB]; beyond it each step decodes its own"
+        20.0, "most that decoded pictures take in the temporary folder [GB]; beyond it each step decodes its own"
     )
     num_workers: int = option(4, "processes that decode pictures beyond image_cache_gb")
     threads: int = option(1, "PyTorch threads; more help only on free cores")

@@ -61,7 +61,7 @@ class PolicyTrainer:
 
     spec, fingerprint, look: see `CheckpointMeta.of`. weights: how often each frame is drawn, relative to the others,
     (N,); by default each once an epoch, or as `sources`, the datasets of `root`, have it. on_frames: sees how many
-    frames more have been decoded into the cache. On one CPU the same data, config and threads give the same bits,
+    frames more have been decoded. On one CPU the same data, config and threads give the same bits,
     resumed or not. Started by `accelerate launch` or `torchrun`, every process takes `batch_size` samples a step; of
     `config.processes`, each takes its share of them (`fit_policy`).
 
@@ -98,8 +98,7 @@ class PolicyTrainer:
         if self.conversion is not None:
             _convert(self.dataset, self.conversion)
         self.options = self.lerobot.resume_options()  # with the features
-        with self.accelerator.main_process_first():  # it fills the cache, the others find it full
-            self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
+        self.samples = load_samples(roots, self.lerobot.policy, config, self.dataset, on_frames)
         drawn = weights[self.samples.train] if weights is not None else None
         if sources is not None and weights is None:
             drawn = weights = sources.row_weights(self.samples.train)

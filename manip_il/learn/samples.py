@@ -1,4 +1,4 @@
-"""Samples of datasets: numbers in memory, pictures in a cache, or decoded when they are drawn.
+"""Samples of datasets: numbers in memory, pictures decoded before, or when they are drawn.
 
 LeRobot's policies say by `*_delta_indices` which frames around a sample's own they want: its window. A frame outside of
 the episode is the nearest one inside, and `<column>_is_pad` says so.
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from manip_il.data.camera import Camera
 from manip_il.data.dataset import Dataset, joined_columns
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_layout import STATS
 from manip_il.data.schema import ACTION, LABEL_VALID
 from manip_il.errors import ManipError, UsageError
@@ -231,16 +230,12 @@ def load_samples(
 def _frames(
     roots: Sequence[Path], cameras: Sequence[str], limit: int, on_frames: Callable[[int], None] | None
 ) -> dict[str, JoinedFrames] | None:
-    """The pictures of every camera in all datasets; None where they would take more than `limit` bytes."""
-    found: list[Mapping[str, Any]] = []
-    total = 0
-    for root in roots if cameras else []:
-        frames = open_frame_cache(root, list(cameras), max_bytes=limit, on_frames=on_frames)
-        total += sum(one.nbytes for one in frames.values()) if frames is not None else 0
-        if frames is None or total > limit:
-            return None
-        found.append(frames)
-    return {camera: JoinedFrames([frames[camera] for frames in found]) for camera in cameras}
+    """The decoded pictures of every camera in all datasets; None where they would take more than `limit` bytes."""
+    opened = [Dataset.open(root) for root in roots]
+    found = {key: [dataset.camera(key) for dataset in opened] for key in cameras}
+    if sum(one.nbytes for each in found.values() for one in each) > limit:
+        return None
+    return {key: JoinedFrames([one.decode(on_frames) for one in each]) for key, each in found.items()}
 
 
 def read_later(roots: Sequence[Path], cameras: Sequence[str]) -> dict[str, JoinedFrames]:

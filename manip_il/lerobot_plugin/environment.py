@@ -16,7 +16,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, IMAGES, STATE
-from manip_il.errors import UnknownName, UsageError, shorten_ffmpeg_warning
+from manip_il.errors import UnknownName, UsageError, silence_ffmpeg_warning
 from manip_il.learn.pretrained import OBSERVATIONS
 from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
@@ -162,4 +162,4 @@ def make_env(env_id: str, kwargs: dict[str, Any], *, film: bool) -> gymnasium.En
 
 
 register_envs()
-shorten_ffmpeg_warning()
+silence_ffmpeg_warning()

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.build import dataset_sha256
 from manip_il.data.fingerprint import canonical_json
-from manip_il.data.schema import MOST_FPS, MOST_FRAMES
+from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, MismatchError
 from manip_il.preferences.frames import Frames, check_same, read_frames
 
 I64 = NDArray[np.int64]
+_MOST_FRAMES = 1_000_000  # of a clip
 FILE_NAME = "pairs.json"
 FORMAT, VERSION = "manip_il pairs", 1
 MOST_PAIRS, MOST_SOURCES, MOST_EPISODES = 100_000, 1_000, 10_000_000
@@ -74,7 +75,7 @@ class Pairs:
         checks.name("robot", self.robot)
         checks.name("task", self.task)
         checks.whole("control_hz", self.control_hz, 1, MOST_FPS)
-        checks.whole("clip", self.length, 1, MOST_FRAMES)
+        checks.whole("clip", self.length, 1, _MOST_FRAMES)
         checks.whole("seed", self.seed, 0, checks.LARGEST_SEED)
         checks.text("chosen", self.chosen, checks.LONGEST_TEXT)
         if not checks.array("sources", self.sources, MOST_SOURCES):
@@ -88,7 +89,7 @@ class Pairs:
     def _check_clip(self, what: str, clip: Clip) -> None:
         checks.whole(f"{what}: source", clip.source, 0, len(self.sources) - 1)
         checks.whole(f"{what}: episode", clip.episode, 0, self.sources[clip.source].episodes - 1)
-        checks.whole(f"{what}: first", clip.first, 0, MOST_FRAMES)
+        checks.whole(f"{what}: first", clip.first, 0, _MOST_FRAMES)
 
     def __len__(self) -> int:
         return len(self.pairs)

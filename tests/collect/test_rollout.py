@@ -161,19 +161,6 @@ def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
     assert [(frame.success, frame.reward) for frame in frames] == [(False, 0), (False, 0), (True, 1), (True, 1)]
 
 
-@pytest.mark.parametrize("envs", [1, 3])
-def test_the_last_frame_alone_has_what_was_observed_after_it(envs: int):
-    rules = Rules(horizon=6, hold=1)
-    found = episodes(rollout([Counter() for _ in range(envs)], range(4), follow, rules, Ones()))
-    for frames in found.values():
-        assert all(frame.final is None for frame in frames[:-1])
-        last = frames[-1]
-        assert last.done
-        # One action on from the last state, though the environment may have begun another episode by now.
-        assert last.final.state[0] == last.state.physics[0] + last.executed_action[0]
-        assert last.final.environment_state[0] == len(frames)
-
-
 @pytest.mark.parametrize(("hold", "length"), [(0, 3), (2, 5), (None, 30)])
 def test_hold_ends_an_episode_that_long_after_success(hold: int | None, length: int):
     frames = one_episode(Counter(), follow, Rules(30, hold))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -71,26 +68,6 @@ def test_a_killed_writers_folder_is_removed_by_the_next_and_no_other(tmp_path):
     with new_folder(tmp_path / "root"):
         assert len(list(tmp_path.glob(".root.*.partial"))) == 1
     assert (tmp_path / ".rooted.abc.partial").exists()
-
-
-@pytest.mark.parametrize("moment", ["before it is opened", "before it is held"])
-def test_a_folder_that_another_writer_takes_for_a_leftover_is_made_again(tmp_path, monkeypatch, moment):
-    module, name = (tempfile, "mkdtemp") if moment == "before it is opened" else (fcntl, "flock")
-    plain, calls = getattr(module, name), list[str]()
-
-    def swept(*args: Any, **settings: Any) -> Any:
-        result = plain(*args, **settings)
-        if not calls:
-            [folder] = tmp_path.glob(".d.*")
-            folder.rmdir()
-        calls.append(name)
-        return result
-
-    monkeypatch.setattr(module, name, swept)
-    with new_folder(tmp_path / "d") as folder:
-        (folder / "one").write_text("1")
-    assert len(calls) == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
 def test_a_second_writer_is_refused_by_the_firsts_process_id(tmp_path):

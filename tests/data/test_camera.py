@@ -1,7 +1,8 @@
-"""Pictures that are decoded when they are read are the cache's and LeRobot's. It imports torch: some seconds."""
+"""Pictures that are decoded, at once or when they are read, are LeRobot's. It imports torch: some seconds."""
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,6 @@ import pytest
 
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
@@ -46,26 +46,20 @@ def roots(
     return {path.name: path for path in folder.iterdir()}
 
 
-def cached(root: Path, folder: Path) -> dict[str, np.ndarray]:
-    frames = open_frame_cache(root, Dataset.open(root).cameras, max_bytes=10**9, folder=folder)
-    assert frames is not None
-    return frames
-
-
 @pytest.mark.parametrize("name", ["h264", "libsvtav1", *RECORDED, "aggregated"])
-def test_the_cache_and_what_is_read_late_are_bit_equal_to_what_lerobot_gives(roots, name, tmp_path):
+def test_what_is_decoded_at_once_or_when_it_is_read_is_bit_equal_to_what_lerobot_gives(roots, name):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    root = roots[name]
-    frames = cached(root, tmp_path)
+    root, counts = roots[name], list[int]()
+    cameras = {key: Dataset.open(root).camera(key) for key in Dataset.open(root).cameras}
+    frames = {key: camera.decode(counts.append) for key, camera in cameras.items()}
     plain: Any = LeRobotDataset("a/b", root=root)
     assert list(frames) == [FRONT, WRIST]
-    assert len(plain) == len(frames[FRONT]) > 20
+    assert sum(counts) == 2 * len(plain) == 2 * len(frames[FRONT]) > 40
     rows = np.random.default_rng(0).integers(0, len(plain), (4, 3))
     for key, values in frames.items():
-        late = Dataset.open(root).camera(key)
-        assert late.shape == values.shape
-        np.testing.assert_array_equal(late[rows], values[rows], strict=True)
+        assert cameras[key].shape == values.shape
+        np.testing.assert_array_equal(cameras[key][rows], values[rows], strict=True)
     for row in range(len(plain)):
         theirs = plain[row]
         assert int(theirs["index"]) == row
@@ -74,13 +68,22 @@ def test_the_cache_and_what_is_read_late_are_bit_equal_to_what_lerobot_gives(roo
             np.testing.assert_array_equal((theirs[key] * 255).numpy(), values[row].astype(np.float32))
 
 
-def test_processes_of_their_own_read_the_same(roots, tmp_path):
+def test_no_room_for_decoded_pictures_is_one_line(roots, monkeypatch):
+    def full(handle: int, start: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(ManipError, match=r"cannot keep 0\.0 GB of decoded pictures in .*: No space left .*TMPDIR"):
+        Dataset.open(roots["image"]).camera(FRONT).decode()
+
+
+def test_processes_of_their_own_read_the_same(roots):
     import torch
 
     from manip_il.learn.samples import SampleSource, Windows, read_later
 
     root = roots["video"]
-    whole = cached(root, tmp_path)[WRIST]
+    whole = Dataset.open(root).camera(WRIST).decode()
     rows = np.arange(len(whole))
     numbers = {"task_index": torch.zeros(len(rows), dtype=torch.int64)}
     windows = Windows(np.zeros(len(rows), np.int64), {WRIST: np.array([-1, 0])})

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +14,13 @@ import pytest
 import datasets
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.build import merge_datasets
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
-from manip_il.store.pull import pull
-from manip_il.store.push import push
 
-from ..damage import DATA, EPISODES, edit_json
+from ..damage import DATA, EPISODES
 from ..pictures import encoded, store_pictures, write
 
 KEY = "observation.images.front"
@@ -67,26 +62,14 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     [None, {"bytes": None, "path": "reference://x"}, {"bytes": EPS, "path": None}, {"bytes": b"", "path": "/a.png"}],
     ids=["none", "address", "another format", "path"],
 )
-def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any, opened: list[str], tmp_path: Path):
+def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: Any, opened: list[str]):
     set_first(root, cell)
     with pytest.raises(ManipError, match=rf"cannot read the pictures {KEY} in frames 0 to 0 of .*lift"):
         _ = Dataset.open(root).camera(KEY)[np.array([0])]
     refused = rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"
     with pytest.raises(ManipError, match=refused):
-        merge_datasets([root, root], tmp_path / "two", repo_id="a/b")
+        check_arrived(root)
     assert not opened
-
-
-def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from ..store.trees import impatient, unwatched
-
-    url, remote = impatient(f"file://{tmp_path}/store")
-    set_first(root, {"bytes": None, "path": "http://127.0.0.1:1/a.png"})
-    monkeypatch.setattr("manip_il.store.push.examine_folder", lambda root: [])  # another program pushed it
-    push(root, url, remote, unwatched)
-    with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"):
-        pull(url, remote, tmp_path / "here", unwatched)
-    assert not (tmp_path / "here").exists()
 
 
 DECODED: dict[str, Any] = {
@@ -106,53 +89,17 @@ def test_a_files_own_metadata_has_nothing_decoded(root: Path, name: str, kind: s
     table = table.append_column("odd", pa.array(rows, layout.PICTURE))
     about = json.dumps({"info": {"features": {"odd": DECODED[kind]}}})
     pq.write_table(table.replace_schema_metadata({"huggingface": about}), root / name)
-    with pytest.raises(ManipError, match=r"'odd'.* (decoded as|has no PNG or JPEG)"):
+    with pytest.raises(ManipError, match=r"decoded as|'odd' has no PNG or JPEG"):
         check_arrived(root)
-    if kind == "another picture":
-        meta: Any = read_metadata(root)
-        assert meta.episodes is None or meta.episodes[0]["length"] > 0  # LeRobot's would decode the whole row
     assert not opened
 
 
-def test_a_playlist_is_no_video_that_lerobot_may_join(tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]):
+def test_a_playlist_is_no_video(tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]):
     root = write(filmed, tmp_path / "film", two)
     path = next(root.glob("videos/**/*.mp4"))
     path.write_bytes(b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:1/a.ts\n" + path.read_bytes())
     with pytest.raises(ManipError, match=r"mp4: it does not begin as an MP4 file does"):
-        merge_datasets([root, root], tmp_path / "two", repo_id="a/b")
-
-
-def change(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
-    return lambda stats: stats["action"].update({name: value})
-
-
-DEEP = json.loads("[" * 70 + "1" + "]" * 70)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        change("mean", "a"),
-        change("mean", None),
-        change("std", [1.0]),
-        change("std", [[1.0] * 8] * 2),
-        change("count", [1, 2]),
-        change("max", DEEP),
-        change("min", [10**400] * 8),
-        change("min", [[1.0], [1.0, 2.0]]),
-        change("q01", {"a": 1}),
-        lambda stats: stats.update(action=[1.0]),
-        lambda stats: stats["action"].pop("max"),
-    ],
-)
-def test_statistics_of_another_type_shape_or_depth_are_one_line(root: Path, damage: Callable[[dict[str, Any]], None]):
-    edit_json(root / layout.STATS, damage)
-    with pytest.raises(ManipError, match=r"stats\.json: (\w+) of action is .*; expected numbers of shape \(\d+,\)"):
-        read_metadata(root, root)
-    for content in ("[]", "1", "[" * 100_000, '{"a": ' + "1" * 5000 + "}"):
-        (root / layout.STATS).write_text(content)
-        with pytest.raises(ManipError, match=r"cannot read .*stats\.json: "):
-            read_metadata(root)
+        check_arrived(root)
 
 
 def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
@@ -164,7 +111,7 @@ def test_a_row_whose_task_has_no_text_is_one_line(root: Path):
         meta.joint_tasks(own)
 
 
-def test_pandas_metadata_that_names_no_column_is_not_looked_at_and_to_join_is_one_line(
+def test_pandas_metadata_that_names_no_column_is_not_looked_at(
     tmp_path: Path, two: s.RobotTaskSpec, filmed: list[Episode]
 ):
     root = write(filmed, tmp_path / "film", two)
@@ -173,7 +120,3 @@ def test_pandas_metadata_that_names_no_column_is_not_looked_at_and_to_join_is_on
     pq.write_table(tasks.replace_schema_metadata({"pandas": about}), root / layout.TASKS)
     tasks_read: Any = read_metadata(root).tasks
     assert list(tasks_read.index) == tasks.column("task").to_pylist()
-    other = shutil.copytree(root, tmp_path / "other")
-    with pytest.raises(ManipError, match=r"LeRobot cannot join .*film, .*other \(\w+: "):
-        merge_datasets([root, other], tmp_path / "two", repo_id="a/b")
-    assert not (tmp_path / "two").exists()

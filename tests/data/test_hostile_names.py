@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,15 +13,12 @@ from manip_il.cli.main import main
 from manip_il.data import journal
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema as s
-from manip_il.data.build import RECORDING, Recording, local_id
+from manip_il.data.build import Recording, local_id
 from manip_il.data.dataset import Dataset
-from manip_il.doctor.examine import examine_folder, repair
-from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError, UsageError
-from manip_il.mcap.export import open_source
 from manip_il.sim.conditions import Condition
 
-from ..damage import digests, edit_json, lines
+from ..damage import digests, edit_json
 from ..pictures import episode_frames, numbered_episodes, with_cameras, write
 from ..synthetic import MakeEpisode
 
@@ -68,36 +64,16 @@ def test_a_camera_named_as_a_path_overwrites_no_other_dataset(attack, victim, ca
     assert not attack.with_name("lift").exists()
 
 
-def test_neither_does_a_repair_from_such_journals(attack, victim, capsys):
-    root = shutil.copytree(victim, attack.with_name("lift"))
-    (root / layout.TASKS).unlink()  # so that a repair would build it again
-    before = digests(victim)
-    assert main(["doctor", str(root), "--repair=true"]) == 1
-    assert "a camera is 'x/../../../victim" in capsys.readouterr().out
-    assert digests(victim) == before
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"robot": "../panda"}, "robot is '../panda'"),
-        ({"robot": None}, "robot is None"),
         ({"task": "a/b"}, "task is 'a/b'"),
         ({"task": "x" * (LONGEST_NAME + 1)}, "task is 'xxx"),
         ({"fps": "20"}, "fps is '20'; expected a whole number"),
-        ({"fps": 0}, "fps is 0"),
-        ({"fps": 10**9}, "fps is 1000000000"),
-        ({"sim_state_size": -1}, "sim_state_size is"),
-        ({"joint_names": "abc"}, "joint_names is 'abc'; expected a list"),
-        ({"joint_names": [1]}, "a name in joint_names is 1"),
-        ({"environment_state_names": ["x"] * 20_000}, "environment_state_names is"),
         ({"cameras": [".."]}, "a camera is '..'"),
         ({"cameras": ["front\n"]}, "a camera is 'front\\n'"),
         ({"cameras": ["a", "a"], "image_size": [8, 8]}, "expected each once"),
-        ({"cameras": ["a"], "image_size": [0, 0]}, "a side of image_size is 0"),
-        ({"image_size": [8]}, "expected height and width"),
-        ({"instruction": {}}, "instruction is {}"),
-        ({"instruction": "x" * 100_000}, "instruction is 'xxx"),
     ],
 )
 def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
@@ -105,31 +81,6 @@ def test_a_spec_refuses_what_it_cannot_be(spec, change, words):
         s.RobotTaskSpec.from_json(spec.to_json() | change)
     assert words in str(error.value)
     assert len(str(error.value)) < 500
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"repo_id": "../../victim"}, "repo_id is '../../victim'"),
-        ({"repo_id": None}, "repo_id is None"),
-        ({"only_successes": "yes"}, "only_successes is 'yes'; expected true or false"),
-        ({"episodes": "3"}, "episodes is '3'"),
-        ({"labels": -1}, "labels is -1"),
-        ({"provenance": []}, "provenance is []"),
-        ({"video": {"g": "2"}}, "video setting g is '2'"),
-        ({"video": {"preset": "../x"}}, "video setting preset is '../x'"),
-        ({"video": {"vcodec": []}}, "vcodec is []"),
-        ({"video": {"colour": 1}}, "unknown video setting 'colour'"),
-        ({"video": None}, "video is None"),
-    ],
-)
-def test_a_recording_is_checked_and_its_file_named(tmp_path, change, words):
-    Recording("a/b").write(tmp_path)
-    edit_json(tmp_path / RECORDING, lambda data: data.update(change))
-    with pytest.raises(ManipError) as error:
-        Recording.read(tmp_path)
-    assert words in str(error.value)
-    assert str(tmp_path / RECORDING) in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -141,17 +92,6 @@ def test_a_folder_of_any_name_gives_a_repository_id(folder, wanted, tmp_path):
     assert Recording.read(tmp_path / f"{folder}.journals").repo_id == wanted
 
 
-@pytest.mark.parametrize("field", ["fingerprint", "spec"])
-def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, field, monkeypatch):
-    real = json.dumps
-    wrong = {"fingerprint": {"mark": 1}, "spec": spec.to_json()}[field]
-    monkeypatch.setattr(json, "dumps", lambda value, **how: "null" if value == wrong else real(value, **how))
-    path = journal.Journal(tmp_path, spec, {"mark": 1}).write(episodes[0])
-    for read in (journal.read_header, journal.read_journal):
-        with pytest.raises(ManipError, match=r"None; expected an object"):
-            read(path)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -161,19 +101,12 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
         ({"video_path": "{video_key.__class__}/{chunk_index}"}, "video_path is"),
         ({"video_path": "videos/{chunk_index:9999999999d}"}, "video_path is"),
         ({"video_path": ["x"]}, "video_path is"),
-        ({"fps": "20"}, "fps is '20'"),
-        ({"fps": 0.001}, "fps is 0.001"),
-        ({"fps": 10**400}, "fps is 1000"),
-        ({"robot_type": {"a": 1}}, "robot_type is"),
-        ({"total_frames": "9"}, "total_frames is '9'"),
-        ({"total_episodes": 2**60}, "total_episodes is"),
         ({"features": None}, "features is None"),
     ],
 )
 def test_what_info_says_is_checked_by_every_reader(victim, change, words):
     edit_json(victim / layout.INFO, lambda info: info.update(change))
-    assert any(words in line for line in lines(victim))
-    for read in (Dataset.open, open_source, lambda root: episode_frames(root, FRONT, 0)):
+    for read in (Dataset.open, lambda root: episode_frames(root, FRONT, 0)):
         with pytest.raises(ManipError) as error:
             read(victim)
         assert words in str(error.value)
@@ -184,8 +117,7 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
     key = "../../secret"
     assert (victim / "videos" / key).resolve() == secret
     edit_json(victim / layout.INFO, lambda info: info["features"].update({key: info["features"].pop(FRONT)}))
-    assert any("a feature is '../../secret'" in line for line in lines(victim))
-    for read in (Dataset.open, open_source, lambda root: episode_frames(root, key, 0)):
+    for read in (Dataset.open, lambda root: episode_frames(root, key, 0)):
         with pytest.raises(ManipError, match=r"a feature is '\.\./\.\./secret'"):
             read(victim)
 
@@ -206,19 +138,6 @@ def test_our_own_file_is_checked(victim, change, words):
         _ = Dataset.open(victim).spec
     assert words in str(error.value)
     assert "manip_il.json" in str(error.value)
-
-
-def test_a_repair_writes_and_moves_nothing_through_a_link(victim, tmp_path):
-    outside = tmp_path / "outside"
-    shutil.move(victim / "meta", outside)
-    (victim / "meta").symlink_to(outside)
-    edit_json(outside / "stats.json", lambda stats: stats.pop(s.ACTION))  # it would be computed again
-    (outside / "left.tmp.partial").write_bytes(b"x")  # it would be moved away
-    before = digests(outside)
-    said = list(repair(Patient(victim), examine_folder(victim)))
-    assert digests(outside) == before
-    assert any("is outside the dataset" in line for line in said)
-    assert any(line.startswith("not moved, as it is outside the dataset") for line in said)
 
 
 @pytest.mark.parametrize("name", ["../x", "a b", "", ".hidden", "x" * 200])

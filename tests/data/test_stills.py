@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.data.frame_cache import open_frame_cache
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.data.pictures import decode_picture, to_png
 from manip_il.errors import ManipError
@@ -58,22 +56,10 @@ def test_pictures_come_back_bit_for_bit(root, seen, pictured):
     assert FRONT not in blind.columns
 
 
-def test_data_files_with_a_row_group_a_frame_are_read_in_few_parts(root, tmp_path):
-    [path] = root.glob("data/*/*.parquet")
-    table, whole = pq.read_table(path), open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "before")
-    pq.write_table(table, path, row_group_size=1)
-    assert len(Dataset.open(root).camera(FRONT).parts) == -(-table.num_rows // 500)
-    again = open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "after")
-    assert whole is not None
-    assert again is not None
-    np.testing.assert_array_equal(again[FRONT], whole[FRONT])
-
-
-def test_the_cache_of_pictures_and_lerobot_read_the_same(root, seen, tmp_path):
-    frames = open_frame_cache(root, [FRONT], max_bytes=10**9, folder=tmp_path / "cache")
-    assert frames is not None
+def test_the_decoded_pictures_and_lerobots_are_the_same(root, seen):
+    frames = Dataset.open(root).camera(FRONT).decode()
     whole = np.concatenate([episode.columns[FRONT] for episode in seen])
-    np.testing.assert_array_equal(frames[FRONT], whole.transpose(0, 3, 1, 2))
+    np.testing.assert_array_equal(frames, whole.transpose(0, 3, 1, 2))
     dataset: Any = LeRobotDataset("local/stills", root=root)
     picture = dataset[8][FRONT]
     exact = picture if picture.dtype == torch.uint8 else (picture * 255).round()
