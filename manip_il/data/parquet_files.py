@@ -37,11 +37,12 @@ class ParquetFiles:
         self._path = folder
         self._writer: pq.ParquetWriter | None = None
         self._waiting: list[pa.Table] = []
+        self._waiting_bytes = 0
 
     def next_place(self) -> tuple[int, int]:
         """Return the chunk and file index that the next rows go to."""
         written = self._path.stat().st_size if self._writer is not None else 0
-        if written + sum(table.nbytes for table in self._waiting) >= self._limit:
+        if written + self._waiting_bytes >= self._limit:
             self.close()
         return layout.numbered(self._template, self._number)[1:]
 
@@ -49,6 +50,7 @@ class ParquetFiles:
         """Append rows; return the chunk and file index that they go to."""
         place = self.next_place()
         self._waiting.append(table)
+        self._waiting_bytes += table.nbytes
         if sum(map(len, self._waiting)) >= self._group_rows:
             self._flush()
         return place
@@ -63,7 +65,8 @@ class ParquetFiles:
             self._number += 1
 
     def _flush(self) -> None:
-        table, self._waiting = pa.concat_tables(self._waiting).combine_chunks(), []
+        table = pa.concat_tables(self._waiting).combine_chunks()
+        self._waiting, self._waiting_bytes = [], 0
         if self._writer is None:
             self._path = self._folder / layout.numbered(self._template, self._number)[0]
             self._path.parent.mkdir(parents=True, exist_ok=True)

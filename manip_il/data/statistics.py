@@ -21,6 +21,8 @@ from manip_il.data.lerobot_layout import QUANTILES, STAT_NAMES, STATS
 from manip_il.errors import ManipError
 
 Statistics = dict[str, dict[str, NDArray[Any]]]  # column -> name -> one value a dimension
+F64 = NDArray[np.float64]
+_POOLED = tuple(name for name in STAT_NAMES if name != "count")
 _LEVELS = np.arange(256)  # of a pixel
 
 
@@ -33,12 +35,14 @@ def column_statistics(columns: Mapping[str, NDArray[Any]]) -> Statistics:
     places = quantile_places(count)
     rows.partition(sorted(set(places.values())), axis=1)
     found |= {name: rows[:, place].copy() for name, place in places.items()}
-    cuts = np.cumsum([values.shape[1] for values in flat.values()])[:-1]
-    split = {name: np.split(values, cuts) for name, values in found.items()}
-    return {
-        key: {name: np.array([count]) if name == "count" else split[name][place] for name in STAT_NAMES}
-        for place, key in enumerate(flat)
-    }
+    found["count"] = np.full(len(rows), count)
+    statistics: Statistics = {}
+    start = 0
+    for key, values in flat.items():
+        stop = start + values.shape[1]
+        statistics[key] = {name: found[name][start : start + 1 if name == "count" else stop] for name in STAT_NAMES}
+        start = stop
+    return statistics
 
 
 def picture_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
@@ -66,36 +70,44 @@ def quantile_places(count: int) -> dict[str, int]:
 
 
 class PooledStatistics:
-    """Statistics of all episodes that were added."""
+    """Statistics of all episodes that were added, which have the same columns."""
 
     def __init__(self) -> None:
-        self._sums: Statistics = {}
+        self._first: Statistics = {}
+        self._sums: dict[str, F64] = {}  # by name, of all columns in a row
+        self._count = 0
 
     def add(self, episode: Statistics) -> None:
-        """Add the statistics of one episode, of any columns.
+        """Add the statistics of one episode.
 
         Mean and std as in Chan et al. (1979), Updating formulae and a pairwise algorithm, eq. 2.1.
         """
-        for key, new in episode.items():
-            old = self._sums.get(key)
-            if old is None:
-                self._sums[key] = dict(new)
-                continue
-            count, more = int(old["count"][0]), int(new["count"][0])
-            share = more / (count + more)
-            apart = new["mean"] - old["mean"]
-            spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
-            self._sums[key] = {
-                **{name: old[name] + share * (new[name] - old[name]) for name in ("mean", *(QUANTILES & old.keys()))},
-                "min": np.minimum(old["min"], new["min"]),
-                "max": np.maximum(old["max"], new["max"]),
-                "std": np.sqrt(spread),
-                "count": np.array([count + more]),
-            }
+        new = {name: np.concatenate([one[name].ravel() for one in episode.values()]) for name in _POOLED}
+        more = int(next(iter(episode.values()))["count"][0])
+        old, self._count = self._sums, self._count + more
+        if not old:
+            self._first, self._sums = episode, new
+            return
+        share = more / self._count
+        apart = new["mean"] - old["mean"]
+        spread = (1 - share) * old["std"] ** 2 + share * new["std"] ** 2 + share * (1 - share) * apart**2
+        self._sums = {name: old[name] + share * (new[name] - old[name]) for name in ("mean", *QUANTILES)} | {
+            "min": np.minimum(old["min"], new["min"]),
+            "max": np.maximum(old["max"], new["max"]),
+            "std": np.sqrt(spread),
+        }
 
     def result(self) -> Statistics:
         """Return the statistics of all frames."""
-        return {key: {name: table[name] for name in STAT_NAMES if name in table} for key, table in self._sums.items()}
+        statistics: Statistics = {}
+        start = 0
+        for key, one in self._first.items():
+            shape, size = one["mean"].shape, one["mean"].size
+            own = {name: values[start : start + size].reshape(shape) for name, values in self._sums.items()}
+            own["count"] = np.array([self._count])
+            statistics[key] = {name: own[name] for name in STAT_NAMES}
+            start += size
+        return statistics
 
 
 def to_lists(statistics: Statistics) -> dict[str, dict[str, list[Any]]]:
