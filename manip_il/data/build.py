@@ -1,4 +1,4 @@
-"""Make datasets of what is on disk: of a folder of journals (`build`), or of several datasets (`merge_datasets`)."""
+"""Make datasets of what is on disk: of a folder of journals, of several datasets, of one with other numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import itertools
 import json
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -22,7 +22,7 @@ from manip_il.data.episodes import Selection
 from manip_il.data.fingerprint import compare_fingerprints
 from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import Header, list_episodes, read_journal
-from manip_il.data.lerobot_write import DatasetWriter, new_dataset
+from manip_il.data.lerobot_write import Columns, EpisodeWriter, new_dataset
 from manip_il.data.schema import RobotTaskSpec, check_same_spec
 from manip_il.data.video_config import VideoConfig
 from manip_il.errors import ManipError, MismatchError
@@ -58,7 +58,7 @@ class Recording:
 
     def open(
         self, root: Path, spec: RobotTaskSpec, fingerprint: Mapping[str, Any], *, replace: bool = False
-    ) -> AbstractContextManager[DatasetWriter]:
+    ) -> AbstractContextManager[EpisodeWriter]:
         """Return the dataset's writer; raises what `new_dataset` raises."""
         video, spec = VideoConfig.from_json(self.video), dataclasses.replace(spec, video=not self.stills)
         return new_dataset(root, spec, repo_id=self.repo_id, fingerprint=fingerprint, video=video, replace=replace)
@@ -160,6 +160,24 @@ def merge_datasets(
             for number, episode in enumerate(one.read_episodes(pictures=not films)):
                 writer.add(episode, (one, number) if films else None)
         return writer.finish({**(provenance or {}), "merged": sources})
+
+
+def rewrite_columns(
+    dataset: Dataset, target: Path, columns: Iterable[Columns], provenance: Mapping[str, Any], **options: Any
+) -> DatasetInfo:
+    """Write a dataset to `target` with these columns in place of its own; films are copied.
+
+    columns: of every episode in stored order, name -> (T,) or (T, d). options: those of `new_dataset`. Raises what
+    `new_dataset` and `EpisodeWriter` raise, `ManipError` for columns of other lengths than the episodes.
+    """
+    spec = dataset.spec
+    episodes = dataset.read_episodes(pictures=not spec.video)
+    with new_dataset(target, spec, **options) as writer:
+        for number, (episode, fresh) in enumerate(zip(episodes, columns, strict=True)):
+            own = episode.columns | {key: values.reshape(len(values), -1) for key, values in fresh.items()}
+            changed = dataclasses.replace(episode, columns=own)
+            writer.add(changed, (dataset, number) if spec.video and spec.cameras else None)
+        return writer.finish(provenance)
 
 
 def dataset_sha256(root: Path) -> str:

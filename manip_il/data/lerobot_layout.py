@@ -12,8 +12,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from manip_il.data.schema import RobotTaskSpec, features
-
+Features = dict[str, dict[str, Any]]  # column or camera -> dtype, shape of a frame, names
 VERSION = "v3.0"
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -47,80 +46,90 @@ VIDEO_COLUMNS = {  # of meta/episodes, behind `videos/<camera column>/`
 STAT_NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 
-def all_features(spec: RobotTaskSpec) -> dict[str, dict[str, Any]]:
-    """Return our features and LeRobot's own five, in the order of the columns."""
-    own = {key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}
-    return {**features(spec), **own}
+def all_features(own: Features) -> Features:
+    """Return a dataset's own features and LeRobot's five, in the order of the columns."""
+    return {**own, **{key: {"dtype": dtype, "shape": (1,), "names": None} for key, dtype in _INDEX_DTYPES.items()}}
 
 
 def info_json(
-    spec: RobotTaskSpec,
-    episodes: int,
-    frames: int,
+    features: Features,
+    fps: float,
+    robot_type: str | None,
+    counts: tuple[int, int, int],
     file_sizes: tuple[float, float],
     videos: dict[str, dict[str, Any]],
-    tasks: int = 1,
 ) -> dict[str, Any]:
     """Return content of `meta/info.json`, keys in LeRobot's order.
 
-    file_sizes: of data and video files [MB]. videos: camera column -> the `info` of its video files. tasks: how many
-    texts its episodes have.
+    features: all of them. counts: of episodes, frames, and texts. file_sizes: of data and video files [MB]. videos:
+    camera column -> the `info` of its video files.
     """
-    table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in all_features(spec).items()}
+    table = {key: {**feature, "shape": list(feature["shape"])} for key, feature in features.items()}
     for key, info in videos.items():
         table[key]["info"] = info
     return {
         "codebase_version": VERSION,
-        "fps": spec.fps,
+        "fps": fps,
         "features": table,
-        "total_episodes": episodes,
-        "total_frames": frames,
-        "total_tasks": tasks,
+        "total_episodes": counts[0],
+        "total_frames": counts[1],
+        "total_tasks": counts[2],
         "chunks_size": CHUNKS_SIZE,
         "data_files_size_in_mb": file_sizes[0],
         "video_files_size_in_mb": file_sizes[1],
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if videos else None,
-        "robot_type": spec.lerobot_type,
-        "splits": {"train": f"0:{episodes}"},
+        "robot_type": robot_type,
+        "splits": {"train": f"0:{counts[0]}"},
     }
 
 
-def data_schema(spec: RobotTaskSpec) -> pa.Schema:
+def data_schema(features: Features) -> pa.Schema:
     """Return Arrow schema of the data files: shape (1,) is a plain value, a vector a list of fixed size.
 
     Its metadata holds the Hugging Face features that `datasets` reads.
     """
     fields: list[pa.Field] = []
     hugging_face: dict[str, Any] = {}
-    for key, feature in all_features(spec).items():
-        if key in spec.image_keys:
-            if not spec.video:  # else in files of their own
-                fields.append(pa.field(key, PICTURE))
-                hugging_face[key] = {"_type": "Image"}
+    for key, feature in features.items():
+        if feature["dtype"] == "video":  # in files of their own
             continue
-        value = {"dtype": feature["dtype"], "_type": "Value"}
-        dtype = pa.type_for_alias(feature["dtype"])
-        size: int = feature["shape"][0]
-        if feature["shape"] != (1,):
-            dtype = pa.list_(dtype, size)
-            value = {"feature": value, "length": size, "_type": "List"}
+        if feature["dtype"] == "image":
+            fields.append(pa.field(key, PICTURE))
+            hugging_face[key] = {"_type": "Image"}
+            continue
+        value: dict[str, Any] = {"dtype": feature["dtype"], "_type": "Value"}
+        dtype, shape = pa.type_for_alias(feature["dtype"]), feature["shape"]
+        if len(shape) > 1:
+            value |= {"shape": list(shape), "_type": f"Array{len(shape)}D"}
+            for _ in shape:
+                dtype = pa.list_(dtype)
+        elif shape != (1,):
+            dtype = pa.list_(dtype, shape[0])
+            value = {"feature": value, "length": shape[0], "_type": "List"}
         fields.append(pa.field(key, dtype))
         hugging_face[key] = value
     metadata = {"huggingface": json.dumps({"info": {"features": hugging_face}})}
     return pa.schema(fields, metadata=metadata)
 
 
-def episodes_schema(spec: RobotTaskSpec) -> pa.Schema:
-    """Return Arrow schema of `meta/episodes`: one row an episode, statistics of every column included."""
+def episodes_schema(features: Features, *, drawn: bool) -> pa.Schema:
+    """Return Arrow schema of `meta/episodes`: one row an episode, statistics of every column included.
+
+    drawn: with a column of what episodes drew.
+    """
     columns = {EPISODE_INDEX: pa.int64(), "tasks": pa.list_(pa.string())}
     for name in ("length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index"):
         columns[name] = pa.int64()
-    columns[DRAWN] = pa.string()
-    for key in spec.image_keys if spec.video else ():
-        columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
-    for key in all_features(spec):
-        columns |= {f"stats/{key}/{name}": _stat_type(name, key in spec.image_keys) for name in STAT_NAMES}
+    if drawn:
+        columns[DRAWN] = pa.string()
+    for key, feature in features.items():
+        if feature["dtype"] == "video":
+            columns |= {f"videos/{key}/{name}": dtype for name, dtype in VIDEO_COLUMNS.items()}
+    for key, feature in features.items():
+        if feature["dtype"] != "string":
+            is_picture = feature["dtype"] in ("video", "image")
+            columns |= {f"stats/{key}/{name}": _stat_type(name, is_picture) for name in STAT_NAMES}
     return pa.schema(columns | dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64()))
 
 

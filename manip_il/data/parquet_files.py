@@ -82,12 +82,14 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def to_table(columns: Mapping[str, NDArray[Any]], schema: pa.Schema) -> pa.Table:
-    """Return columns (T,) and (T, d) as an Arrow table, vectors as lists, pictures as PNG."""
+    """Return columns (T,) and (T, ...) as an Arrow table: vectors as lists, pictures as PNG."""
     arrays: list[pa.Array] = []
     for field in schema:
         values = columns[field.name]
         if field.type == layout.PICTURE:
             arrays.append(pa.array([{"bytes": to_png(picture), "path": None} for picture in values], field.type))
+        elif values.ndim > 2:
+            arrays.append(pa.array(values.tolist(), field.type))
         elif values.ndim > 1:
             flat = pa.array(np.ascontiguousarray(values).reshape(-1), field.type.value_type)
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(field.type))

@@ -44,7 +44,7 @@ def test_episodes_come_back_bit_for_bit(root, episodes):
 
 def test_a_table_holds_whole_columns(root, episodes, spec):
     table = Dataset.open(root).columns()
-    assert list(table) == list(layout.all_features(spec))
+    assert list(table) == list(layout.all_features(s.features(spec)))
     assert table[s.SIM_STATE].shape == (20, spec.sim_state_size)
     assert table[s.SIM_STATE].dtype == np.float64
     assert table["episode_index"].tolist() == [0] * 7 + [1] + [2] * 12

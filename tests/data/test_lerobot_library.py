@@ -121,9 +121,11 @@ def test_the_layout_is_the_librarys(spec):
     assert layout.DATA_FILES_SIZE_IN_MB == utils.DEFAULT_DATA_FILE_SIZE_IN_MB
     assert layout.VIDEO_FILES_SIZE_IN_MB == utils.DEFAULT_VIDEO_FILE_SIZE_IN_MB
     assert layout.VIDEO_PATH == utils.DEFAULT_VIDEO_PATH
-    assert layout.all_features(spec) == s.features(spec) | DEFAULT_FEATURES
-    hugging_face = json.loads(layout.data_schema(spec).metadata[b"huggingface"])["info"]["features"]
-    assert hugging_face == get_hf_features_from_features(layout.all_features(spec)).to_dict()
+    assert layout.all_features(s.features(spec)) == s.features(spec) | DEFAULT_FEATURES
+    hugging_face = json.loads(layout.data_schema(layout.all_features(s.features(spec))).metadata[b"huggingface"])[
+        "info"
+    ]["features"]
+    assert hugging_face == get_hf_features_from_features(layout.all_features(s.features(spec))).to_dict()
 
 
 def test_video_settings_are_the_librarys():
