@@ -17,8 +17,7 @@ from manip_il.collect.environments import env_actions, env_fingerprint, make_exp
 from manip_il.collect.rollout import Labeller
 from manip_il.collect.source import Source
 from manip_il.data import schema
-from manip_il.data.build import dataset_sha256
-from manip_il.data.build import rewrite_columns
+from manip_il.data.build import dataset_sha256, rewrite_columns
 from manip_il.mdp import Episode, State
 from manip_il.sim.config import EnvConfig
 

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from av.container import InputContainer
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data.episode_table import EpisodeTable
 from manip_il.data.info import Info
 from manip_il.data.parquet_files import read_file
-from manip_il.data.pictures import Pictures, VideoReader, decode_cell
+from manip_il.data.pictures import UNREADABLE, Pictures, decode_cell, open_video, read_frames, unreadable
 from manip_il.errors import ManipError, MismatchError, UnknownName
 
 I64 = NDArray[np.int64]
@@ -147,7 +148,7 @@ class Camera:
         path, first = self.root / part.path, part.first + int(rows[0]) - part.row
         changed = path.stat().st_mtime_ns if path.exists() else 0
         if self.films:
-            pictures = _reader(path, changed, threading.get_ident()).read(path, first, len(rows), self.fps)
+            pictures = read_frames(path, _film(path, changed, threading.get_ident()), first, len(rows), self.fps)
         else:
             try:
                 cells = _table(path, changed, self.key)[first : first + len(rows)]
@@ -164,9 +165,12 @@ class Camera:
 
 
 @lru_cache(_OPEN_FILMS)
-def _reader(path: Path, changed: int, thread: int) -> VideoReader:
-    """Return the reader of one file, as it is since `changed`, for one thread."""
-    return VideoReader()
+def _film(path: Path, changed: int, thread: int) -> InputContainer:
+    """Open a file, as it is since `changed`, for one thread: opening a long one takes longer than decoding an episode."""
+    try:
+        return open_video(path)
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
 
 
 @lru_cache(_OPEN_TABLES)

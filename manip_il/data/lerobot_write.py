@@ -7,7 +7,6 @@ files in a few milliseconds an episode, and the dataset is there whole or not at
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from pathlib import Path

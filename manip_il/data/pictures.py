@@ -24,7 +24,7 @@ _OPTIONS = {
     "protocol_whitelist": "file",
     "enable_drefs": "0",  # tracks that are in other files
 }
-_UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
+UNREADABLE = (av.FFmpegError, OSError, ValueError, OverflowError, IndexError)  # the last: there is no video stream
 _FORMATS = ("PNG", "JPEG")
 _LEVEL = 1  # of compression: the next ones save a tenth and take twice as long
 
@@ -81,34 +81,18 @@ def open_video(path: Path) -> InputContainer:
     return container
 
 
-class VideoReader:
-    """Frames of video files, one file open at a time: opening a long one takes longer than decoding an episode."""
+def read_frames(path: Path, container: InputContainer, first: int, count: int, fps: float) -> Pictures:
+    """Decode frames `first` to `first + count - 1` of an open video, (count, height, width, 3).
 
-    def __init__(self) -> None:
-        self._path: Path | None = None
-        self._container: InputContainer | None = None
-
-    def read(self, path: Path, first: int, count: int, fps: float) -> Pictures:
-        """Decode frames `first` to `first + count - 1`, (count, height, width, 3).
-
-        Raises `ManipError` for a file that cannot be read or does not hold each of them.
-        """
-        try:
-            if self._container is None or self._path != path:
-                self.close()
-                self._container, self._path = open_video(path), path
-            pictures = _decode(self._container, first, count, fps)
-        except _UNREADABLE as error:
-            raise _unreadable(path, error) from error
-        if len(pictures) != count:
-            raise ManipError(f"{path} has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
-        return np.stack(pictures)
-
-    def close(self) -> None:
-        """Close the open file, if any."""
-        if self._container is not None:
-            self._container.close()
-            self._path = self._container = None
+    Raises `ManipError` for a file that cannot be read or does not hold each of them.
+    """
+    try:
+        pictures = _decode(container, first, count, fps)
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
+    if len(pictures) != count:
+        raise ManipError(f"{path} has no frame {first + len(pictures)}; its dataset counts {count} from {first} on")
+    return np.stack(pictures)
 
 
 def _decode(container: InputContainer, first: int, count: int, fps: float) -> list[NDArray[np.uint8]]:
@@ -128,6 +112,7 @@ def _decode(container: InputContainer, first: int, count: int, fps: float) -> li
     return pictures
 
 
-def _unreadable(path: Path, error: Exception) -> ManipError:
+def unreadable(path: Path, error: Exception) -> ManipError:
+    """Return the error of a video that cannot be read."""
     reason = "it holds no video" if isinstance(error, IndexError) else getattr(error, "strerror", None) or str(error)
     return ManipError(f"cannot read {path}: {reason}")

@@ -18,8 +18,8 @@ from manip_il.collect.relabel import Changes, label_states, relabel_dataset
 from manip_il.collect.source import open_source
 from manip_il.data import lerobot_layout as layout
 from manip_il.data import schema
-from manip_il.data.dataset import Dataset
 from manip_il.data.build import rewrite_columns, write_dataset
+from manip_il.data.dataset import Dataset
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
 from manip_il.seeding import stream_seeds
