@@ -192,7 +192,7 @@ def dataset_sha256(root: Path) -> str:
 def _check_mergeable(left_name: str, left: RobotTaskSpec, right_name: str, right: RobotTaskSpec) -> None:
     """Compare what must be the same for a policy, and what a dataset has only one of."""
     check_same_spec(left_name, left, right_name, right)
-    for what in ("instruction", "sim_state_size", "task"):
+    for what in ("sim_state_size", "task"):
         left_value, right_value = getattr(left, what), getattr(right, what)
         if left_value != right_value and UNKNOWN_TASK not in (left_value, right_value):
             raise MismatchError(what, left_name, left_value, right_name, right_value)

@@ -166,7 +166,7 @@ class Camera:
 
 @lru_cache(_OPEN_FILMS)
 def _film(path: Path, changed: int, thread: int) -> InputContainer:
-    """Open a file, as it is since `changed`, for one thread: opening a long one takes longer than decoding an episode."""
+    """Open a file, as it is since `changed`, for one thread: opening takes longer than decoding an episode."""
     try:
         return open_video(path)
     except UNREADABLE as error:

@@ -5,6 +5,7 @@ Beside LeRobot's files a dataset of this program has `meta/manip_il.json` (`own`
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -110,7 +111,8 @@ class Dataset:
         without actions.
         """
         if self.own is not None:
-            return self.own.spec
+            one = len(self.tasks) == 1  # else every episode has its own
+            return dataclasses.replace(self.own.spec, instruction=self.instruction) if one else self.own.spec
         features = self.features
         if s.ACTION not in features:
             raise ManipError(f"{self.root} has no column {s.ACTION}: there is nothing to learn from it")
@@ -235,7 +237,7 @@ class Dataset:
             root=self.root,
             robot=own.spec.robot if own else s.robot_of(self.info.robot or UNKNOWN_ROBOT)["robot"],
             task=own.spec.task if own else UNKNOWN_TASK,
-            instruction=own.spec.instruction if own else self.instruction,
+            instruction=self.spec.instruction if own else self.instruction,
             fps=self.fps,
             episodes=self.info.episodes,
             frames=self.info.frames,
