@@ -19,7 +19,6 @@ from manip_il.data.dataset import Dataset
 from manip_il.doctor.examine import examine_folder, repair
 from manip_il.doctor.patient import Patient
 from manip_il.errors import ManipError, UsageError
-from manip_il.mcap.export import open_source
 from manip_il.sim.conditions import Condition
 
 from ..damage import digests, edit_json, lines
@@ -173,7 +172,7 @@ def test_a_journal_whose_header_holds_null_is_refused(tmp_path, episodes, spec, 
 def test_what_info_says_is_checked_by_every_reader(victim, change, words):
     edit_json(victim / layout.INFO, lambda info: info.update(change))
     assert any(words in line for line in lines(victim))
-    for read in (Dataset.open, open_source, lambda root: episode_frames(root, FRONT, 0)):
+    for read in (Dataset.open, lambda root: episode_frames(root, FRONT, 0)):
         with pytest.raises(ManipError) as error:
             read(victim)
         assert words in str(error.value)
@@ -185,7 +184,7 @@ def test_a_feature_named_as_a_path_leads_nowhere(victim, tmp_path):
     assert (victim / "videos" / key).resolve() == secret
     edit_json(victim / layout.INFO, lambda info: info["features"].update({key: info["features"].pop(FRONT)}))
     assert any("a feature is '../../secret'" in line for line in lines(victim))
-    for read in (Dataset.open, open_source, lambda root: episode_frames(root, key, 0)):
+    for read in (Dataset.open, lambda root: episode_frames(root, key, 0)):
         with pytest.raises(ManipError, match=r"a feature is '\.\./\.\./secret'"):
             read(victim)
 
