@@ -41,6 +41,7 @@ class Source:
     video: bool | None = None
 
     def __post_init__(self) -> None:
+        checks.text("topic", self.topic, checks.LONGEST_NAME)
         if self.is_camera == bool(self.paths):
             raise UsageError("expected either field or video")
         if self.dtype not in (*NUMBERS, TEXT):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -20,8 +19,6 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import MCAP0_MAGIC
 
-from manip_il.data import lerobot_layout as layout
-from manip_il.data.dataset import Dataset
 from manip_il.data.journal import Journal
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
 from manip_il.errors import ManipError
@@ -53,23 +50,6 @@ def test_messages_out_of_order_are_sorted_and_the_last_one_of_a_stamp_counts(tmp
     messages = [(0, {"x": 1}), (200, {"x": 3}), (100, {"x": 9}), (100, {"x": 2})]
     path = write(tmp_path / "a.mcap", {"/a": messages})
     assert [row["f"].item() for row in read_frames(path, load(tmp_path, {"f": feature()}))] == [1, 2, 3]
-
-
-def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path) -> None:
-    big, small = 2**63 - 1, 5e-324
-    contents = [{"i": big - n, "f": [small * n, -0.0], "b": n == 1, "s": f"é\n{n}"} for n in range(3)]
-    path = write(tmp_path / "a.mcap", {"/a": [(n * 100, content) for n, content in enumerate(contents)]})
-    features = {
-        "i": feature(field="i", dtype="int64"),
-        "f": feature(field=["f[:]", "f[0]"], shape=[3, 1], names=None),
-        "b": feature(field="b", dtype="bool"),
-        "s": feature(field="s", dtype="string"),
-    }
-    task = {"topic": "/a", "field": "s", "resample": "previous", "tolerance": 0}
-    for n, row in enumerate(read_frames(path, load(tmp_path, features, task=task))):
-        assert (row["i"].item(), row["b"].item(), row["s"], row["task"]) == (big - n, n == 1, f"é\n{n}", f"é\n{n}")
-        assert row["f"].tobytes() == np.array([small * n, -0.0, small * n]).tobytes()
-        assert row["f"].shape == (3, 1)
 
 
 def picture(number: int) -> np.ndarray:
@@ -106,13 +86,9 @@ def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
     [
         (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s .*nearest allows 0\.02 s: raise its tolerance"),
         ([(0, {"x": "1"})], {}, r"topic /a, f at 0 ns: \['1'\]; expected float64"),
-        ([(0, {"x": None})], {}, r"\[None\]; expected"),
         ([(0, {"x": 1}), (100, {"x": float("nan")})], {}, r"f at 100000000 ns: \[nan\]; expected finite numbers"),
         ([(0, {"x": 1e39})], {"dtype": "float32"}, r"\[1e\+39\]; expected finite numbers of float32"),
         ([(0, {"x": 1.5})], {"dtype": "int64"}, r"\[1.5\]; expected finite numbers of int64"),
-        ([(0, {"x": 2**63})], {"dtype": "int64"}, "f at 0 ns: .*too large"),
-        ([(0, {"x": 2})], {"dtype": "bool"}, r"\[2\]; expected finite numbers of bool"),
-        ([(0, {"x": 2})], {"dtype": "string"}, r"\[2\]; expected string"),
         ([(0, {"x": [1, 2]})], {"names": ["a"]}, "f at 0 ns: 2 values; expected 1"),
         ([(0, {"x": 1}), (100, {"y": 1})], {}, "f at 100000000 ns: no field 'x'"),
         (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a, /late, /steady"),
@@ -129,37 +105,19 @@ def test_what_cannot_be_is_refused_by_file_topic_and_time(
 
 
 @pytest.mark.parametrize(
-    ("encoding", "why"), [("cdr", "for ROS 2: pip install mcap-ros2-support"), ("ros1", "convert the file")]
-)
-def test_an_encoding_that_cannot_be_read_is_refused_with_a_remedy(tmp_path: Path, encoding: str, why: str) -> None:
-    path = write(tmp_path / "ros.mcap", {"/a": ramp(STEADY)}, encoding)
-    with pytest.raises(
-        ManipError, match=rf"ros\.mcap: messages are {encoding} .*expected protobuf, json or cdr.*{why}"
-    ):
-        list(read_frames(path, load(tmp_path, {"f": feature()})))
-
-
-@pytest.mark.parametrize("keep", [0, 0.3, 0.99])
-def test_a_file_that_is_cut_is_refused(tmp_path: Path, keep: float) -> None:
-    path = write(tmp_path / "cut.mcap", {"/a": ramp(range(1000))})
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
-    with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: ."):
-        list(read_frames(path, load(tmp_path, {"f": feature()})))
-
-
-@pytest.mark.parametrize(
-    ("message", "why"),
+    ("message", "encoding", "why"),
     [
-        (raw(0, "mono8"), "encoded as 'mono8'; expected rgb8 or bgr8"),
-        (RawImage(width=6, height=4, encoding="rgb8", data=b"12"), "cannot reshape"),
-        (CompressedImage(format="png", data=b"no"), "it is not a PNG or JPEG"),
-        ({"x": 1}, "a picture encoded as 'none'"),
+        (raw(0, "mono8"), "", "topic /a at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
+        (CompressedImage(format="png", data=b"no"), "", "topic /a at 0 ns: it is not a PNG or JPEG"),
+        ({"x": 1}, "cdr", r"messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2-support"),
     ],
 )
-def test_what_is_no_picture_is_refused(tmp_path: Path, message: Any, why: str) -> None:
-    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]})
+def test_what_is_no_picture_or_of_another_encoding_is_refused(
+    tmp_path: Path, message: Any, encoding: str, why: str
+) -> None:
+    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]}, encoding)
     mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
-    with pytest.raises(ManipError, match=rf"p\.mcap, topic /a at 0 ns: .*{why}"):
+    with pytest.raises(ManipError, match=rf"p\.mcap.* {why}"):
         list(read_frames(path, mapping))
 
 
@@ -185,9 +143,6 @@ def test_files_are_taken_in_the_order_of_their_names(tmp_path: Path) -> None:
     for name in ("b.mcap", "a.mcap", ".c.mcap", "d.txt"):
         (tmp_path / name).touch()
     assert [path.name for path in list_files(tmp_path)] == ["a.mcap", "b.mcap"]
-    assert list_files(tmp_path / "b.mcap") == [tmp_path / "b.mcap"]
-    with pytest.raises(ManipError, match=r"is no file, and holds no \*\.mcap files"):
-        list_files(tmp_path / "x")
 
 
 @pytest.mark.slow
@@ -238,26 +193,31 @@ list(import_files([source / "a.mcap"] * 2, target, load_mapping(source / "m.yaml
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("video", "fps"), [(False, 9.99), (True, 10)])
-def test_two_imports_give_the_same_bytes_at_any_rate(tmp_path: Path, video: bool, fps: float) -> None:
+def test_two_imports_give_the_same_bytes(tmp_path: Path) -> None:
     big = np.zeros((64, 64, 3), np.uint8)
     pictures = [(stamp, CompressedImage(format="png", data=encoded(big + stamp // 10))) for stamp in STEADY]
-    write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/b": ramp(STEADY), "/c": pictures})
-    camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02, "video": video}
-    load(tmp_path, {"observation.state": feature(), "action": feature("/b"), "observation.images.c": camera}, fps=fps)
+    write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/c": pictures})
+    camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02}
+    stills, film = {**camera, "video": False}, {**camera, "video": True}
+    load(tmp_path, {"action": feature(), "observation.images.a": stills, "observation.images.b": film})
     for seed in ("1", "2"):  # of the order of sets
         command = [sys.executable, "-c", IMPORT, str(tmp_path), str(tmp_path / seed)]
         subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed})
     assert digests(tmp_path / "1") == digests(tmp_path / "2")
-    assert json.loads((tmp_path / "1" / layout.INFO).read_text())["fps"] == fps
-    stamps = Dataset.open(tmp_path / "1").columns([layout.TIMESTAMP])[layout.TIMESTAMP]
-    np.testing.assert_array_equal(stamps[:9], (np.arange(9) / fps).astype(np.float32))
 
 
 @pytest.mark.slow
-def test_files_that_do_not_fit_each_other_leave_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [(False, r"shape of 'f' differs: .*b\.mcap has \(3,\), .*a\.mcap has \(2,\)"), (True, r"cannot read .*b\.mcap: .")],
+)
+def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(
+    tmp_path: Path, damage: bool, why: str
+) -> None:
     first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
     second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
-    with pytest.raises(ManipError, match=r"shape of 'f' differs: .*b\.mcap has \(3,\), .*a\.mcap has \(2,\)"):
+    if damage:
+        second.write_bytes(first.read_bytes()[:-20])
+    with pytest.raises(ManipError, match=why):
         list(import_files([first, second], tmp_path / "new", load(tmp_path, {"f": feature()})))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "m.yaml"]
