@@ -155,9 +155,10 @@ def test_lerobots_comes_back_with_its_tasks_odd_columns_and_pictures(tmp_path: P
     mapping = load_mapping(tmp_path / "out" / MAPPING)
     assert list(import_files(list_files(tmp_path / "out"), tmp_path / "new", mapping)) == [4, 5]
     left, right = Dataset.open(root), Dataset.open(tmp_path / "new")
-    assert (right.fps, right.info.robot, right.tasks) == (30, "", left.tasks)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "new", "out"]
-    names = [key for key in left.features if key not in left.cameras]
+    assert (right.fps, right.info.robot) == (30, "")
+    texts = [[one.tasks[i] for i in one.columns(["task_index"])["task_index"].tolist()] for one in (left, right)]
+    assert texts[0] == texts[1] == 2 * ["wipe"] + 2 * ["fold, 100 %"] + 2 * ["wipe"] + 3 * ["fold, 100 %"]
+    names = [key for key in left.features if key not in (*left.cameras, "task_index")]
     for key, values in left.columns(names).items():
         new = right.columns(names)[key]
         assert (new.dtype, new.tolist(), right.features[key]) == (values.dtype, values.tolist(), left.features[key])
