@@ -61,28 +61,29 @@ def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
 
     Raises `ManipError` naming file and topic for whatever the mapping asks for and the file does not give.
     """
-    found: dict[str, dict[int, Any]] = {source.topic: {} for source in mapping.sources.values()}
-    cameras = {source.topic for source in mapping.sources.values() if source.is_camera}
-    for topic, stamp, content in read_messages(path, found):
-        found[topic][stamp] = None if topic in cameras else content  # of equal stamps the last one counts
-    for topic in found:
-        if not found[topic]:
+    columns: dict[str, dict[str, Source]] = {source.topic: {} for source in mapping.sources.values()}
+    for key, source in mapping.sources.items():
+        columns[source.topic][key] = source
+    found: dict[str, dict[int, Any]] = {key: {} for key in mapping.sources}
+    for topic, stamp, content in read_messages(path, columns):
+        for key, source in columns[topic].items():  # of equal stamps the last message counts
+            where = f"{path}, topic {topic}, {key} at {stamp} ns"
+            found[key][stamp] = None if source.is_camera else _value(where, source, content)
+    stamps: dict[str, I64] = {}
+    for key, source in mapping.sources.items():
+        stamps[source.topic] = np.array(list(found[key]), np.int64)
+        if not found[key]:
             topics = read_topics(path)
-            raise ManipError(
-                f"{path} has no messages of {topic}{nearest(topic, topics)}; its topics: {', '.join(topics)}"
-            )
-    stamps = {topic: np.array(list(messages), np.int64) for topic, messages in found.items()}
+            known = f"{nearest(source.topic, topics)}; its topics: {', '.join(topics)}"
+            raise ManipError(f"{path} has no messages of {source.topic}{known}")
     times = _times(path, stamps, exact_rate(mapping.fps))
-    columns: dict[str, Any] = {TASK: [mapping.task] * len(times)}
+    rows: dict[str, Any] = {TASK: [mapping.task] * len(times)}
     for key, source in mapping.sources.items():
         where = f"{path}, topic {source.topic}, {key}"
         chosen = stamps[source.topic][pick(where, source, stamps[source.topic], times)].tolist()
-        if source.is_camera:
-            columns[key] = read_pictures(path, source.topic, chosen)
-        else:
-            columns[key] = _values(where, source, [(stamp, found[source.topic][stamp]) for stamp in chosen])
-    for values in zip(*columns.values(), strict=True):
-        yield dict(zip(columns, values, strict=True))
+        rows[key] = read_pictures(path, source.topic, chosen) if source.is_camera else map(found[key].get, chosen)
+    for values in zip(*rows.values(), strict=True):
+        yield dict(zip(rows, values, strict=True))
 
 
 def pick(where: str, source: Source, stamps: I64, times: I64) -> I64:
@@ -138,24 +139,21 @@ def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:
     return start + np.array(frame_times(math.ceil((end - start + 1) * rate / NANOSECONDS), rate), np.int64)
 
 
-def _values(where: str, source: Source, messages: list[tuple[int, Any]]) -> Iterator[Any]:
-    """Yield a column's text or array (*shape) in every message. Raises `ManipError` for what its dtype cannot hold."""
-    for stamp, content in messages:
-        try:
-            values = [one for path in source.paths for one in values_at(path, content)]
-            if source.width not in (None, len(values)):
-                raise ValueError(f"{len(values)} values; expected {source.width}")
-            if not all(isinstance(one, str if source.dtype == TEXT else int | float) for one in values):
-                raise ValueError(f"{checks.shorten(values)}; expected {source.dtype}")
-            yield values[0] if source.dtype == TEXT else _numbers(values, source)
-        except (ManipError, OverflowError, ValueError) as error:
-            raise ManipError(f"{where} at {stamp} ns: {error}") from error
-
-
-def _numbers(values: list[Any], source: Source) -> NDArray[Any]:
-    given = np.array(values, object)
-    with np.errstate(over="ignore"):  # which the next line sees
-        numbers = given.astype(source.dtype)
-    if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers != given).any():
-        raise ValueError(f"{checks.shorten(values)}; expected finite numbers of {source.dtype}")
-    return numbers.reshape(source.shape or -1)
+def _value(where: str, source: Source, content: Any) -> Any:
+    """Return a column's text or array (*shape) in a message. Raises `ManipError` for what its dtype cannot hold."""
+    try:
+        values = [one for path in source.paths for one in values_at(path, content)]
+        if source.width not in (None, len(values)):
+            raise ValueError(f"{len(values)} values; expected {source.width}")
+        if not all(isinstance(one, str if source.dtype == TEXT else int | float) for one in values):
+            raise ValueError(f"{checks.shorten(values)}; expected {source.dtype}")
+        if source.dtype == TEXT:
+            return values[0]
+        given = np.array(values, object)
+        with np.errstate(over="ignore"):  # which the next line sees
+            numbers = given.astype(source.dtype)
+        if not np.isfinite(numbers).all() if numbers.dtype.kind == "f" else (numbers != given).any():
+            raise ValueError(f"{checks.shorten(values)}; expected finite numbers of {source.dtype}")
+        return numbers.reshape(source.shape or -1)
+    except (ManipError, OverflowError, ValueError) as error:
+        raise ManipError(f"{where}: {error}") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -84,14 +83,6 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
     read: Any = LeRobotDataset("someone/both", root=both, video_backend="pyav")
     assert read[len(read) - 1]["observation.images.front"].shape == (3, HEIGHT, WIDTH)
     command("lerobot-train", *act_words(both, tmp_path / "run", steps=2), "--batch_size=4")
-
-
-def test_a_dataset_without_our_file_is_still_of_the_robot_that_we_know(simulated, tmp_path):
-    root = shutil.copytree(simulated, tmp_path / "copy")
-    (root / "meta/manip_il.json").unlink()
-    found, before = Dataset.open(root).spec, Dataset.open(simulated).spec
-    for name in ("robot", "robot_type", "action_meaning", "joint_names", "fps"):
-        assert getattr(found, name) == getattr(before, name)
 
 
 @pytest.mark.parametrize("policy", ["act", "cnn"])

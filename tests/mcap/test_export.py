@@ -99,6 +99,8 @@ def test_an_export_read_by_others_holds_the_datasets_values(ours: Path, tmp_path
         for key, topic in ((s.SIM_STATE, "/sim_state"), (s.SEED, "/seed"), (s.REWARD, "/next/reward")):
             values = [[scalar["value"] for scalar in message["scalars"]] for message in found[topic]]
             assert np.ravel(values).tolist() == table[key][rows].ravel().tolist()
+        labels = [scalar["label"] for scalar in found["/sim_state"][0]["scalars"]]
+        assert labels == [f"sim_state_{place}" for place in range(7)]  # as LeRobot labels them
         with path.open("rb") as stream:
             [about] = make_reader(stream).iter_metadata()
         assert about.metadata == {"info": (ours / layout.INFO).read_text(), "episode_index": str(number)}
