@@ -104,8 +104,8 @@ def _channel(column: Feature, values: Any, times: foxglove.Times) -> foxglove.Ch
     values = values.reshape(len(times), -1)
     if _is_joints(column):
         return foxglove.joint_states(topic, column.labels, values, times)
-    labels = column.labels if column.names else [f"{column.key}_{place}" for place in range(column.size)]  # LeRobot's
-    labels = labels if column.names or column.size > 1 else [column.key]
+    unnamed = [column.key] if column.size == 1 else [f"{column.key}_{place}" for place in range(column.size)]
+    labels = column.labels if column.names else unnamed  # as LeRobot labels them
     return foxglove.scalars(topic, labels, (values.astype(np.int64) if values.dtype == bool else values).tolist())
 
 

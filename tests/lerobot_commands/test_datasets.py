@@ -11,17 +11,6 @@ from manip_il.doctor.examine import examine_folder, has_errors
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.gl  # records pictures
-def test_lerobot_dataset_viz_saves_an_episode_for_rerun(command, record, tmp_path):
-    seen = record("seen", 2, "--cameras=front", "--image.height=32", "--image.width=32")
-    words = ["--repo-id=someone/seen", f"--root={seen}", "--episode-index=1", "--save=1", f"--output-dir={tmp_path}"]
-    command("lerobot-dataset-viz", *words)
-    (recording,) = tmp_path.glob("*.rrd")
-    data = recording.read_bytes()
-    for entity in ("observation.images.front", "action", "state", "next.reward"):
-        assert entity.encode() in data, entity
-
-
 def test_lerobot_edit_dataset_merges_varied_worlds_with_plain_ones_and_takes_episodes_out(command, record, tmp_path):
     varied, plain = record("varied", 2, "--vary=dynamics"), record("plain", 2)
     both, rest = tmp_path / "both", tmp_path / "rest"

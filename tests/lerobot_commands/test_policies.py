@@ -9,10 +9,6 @@ from manip_il.sim.env import EnvConfig
 
 pytestmark = pytest.mark.slow
 UNFILMED = "--env.render_mode=none"  # these tests need no OpenGL
-SMALL_ACT = {"type": "act", "device": "cpu", "dim_model": 32, "n_heads": 2, "dim_feedforward": 64} | {
-    "n_encoder_layers": 1, "use_vae": "false", "chunk_size": 5, "n_action_steps": 5, "optimizer_lr": 1e-3,
-    "pretrained_backbone_weights": "null",
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -22,17 +18,13 @@ def demos(record):
 
 @pytest.mark.parametrize(
     ("space", "policy", "batch_size"),
-    [
-        ("joint_target", {"type": "mlp", "width": 32}, 2),
-        ("ee_delta", {"type": "mlp", "width": 32}, 5),
-        ("ee_delta", SMALL_ACT, 3),
-    ],
-    ids=["mlp-async", "mlp-ee_delta", "act-ee_delta"],
+    [("joint_target", "mlp", 2), ("ee_delta", "mlp", 5), ("ee_delta", "act", 3)],
 )
 def test_lerobot_eval_finds_our_success_for_every_seed_and_needs_no_word_of_the_action_space(
-    command, lerobots, trial, demos, tmp_path, space, policy, batch_size
+    command, lerobots, trial, demos, small_act, tmp_path, space, policy, batch_size
 ):
-    words = [f"--policy.{name}={value}" for name, value in policy.items()]
+    options = small_act if policy == "act" else {"type": "mlp", "width": 32}
+    words = [f"--policy.{name}={value}" for name, value in options.items()]
     words += [f"--action_space={space}", "--batch_size=64", "--steps=300", f"--output_dir={tmp_path / 'run'}"]
     assert main(["train", f"--dataset.root={demos}", *words]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
