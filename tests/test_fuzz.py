@@ -38,7 +38,7 @@ from manip_il.errors import ManipError
 from manip_il.evaluation.results import EvalResult
 from manip_il.learn.checkpoint import read_meta
 from manip_il.learn.pretrained import read_interface
-from manip_il.mcap.importing import features_of, frames_of, read_import
+from manip_il.mcap.importing import read_frames
 from manip_il.mcap.mapping import load_mapping
 from manip_il.robots.files import ModelFiles, _compile
 
@@ -56,7 +56,7 @@ ODD: tuple[Any, ...] = (
 )
 MAPPING = """\
 fps: 10
-task: {topic: /words, field: text, resample: hold, tolerance: 10}
+task: {topic: /words, field: text, resample: previous, tolerance: 10}
 features:
   observation.images.front: {topic: /pictures, video: false, resample: nearest, tolerance: 0.2}
   count: {topic: /numbers, field: count, dtype: int64, resample: nearest, tolerance: 0.2}
@@ -154,9 +154,7 @@ def make_mcap(folder: Path) -> None:
 
 
 def read_mcap(folder: Path) -> None:
-    mapping = load_mapping(folder / "mapping.yaml")
-    episode = read_import(folder / "in.mcap", mapping)
-    list(frames_of(episode, mapping, features_of(episode, mapping)))
+    list(read_frames(folder / "in.mcap", load_mapping(folder / "mapping.yaml")))
 
 
 def read_policy(folder: Path) -> None:

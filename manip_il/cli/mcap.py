@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -36,17 +35,18 @@ class McapExportOptions:
 
     def run(self) -> None:
         """Export every episode; the folder appears when it is whole."""
-        from manip_il.mcap.export import MAPPING, export_dataset, open_source
+        from manip_il.data.dataset import Dataset
+        from manip_il.mcap.export import MAPPING, export_dataset, left_out
 
-        info = open_source(self.dataset)
+        dataset = Dataset.open(self.dataset)
         prepare_output(self.out, resume=False, overwrite=self.overwrite)
-        with new_folder(self.out) as folder, progress(info.episodes, "export") as bar:
-            count = 0
-            for _ in export_dataset(self.dataset, info, folder):
-                count += 1
+        with new_folder(self.out) as folder, progress(dataset.info.episodes, "export") as bar:
+            for _ in export_dataset(dataset, folder):
                 bar.advance()
             save_options(folder, self)
-        say(f"exported {count:,} episodes to {self.out}")
+        if missing := left_out(dataset.info):
+            say(f"left out, as MCAP has no place for them: {', '.join(missing)}")
+        say(f"exported {dataset.info.episodes:,} episodes to {self.out}")
         say(f"back to a dataset: manip-il mcap import {self.out} DATASET --mapping={self.out / MAPPING}")
 
 
@@ -55,7 +55,7 @@ class McapImportOptions:
     """Write MCAP files as a LeRobot v3.0 dataset: one episode per file, in the order of their names.
 
     The mapping names the topic and the field of every column, and how its messages are resampled to the dataset's rate:
-    nearest, hold or interpolate, with a tolerance in seconds. A gap beyond it is an error.
+    nearest or previous, with a tolerance in seconds. A gap beyond it is an error.
     """
 
     example: ClassVar[str] = "manip-il mcap import demos_mcap datasets/demos --mapping=demos_mcap/mapping.yaml"
@@ -76,28 +76,16 @@ class McapImportOptions:
         """Import every file; the dataset appears when it is whole."""
         from manip_il.mcap.importing import import_files, list_files
         from manip_il.mcap.mapping import load_mapping
+        from manip_il.mcap.read import read_topics
 
         mapping = load_mapping(self.mapping)
         paths = list_files(self.source)
-        counts: Counter[str] = Counter()
-        used: Counter[str] = Counter()
-        episodes = frames = 0
+        frames = 0
         with progress(len(paths), "import") as bar:
-            for done in import_files(paths, self.dataset, mapping):
+            for count in import_files(paths, self.dataset, mapping):
                 bar.advance()
-                counts.update(done.counts)
-                used.update(done.used)
-                episodes, frames = episodes + 1, frames + done.frames
-        say(_table(counts, used))
-        say(f"imported {episodes:,} episodes, {frames:,} frames to {self.dataset}")
-
-
-def _table(counts: Counter[str], used: Counter[str]) -> str:
-    """Messages of every topic: how many there are, had a part in the dataset, and had none."""
-    width = max(map(len, ["topic", *counts]))
-    lines = [f"{'topic':{width}}  {'messages':>10}  {'used':>10}  {'unused':>10}"]
-    for topic in sorted(counts):
-        rest = counts[topic] - used[topic]
-        note = "" if topic in used else "  not in the mapping"
-        lines.append(f"{topic:{width}}  {counts[topic]:>10,}  {used[topic]:>10,}  {rest:>10,}{note}")
-    return "\n".join(lines)
+                frames += count
+        wanted = {source.topic for source in mapping.sources.values()}
+        if rest := sorted({topic for path in paths for topic in read_topics(path)} - wanted):
+            say(f"topics that the mapping does not name: {', '.join(rest)}")
+        say(f"imported {len(paths):,} episodes, {frames:,} frames to {self.dataset}")

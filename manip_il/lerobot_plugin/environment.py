@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, override
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
@@ -22,16 +20,16 @@ from manip_il.option import option_of
 from manip_il.robots.robot import get_robot
 from manip_il.sim.config import CAMERAS, CameraConfig
 from manip_il.sim.config import EnvConfig as SimConfig
-from manip_il.sim.env import environment_state_names
-from manip_il.sim.register import ENV_IDS, TASK_IDS, register_envs
+from manip_il.sim.env import ManipEnv, environment_state_names
+from manip_il.sim.register import ENV_IDS, TASK_IDS
 from manip_il.sim.scene import build_scene
 
-PACKAGE = "manip_il"
-TASKS = {env_id.removeprefix(f"{PACKAGE}/"): names for env_id, names in ENV_IDS.items()}
-ANY_ROBOTS = {env_id.removeprefix(f"{PACKAGE}/"): task for env_id, task in TASK_IDS.items()}
+TASKS = {env_id.removeprefix("manip_il/"): names for env_id, names in ENV_IDS.items()}
+ANY_ROBOTS = {env_id.removeprefix("manip_il/"): task for env_id, task in TASK_IDS.items()}
 RENDER_MODES = ("rgb_array", "none")
+_ID = "manip_il/LeRobot-v0"
 _COMMANDS = ("lerobot.scripts.lerobot_eval", "lerobot.scripts.lerobot_train")
-_RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE, ACTION: ACTION}
+_RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE}
 
 
 @EnvConfig.register_subclass("manip_il")
@@ -39,7 +37,7 @@ _RENAMED = {"agent_pos": STATE, "environment_state": ENVIRONMENT_STATE, ACTION: 
 class ManipILEnv(EnvConfig):
     """One robot at one task, for lerobot-eval and lerobot-train.
 
-    robot: for a task of any robot (`PickPlace-v0`), by name or a YAML; panda where none is said.
+    robot: for a task of any robot (`PickPlace-v0`), by name or a YAML; panda if none is named.
     observation: `state` (joints and `environment_state`), `images` (joints and cameras) or `both`. cameras: names
     with commas between. observation_height, observation_width: of their pictures [pixels]. fps, episode_length,
     tolerance, success_steps, object, reward: `control_hz`, `horizon`, ... of `manip_il.sim.config.EnvConfig`.
@@ -78,31 +76,27 @@ class ManipILEnv(EnvConfig):
 
     @property
     @override
-    def package_name(self) -> str:
-        """Namespace of the task's id in gymnasium's registry."""
-        return PACKAGE
+    def gym_id(self) -> str:
+        """Id in gymnasium's registry, of every task: its robot and task are in the arguments."""
+        return _ID
 
     @property
     @override
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of `gymnasium.make` beside the id."""
-        kwargs: dict[str, Any] = {"config": self._simulation(), "render_mode": "rgb_array"}
         cameras = self._cameras()
-        return kwargs | ({"cameras": cameras.names, "image_size": cameras.size} if cameras else {})
+        pictures = {"cameras": cameras.names, "image_size": cameras.size} if cameras else {}
+        return {"config": self._simulation(), "film": self.render_mode != "none", **pictures}
 
     @override
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """Return {type: {0: n_envs environments}} as LeRobot does, with `render_mode`."""
-        make: Callable[[], gymnasium.Env[Any, Any]] = partial(
-            make_env, self.gym_id, self.gym_kwargs, film=self.render_mode != "none"
-        )
-        mode = AutoresetMode.SAME_STEP  # LeRobot reads an episode's last `info` in the step that ends it
-        if use_async_envs and n_envs > 1:
-            _preload()
-            envs = AsyncVectorEnv([make] * n_envs, context="forkserver", autoreset_mode=mode)
-        else:
-            envs = SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
-        return {self.type: {0: envs}}
+        """Return LeRobot's environments, processes forked from one that has imported what each would take seconds for.
+
+        Python 3.12 means to preload the running command by itself, but does not (its fork server drops the path).
+        """
+        commands = [name for name in _COMMANDS if name in sys.modules]
+        multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
+        return super().create_envs(n_envs, use_async_envs)
 
     def _simulation(self) -> SimConfig:
         name = self.task or ""
@@ -137,29 +131,18 @@ class ManipILEnv(EnvConfig):
         return features
 
 
-def _preload() -> None:
-    """Have children forked from a process that has imported what they need: each would take seconds for it.
+class FilmedEnv(ManipEnv):
+    """The environment; without `film` small black pictures where lerobot-eval films, which it cannot be told not to."""
 
-    Python 3.12 means to preload the running command by itself, but does not (its fork server drops the path).
-    """
-    commands = [name for name in _COMMANDS if name in sys.modules]
-    multiprocessing.get_context("forkserver").set_forkserver_preload([*commands, __name__])
-
-
-class Unfilmed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Small black pictures where lerobot-eval films, which it cannot be told not to."""
+    def __init__(self, *, film: bool, **kwargs: Any):
+        super().__init__(render_mode="rgb_array", **kwargs)
+        self._film = film
 
     @override
     def render(self) -> Any:
-        return np.zeros((16, 16, 3), dtype=np.uint8)
+        return super().render() if self._film else np.zeros((16, 16, 3), np.uint8)
 
 
-def make_env(env_id: str, kwargs: dict[str, Any], *, film: bool) -> gymnasium.Env[Any, Any]:
-    """Return one environment; in a child process too, where nothing is registered yet."""
-    register_envs()
-    env = gymnasium.make(env_id, disable_env_checker=True, **kwargs)
-    return env if film else Unfilmed(env)
-
-
-register_envs()
+if _ID not in gymnasium.registry:
+    gymnasium.register(_ID, entry_point=FilmedEnv)
 silence_ffmpeg_warning()

@@ -1,57 +1,38 @@
-"""Mapping files of `manip-il mcap import`: which topics and fields make which columns of the dataset.
-
-fps: 20
-robot_type: panda
-task: Put the cube on the goal.     # or a topic of texts: topic, field, resample, tolerance
-features:
-  observation.state:
-    topic: /joint_states
-    field: ["joints[name=elbow].position", "joints[name=wrist].position"]
-    dtype: float32
-    names: [elbow, wrist]
-    resample: interpolate           # or nearest, hold
-    tolerance: 0.1                  # [s]
-  observation.images.front:
-    topic: /camera/front
-    video: false                    # false: PNG, without loss; true: an encoded video
-    resample: nearest
-    tolerance: 0.05
-
-A field is a path to values in a message, or a list of paths (see `path`).
-"""
+"""Mapping files of an import: which topics and fields make which columns. `configs/mcap/panda.yaml` explains one."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Literal
 
 import draccus
-import yaml
 
 from manip_il import checks
+from manip_il.data.foxglove import NANOSECONDS
 from manip_il.data.info import INDEX_FEATURES, NUMBERS
 from manip_il.data.schema import MOST_FPS
 from manip_il.errors import ManipError, UsageError
-from manip_il.mcap.path import parse_path
-
-Method = Literal["nearest", "hold", "interpolate"]
+from manip_il.mcap.path import check_path
 
 TEXT = "string"  # LeRobot's dtype of text
 TASK = "task"  # a frame's text, beside its columns
+_NTSC = 1001  # the denominator of its rates
 
 
 @dataclass(frozen=True)
 class Source:
-    """The topic that a column comes from, and how it is resampled to the dataset's rate. tolerance: [s].
+    """The topic that a column comes from, and which of its messages a frame takes. tolerance: between the two [s].
 
-    Numbers or text are the values of all paths in `field`, in order; shape: (values,) where it is None. Pictures have
-    `video` in place of these: encoded with loss, or PNG. Raises `UsageError` for what does not fit together.
+    resample: `nearest` in time, the earlier of two, or `previous`, the last one that is not later. Numbers or text are
+    the values at all paths in `field`, in order; shape: (values,) if it is None. Pictures have `video` in place of
+    these: encoded with loss, or PNG. Raises `UsageError` for what does not fit together.
     """
 
     topic: str
-    resample: Method
+    resample: Literal["nearest", "previous"]
     tolerance: float
     field: list[str] | str | None = None
     dtype: str = TEXT
@@ -60,18 +41,15 @@ class Source:
     video: bool | None = None
 
     def __post_init__(self) -> None:
-        dtypes = (*NUMBERS, TEXT)
-        for is_wrong, why in (
-            (self.is_camera == bool(self.paths), "expected either field or video"),
-            (self.dtype not in dtypes, f"dtype is {self.dtype}; expected one of {', '.join(dtypes)}"),
-            (self.resample == "interpolate" and not self.dtype.startswith("float"), "only floats can be interpolated"),
-            (len(self.topic) > checks.LONGEST_NAME, f"topic is {checks.shorten(self.topic)}; expected a topic's name"),
-            (not 0 <= self.tolerance < math.inf, f"tolerance is {self.tolerance}; expected seconds, 0 or more"),
-        ):
-            if is_wrong:
-                raise UsageError(why)
+        checks.text("topic", self.topic, checks.LONGEST_NAME)
+        if self.is_camera == bool(self.paths):
+            raise UsageError("expected either field or video")
+        if self.dtype not in (*NUMBERS, TEXT):
+            raise UsageError(f"dtype is {self.dtype}; expected one of {', '.join((*NUMBERS, TEXT))}")
+        if not 0 <= self.tolerance < math.inf:
+            raise UsageError(f"tolerance is {self.tolerance}; expected seconds, 0 or more")
         for path in self.paths:
-            parse_path(path)
+            check_path(path)
 
     @property
     def is_camera(self) -> bool:
@@ -85,7 +63,7 @@ class Source:
 
     @property
     def width(self) -> int | None:
-        """Number of values in a row; None where the mapping leaves it open."""
+        """Number of values in a message; None if the mapping leaves it open."""
         if self.dtype == TEXT or self.shape is not None:
             return math.prod(self.shape or ())
         return len(self.names) if isinstance(self.names, list) else None
@@ -95,28 +73,26 @@ class Source:
 class Mapping:
     """A dataset in terms of topics. task: one text for all, or where the texts come from."""
 
-    fps: int
+    fps: float
     task: str | Source
     features: dict[str, Source]
     robot_type: str | None = None
 
     def __post_init__(self) -> None:
-        checks.whole("fps", self.fps, 1, MOST_FPS)
+        checks.number("fps", self.fps, 1, MOST_FPS)
         if not self.features:
             raise UsageError("features is empty; expected at least one column")
-        for key in self.features:
+        for key, source in self.features.items():
             checks.name("a column's name", key)  # LeRobot names folders and files by it
             if key in (*INDEX_FEATURES, TASK):
                 raise UsageError(f"LeRobot fills {key} itself; leave it out")
+            if source.video and self.fps % 1:
+                raise UsageError(f"LeRobot writes videos at whole rates, not at {self.fps}; {key} needs video: false")
 
     @property
     def sources(self) -> dict[str, Source]:
         """All columns, and `task` if its texts come from a topic."""
         return ({TASK: self.task} if isinstance(self.task, Source) else {}) | self.features
-
-    def to_yaml(self) -> str:
-        """Return the text of a mapping file: `load_mapping` gives an equal one."""
-        return yaml.safe_dump(_plain(asdict(self)), sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 
 def load_mapping(path: Path) -> Mapping:
@@ -133,15 +109,19 @@ def load_mapping(path: Path) -> Mapping:
         raise UsageError(f"{path}: {error}") from error
 
 
+def exact_rate(fps: float) -> Fraction:
+    """Return the small fraction that a rate is the float of, NTSC's among them, else what its decimals say."""
+    small = Fraction(fps).limit_denominator(_NTSC)
+    return small if float(small) == fps else Fraction(str(fps))
+
+
+def frame_times(count: int, rate: Fraction) -> list[int]:
+    """Return the times of an episode's frames since its start [ns]."""
+    return [frame * NANOSECONDS * rate.denominator // rate.numerator for frame in range(count)]
+
+
 def _source(what: str, table: Any) -> Source:
     try:
         return draccus.decode(Source, checks.mapping("it", table))
     except (ManipError, draccus.ParsingError) as error:
         raise UsageError(f"{what}: {checks.one_line(error)}") from error
-
-
-def _plain(value: Any) -> Any:
-    """Return tables without the keys that are None, and lists for tuples, as YAML has them."""
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items() if one is not None}
-    return list(value) if isinstance(value, tuple) else value

@@ -1,140 +1,96 @@
-"""Read the messages of one MCAP file, topic by topic: stamps, rows of values, pictures."""
+"""Read the messages of one MCAP file by the library's reader and decoders: their content, values and pictures."""
 
 from __future__ import annotations
 
+import importlib
+import itertools
 import json
 from collections import Counter
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 import numpy as np
-from mcap.reader import NonSeekingReader
-from mcap.records import Channel, Message, Schema
-from mcap_protobuf.decoder import DecoderFactory
+from mcap.decoder import DecoderFactory
+from mcap.reader import make_reader
+from mcap.records import Schema
+from mcap.well_known import MessageEncoding
+from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
 from numpy.typing import NDArray
 
 from manip_il import checks
 from manip_il.data.pictures import decode_picture
-from manip_il.errors import ManipError, nearest
-from manip_il.mcap.mapping import TEXT, Mapping, Source
-from manip_il.mcap.path import values_at
+from manip_il.errors import ManipError
 
-I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
-Rows = list[list[Any]]
-Stored = tuple[Schema | None, Channel, Message]
 
-_LARGEST_RECORD = 1024**3  # [bytes]
-_ENCODINGS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # of raw pictures -> their channels as R, G, B
+_ROS2 = "mcap_ros2"  # the module of the package mcap-ros2-support, which need not be installed
+_CHANNELS = {"rgb8": slice(None), "bgr8": slice(None, None, -1)}  # of raw pictures, as R, G, B
 
 
-def read_topics(path: Path, mapping: Mapping) -> tuple[Counter[str], dict[str, I64], dict[str, Rows]]:
-    """Read all but the pictures, which are left to `read_pictures`.
+def read_topics(path: Path) -> list[str]:
+    """Return the topics that a file's summary lists, or none if it has no summary."""
+    with open(checks.open_regular(path), "rb") as stream:
+        summary = make_reader(stream).get_summary()
+    return sorted({channel.topic for channel in summary.channels.values()} if summary else ())
 
-    Returns how many messages every topic of the file has, the wanted topics' stamps, (N,) [ns], and the rows of every
-    column of numbers or text, N of as many values. Raises `ManipError` naming file and topic if there are no messages,
-    they cannot be decoded, lack a field, or their stamps do not ascend.
+
+def read_messages(path: Path, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, log time [ns] and decoded content of the messages of some topics, in the order of time.
+
+    Raises `ManipError` naming the file for every error of the library.
     """
-    counts: Counter[str] = Counter()
-    rows: dict[str, Rows] = {key: [] for key in mapping.sources}
-    stamps: dict[str, list[int]] = {source.topic: [] for source in mapping.sources.values()}
-    wanted: dict[str, list[tuple[str, Source]]] = {topic: [] for topic in stamps}
-    for key, source in mapping.sources.items():
-        wanted[source.topic] += [] if source.is_camera else [(key, source)]
-    factory = DecoderFactory()
-    for stored in _stored(path):
-        topic, stamp = stored[1].topic, stored[2].log_time
-        counts[topic] += 1
-        if topic not in stamps:
-            continue
-        with _naming(path, topic, stamp):
-            if stamps[topic] and stamp <= stamps[topic][-1]:
-                raise ManipError(f"the message before it is stamped {stamps[topic][-1]} ns; expected ascending times")
-            stamps[topic].append(stamp)
-            content = _content(factory, *stored) if wanted[topic] else None
-            for key, source in wanted[topic]:
-                rows[key].append(_row(key, source, content, len(rows[key][0]) if rows[key] else None))
-    for topic, times in stamps.items():
-        if not times:
-            known = ", ".join(sorted(counts)) or "none"
-            raise ManipError(f"{path} has no messages of {topic}{nearest(topic, counts)}; its topics: {known}")
-    return counts, {topic: np.array(times, np.int64) for topic, times in stamps.items()}, rows
-
-
-def read_pictures(path: Path, topic: str, numbers: I64) -> Iterator[U8]:
-    """Yield pictures of a topic, (height, width, 3). numbers: of its messages, (T,), never descending.
-
-    Raises `ManipError` naming file, topic and stamp for a message that holds no picture.
-    """
-    messages = enumerate(stored for stored in _stored(path) if stored[1].topic == topic)
-    factory, at, picture = DecoderFactory(), -1, np.empty((0, 0, 3), np.uint8)
-    for number in numbers.tolist():
-        while at < number:
-            at, stored = next(messages)
-            if at == number:
-                with _naming(path, topic, stored[2].log_time):
-                    picture = _picture(stored[0], _content(factory, *stored))
-        yield picture
-
-
-def _stored(path: Path) -> Iterator[Stored]:
-    """Yield every message as stored; the checksums of chunks and data are compared."""
+    factories: list[DecoderFactory] = [ProtobufFactory(), _OtherFactory()]
+    if find_spec(_ROS2):
+        factories.insert(0, importlib.import_module(f"{_ROS2}.decoder").DecoderFactory())
     try:
         with open(checks.open_regular(path), "rb") as stream:
-            reader = NonSeekingReader(stream, validate_crcs=True, record_size_limit=_LARGEST_RECORD)
-            yield from reader.iter_messages(log_time_order=False)
+            reader = make_reader(stream, validate_crcs=True, decoder_factories=factories)
+            for _, channel, message, content in reader.iter_decoded_messages(topics):
+                yield channel.topic, message.log_time, content
     except MemoryError:
         raise
     except Exception as error:  # a damaged file can make a parser raise anything
-        why = str(error) or type(error).__name__
-        raise ManipError(f"cannot read {path}: {why}; expected a complete MCAP file") from error
+        raise ManipError(f"cannot read {path}: {checks.one_line(error) or type(error).__name__}") from error
 
 
-def _content(factory: DecoderFactory, schema: Schema | None, channel: Channel, message: Message) -> Any:
-    """Return a message's protobuf message, or the content of its JSON."""
-    if channel.message_encoding == "json":
-        return json.loads(message.data)
-    if decoder := factory.decoder_for(channel.message_encoding, schema):
-        return decoder(message.data)
-    encoding = channel.message_encoding
-    raise ManipError(f"messages encoded as {encoding!r}; expected protobuf (with its schema) or json; convert the file")
+def read_pictures(path: Path, topic: str, stamps: Sequence[int]) -> Iterator[U8]:
+    """Yield the pictures (height, width, 3) of a topic's messages with these stamps, (T,) [ns], which never descend.
+
+    Raises `ManipError` naming file, topic and stamp for a message that holds no picture.
+    """
+    frames = Counter(stamps)
+    for stamp, messages in itertools.groupby(read_messages(path, [topic]), lambda message: message[1]):
+        *_, (_, _, content) = messages  # of equal stamps the last one counts
+        if stamp in frames:
+            try:
+                picture = _picture(content)
+            except ValueError as error:
+                raise ManipError(f"{path}, topic {topic} at {stamp} ns: {error}") from error
+            yield from itertools.repeat(picture, frames[stamp])
 
 
-@contextmanager
-def _naming(path: Path, topic: str, stamp: int) -> Generator[None]:
-    """Make a `ManipError` that names a message of whatever goes wrong with it: parsers have errors of their own."""
-    try:
-        yield
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise ManipError(f"{path}, topic {topic} at {stamp} ns: {str(error) or type(error).__name__}") from error
+class _OtherFactory(DecoderFactory):
+    """Decodes JSON; another encoding, which no factory before it decodes, is an error."""
+
+    @override
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any]:
+        if message_encoding == MessageEncoding.JSON:
+            return json.loads
+        is_ros2 = message_encoding == MessageEncoding.CDR and not find_spec(_ROS2)
+        remedy = "for ROS 2: pip install mcap-ros2-support" if is_ros2 else "convert the file"
+        found = f"{message_encoding} (schema: {schema.encoding if schema else 'none'})"
+        raise ValueError(f"messages are {found}; expected protobuf, json or cdr (ros2msg); {remedy}")
 
 
-def _row(key: str, source: Source, content: Any, width: int | None) -> list[Any]:
-    """Return a message's values. width: of the rows before."""
-    row = [value for path in source.paths for value in values_at(path, content)]
-    if (width := source.width or width) not in (None, len(row)):
-        raise ManipError(f"{len(row)} values; {key} has {width}")
-    for value in row:
-        if not isinstance(value, str if source.dtype == TEXT else int | float):
-            raise ManipError(f"{key} holds {checks.shorten(value)}; expected {source.dtype}")
-    return row
-
-
-def _picture(schema: Schema | None, message: Any) -> U8:
-    """Return the picture (height, width, 3) in a message. Raises `ManipError` or `ValueError` for one of no kind."""
-    name = schema.name if schema else "no schema"
-    if name == "foxglove.CompressedImage":
-        return decode_picture(message.data)
-    if name != "foxglove.RawImage":
-        raise ManipError(f"a message of {name}; pictures are read from foxglove.RawImage and foxglove.CompressedImage")
-    if message.encoding not in _ENCODINGS:
-        raise ManipError(f"its pictures are encoded as {message.encoding!r}; expected {' or '.join(_ENCODINGS)}")
+def _picture(message: Any) -> U8:
+    """Return the picture (height, width, 3) in a message of Foxglove or ROS. Raises `ValueError` for none."""
+    if hasattr(message, "format"):  # CompressedImage
+        return decode_picture(bytes(message.data))
+    encoding = getattr(message, "encoding", "none")  # of RawImage; ROS calls it Image
+    if encoding not in _CHANNELS:
+        raise ValueError(f"a picture encoded as {encoding!r}; expected {' or '.join(_CHANNELS)}, PNG or JPEG")
     height, width, step = message.height, message.width, message.step or message.width * 3
-    if step < width * 3 or len(message.data) != height * step:
-        raise ManipError(f"a picture of {height} x {width} with {len(message.data)} bytes, {step} a row")
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)
-    return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _ENCODINGS[message.encoding]])
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)  # they may be longer than their pixels
+    return np.ascontiguousarray(rows[:, : width * 3].reshape(height, width, 3)[:, :, _CHANNELS[encoding]])

@@ -18,7 +18,7 @@ from manip_il.data.journal import Journal, read_journal
 from manip_il.data.lerobot_write import write_dataset
 from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
-from manip_il.mcap.export import export_dataset, open_source
+from manip_il.mcap.export import export_dataset
 from manip_il.mdp import Episode
 from manip_il.store.card_dataset import dataset_fields
 
@@ -77,7 +77,7 @@ def test_merging_numbers_the_texts_anew(tmp_path, told, spec, root):
 
 def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tmp_path, root):
     assert not has_errors(examine_folder(root))
-    for path, text in zip(export_dataset(root, open_source(root), tmp_path), TEXTS, strict=True):
+    for path, text in zip(export_dataset(Dataset.open(root), tmp_path), TEXTS, strict=True):
         assert {message.message for topic, _, message in decoded(path.read_bytes()) if topic == "/task"} == {text}
     assert dict(dataset_fields(root, "someone/data")[1]["rows"])["texts"] == f"2, such as: {RED}"
 

@@ -112,14 +112,19 @@ def lerobots() -> Callable[[Path], dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def act_words() -> Callable[..., Sequence[str]]:
-    """Options of lerobot-train for a tiny ACT without downloads."""
+def small_act() -> dict[str, Any]:
+    """Options of a tiny ACT without downloads."""
+    sizes = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_decoder_layers": 1}
+    chunk = {"chunk_size": 5, "n_action_steps": 5, "use_vae": "false", "optimizer_lr": 1e-3}
+    return {"type": "act", **sizes, **chunk, "pretrained_backbone_weights": "null", "device": "cpu"}
+
+
+@pytest.fixture(scope="session")
+def act_words(small_act: dict[str, Any]) -> Callable[..., Sequence[str]]:
+    """Options of lerobot-train for it."""
 
     def words(root: Path, output_dir: Path, steps: int) -> list[str]:
-        sizes = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_decoder_layers": 1}
-        chunk = {"chunk_size": 5, "n_action_steps": 5, "use_vae": "false", "optimizer_lr": 1e-3}
-        offline = {"pretrained_backbone_weights": "null", "push_to_hub": "false", "device": "cpu"}
-        policy = {"type": "act"} | sizes | chunk | offline
+        policy = small_act | {"push_to_hub": "false"}
         run = {"dataset.repo_id": f"someone/{root.name}", "dataset.root": root, "output_dir": output_dir}
         run |= dict.fromkeys(("steps", "save_freq", "env_eval_freq"), steps) | {"num_workers": 0}
         return [*(f"--policy.{key}={value}" for key, value in policy.items()), *(f"--{k}={v}" for k, v in run.items())]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +28,6 @@ from ..so_follower import Camera, arm, record, recorders_features
 
 pytestmark = [pytest.mark.slow, pytest.mark.gl]  # records pictures
 HEIGHT, WIDTH = 48, 64
-SMALL_ACT = {
-    **{"chunk_size": 5, "n_action_steps": 5, "dim_model": 32, "n_heads": 2, "n_encoder_layers": 1},
-    **{"dim_feedforward": 32, "pretrained_backbone_weights": "null"},
-}
 AS_LEROBOT = "--dataset.rgb_encoder.vcodec=libsvtav1"  # its recorder has this codec, and merges one codec only
 KEPT = {ACTION, STATE, "observation.images.front"}
 
@@ -86,19 +81,10 @@ def test_simulated_and_real_demonstrations_merge_and_train(command, real, simula
     command("lerobot-train", *act_words(both, tmp_path / "run", steps=2), "--batch_size=4")
 
 
-def test_a_dataset_without_our_file_is_still_of_the_robot_that_we_know(simulated, tmp_path):
-    root = shutil.copytree(simulated, tmp_path / "copy")
-    (root / "meta/manip_il.json").unlink()
-    found, before = Dataset.open(root).spec, Dataset.open(simulated).spec
-    for name in ("robot", "robot_type", "action_meaning", "joint_names", "fps"):
-        assert getattr(found, name) == getattr(before, name)
-
-
 @pytest.mark.parametrize("policy", ["act", "cnn"])
-def test_a_policy_of_ours_drives_the_real_arm_as_lerobot_rollout_asks_it(real, simulated, policy, tmp_path):
-    small = SMALL_ACT if policy == "act" else {}
-    own = [f"--policy.{name}={value}" for name, value in small.items()]
-    words = [f"--policy.type={policy}", *own, "--observation=images", "--steps=2", "--batch_size=4"]
+def test_a_policy_of_ours_drives_the_real_arm_as_lerobot_rollout_asks_it(real, simulated, small_act, policy, tmp_path):
+    own = [f"--policy.{name}={value}" for name, value in (small_act if policy == "act" else {"type": "cnn"}).items()]
+    words = [*own, "--observation=images", "--steps=2", "--batch_size=4"]
     assert main(["train", f"--dataset.root={simulated}", *words, f"--output_dir={tmp_path / 'run'}"]) == 0
     path = tmp_path / "run/checkpoints/last/pretrained_model"
 

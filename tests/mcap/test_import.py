@@ -1,15 +1,10 @@
-"""MCAP to episodes: every value from a message that the mapping allows, or an error that says where and when.
-
-Resampling is compared with a search through all messages.
-"""
+"""MCAP to episodes: every value from a message that the mapping allows, or an error that says where and when."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,106 +13,43 @@ import pytest
 import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
-from mcap.writer import MCAP0_MAGIC, Writer
-from mcap_protobuf.schema import register_schema
+from mcap.writer import MCAP0_MAGIC
 
-from manip_il.data.foxglove import NANOSECONDS
 from manip_il.data.journal import Journal
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, STATE, SUCCESS, RobotTaskSpec
-from manip_il.errors import ManipError, MismatchError
-from manip_il.mcap.importing import (
-    blend,
-    features_of,
-    frames_of,
-    import_files,
-    list_files,
-    pick,
-    read_import,
-)
-from manip_il.mcap.mapping import Method
+from manip_il.errors import ManipError
+from manip_il.mcap.importing import import_files, list_files, pick, read_frames
+from manip_il.mcap.mapping import Source
 
 from ..damage import digests
 from ..pictures import encoded
 from ..synthetic import MakeEpisode
-from .use import imported, load
+from .use import Messages, feature, load, ramp, write
 
-MS = 1_000_000
-JSON = "json"
-Messages = Iterable[tuple[int, Any]]  # stamp [ms], content
-
-
-def write(path: Path, topics: dict[str, Messages], encoding: str = JSON) -> Path:
-    """Topics of JSON or protobuf messages, in the order of their stamps."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        for topic, messages in topics.items():
-            channel = None
-            for stamp, content in messages:
-                is_json = isinstance(content, dict)
-                if channel is None:
-                    schema = 0 if is_json else register_schema(writer, type(content))
-                    channel = writer.register_channel(topic, encoding if is_json else "protobuf", schema)
-                data = json.dumps(content).encode() if is_json else content.SerializeToString()
-                writer.add_message(channel, stamp * MS, data, stamp * MS)
-        writer.finish()
-    return path
-
-
-def feature(topic: str = "/a", **changes: Any) -> dict[str, Any]:
-    return {"topic": topic, "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 0.02, **changes}
-
-
-def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:
-    return [(stamp, {"x": float(stamp)}) for stamp in stamps]
+STEADY = range(0, 1000, 100)
 
 
 def test_topics_of_other_rates_meet_on_the_datasets_clock(tmp_path: Path) -> None:
     fast, slow, whole = range(0, 1001, 10), range(45, 900, 50), range(5, 990, 7)
     topics = {"/fast": ramp(fast), "/slow": ramp(slow), "/whole": [(s, {"x": s}) for s in whole], "/rest": ramp([0])}
     path = write(tmp_path / "a.mcap", topics)
-    mapping = load(
-        tmp_path,
-        {
-            "near": feature("/fast"),
-            "between": feature("/slow", resample="interpolate", tolerance=0.05),
-            "held": feature("/whole", resample="hold", dtype="int64"),
-        },
-    )
-    episode, rows = read_import(path, mapping), imported(path, mapping)
+    held = feature("/whole", resample="previous", dtype="int64")
+    rows = list(read_frames(path, load(tmp_path, {"near": feature("/fast"), "same": feature("/slow"), "held": held})))
     times = list(range(45, 896, 100))  # from the latest first message to the earliest last one
-    assert episode.frames == len(rows) == len(times)
-    assert [row["between"].item() for row in rows] == times
-    assert all(abs(row["near"].item() - time) <= 5 for row, time in zip(rows, times, strict=True))
+    assert [row["same"].item() for row in rows] == times
+    assert [row["near"].item() for row in rows] == [time - 5 for time in times]  # the earlier of two
     assert [row["held"].item() for row in rows] == [max(s for s in whole if s <= time) for time in times]
     assert {row["task"] for row in rows} == {"t"}
-    assert episode.counts == {"/fast": 101, "/slow": 18, "/whole": 141, "/rest": 1}
-    assert episode.used == {"/fast": 9, "/slow": 9, "/whole": 9}
 
 
-def test_numbers_keep_every_bit_and_texts_every_letter(tmp_path: Path) -> None:
-    big, small = 2**63 - 1, 5e-324
-    contents = [{"i": big - n, "f": [small * n, -0.0], "b": n == 1, "s": f"é\n{n}"} for n in range(3)]
-    path = write(tmp_path / "a.mcap", {"/a": [(n * 100, content) for n, content in enumerate(contents)]})
-    mapping = load(
-        tmp_path,
-        {
-            "i": feature(field="i", dtype="int64"),
-            "f": feature(field=["f[:]", "f[0]"], shape=[3, 1], names=None),
-            "b": feature(field="b", dtype="bool"),
-            "s": feature(field="s", dtype="string"),
-        },
-        task={"topic": "/a", "field": "s", "resample": "hold", "tolerance": 0},
-    )
-    rows = imported(path, mapping)
-    for n, row in enumerate(rows):
-        assert (row["i"].item(), row["b"].item(), row["s"], row["task"]) == (big - n, n == 1, f"é\n{n}", f"é\n{n}")
-        assert row["f"].tobytes() == np.array([small * n, -0.0, small * n]).tobytes()
-        assert row["f"].shape == (3, 1)
+def test_messages_out_of_order_are_sorted_and_the_last_one_of_a_stamp_counts(tmp_path: Path) -> None:
+    messages = [(0, {"x": 1}), (200, {"x": 3}), (100, {"x": 9}), (100, {"x": 2})]
+    path = write(tmp_path / "a.mcap", {"/a": messages})
+    assert [row["f"].item() for row in read_frames(path, load(tmp_path, {"f": feature()}))] == [1, 2, 3]
 
 
 def picture(number: int) -> np.ndarray:
@@ -135,50 +67,30 @@ def png(number: int) -> CompressedImage:
 
 
 def test_pictures_are_the_nearest_ones_pixel_for_pixel(tmp_path: Path) -> None:
-    stamps = range(0, 500, 33)
-    topics = {
-        "/a": ramp(range(0, 500, 100)),
-        "/raw": [(stamp, raw(n)) for n, stamp in enumerate(stamps)],
-        "/bgr": [(stamp, raw(n, "bgr8")) for n, stamp in enumerate(stamps)],
-        "/png": [(stamp, png(n)) for n, stamp in enumerate(stamps)],
-    }
-    path = write(tmp_path / "a.mcap", topics)
+    stamps = [*range(0, 500, 33), 495]  # the last one twice
+    kinds: dict[str, Any] = {"raw": raw, "bgr": lambda n: raw(n, "bgr8"), "png": png}
+    topics = {f"/{name}": [(stamp, make(n)) for n, stamp in enumerate(stamps)] for name, make in kinds.items()}
+    path = write(tmp_path / "a.mcap", {"/a": ramp(range(0, 500, 99)), **topics})
     camera = {"resample": "nearest", "tolerance": 0.02, "video": False}
-    mapping = load(
-        tmp_path, {"a": feature(), **{name: {**camera, "topic": f"/{name}"} for name in ("raw", "bgr", "png")}}
-    )
-    episode, rows = read_import(path, mapping), imported(path, mapping)
-    for time, row in zip(range(0, 500, 100), rows, strict=True):
-        wanted = picture(min(range(len(stamps)), key=lambda n: abs(stamps[n] - time)))
-        for name in ("raw", "bgr", "png"):
-            np.testing.assert_array_equal(row[name], wanted)
-    names = ["height", "width", "channels"]
-    assert features_of(episode, mapping)["raw"] == {"dtype": "image", "shape": (4, 6, 3), "names": names}
-
-
-STEADY = range(0, 1000, 100)
+    features = {"a": feature(tolerance=0.05), **{name: {**camera, "topic": f"/{name}"} for name in kinds}}
+    rows = list(read_frames(path, load(tmp_path, features, fps=200 / 33)))
+    assert len(rows) == 4
+    for frame, row in enumerate(rows):
+        wanted = len(stamps) - 1 if frame == 3 else 5 * frame
+        for name in kinds:
+            np.testing.assert_array_equal(row[name], picture(wanted))
 
 
 @pytest.mark.parametrize(
     ("messages", "changes", "why"),
     [
-        (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s"),
-        (ramp([0, 200, 100]), {}, r"topic /a at 100000000 ns: the message before it is stamped 200000000 ns"),
-        ([(0, {"x": "1"})], {}, "topic /a at 0 ns: f holds '1'; expected float64"),
-        ([(0, {"x": None})], {}, "f holds None; expected float64"),
-        (
-            [(0, {"x": 1}), (100, {"x": float("nan")})],
-            {},
-            r"message 1 holds \[nan\]; expected finite numbers",
-        ),
-        ([(0, {"x": 1e39})], {"dtype": "float32"}, r"message 0 holds \[1e\+39\]; expected finite numbers of float32"),
-        ([(0, {"x": 1.5})], {"dtype": "int64"}, r"holds \[1.5\]; expected finite numbers of int64"),
-        ([(0, {"x": float("inf")})], {"dtype": "int64"}, "infinity to integer; expected int64"),
-        ([(0, {"x": 2})], {"dtype": "bool"}, r"holds \[2\]; expected finite numbers of bool"),
-        ([(0, {"x": 2})], {"dtype": "string"}, "f holds 2; expected string"),
-        ([(0, {"x": [1, 2]})], {"names": ["a"]}, "topic /a at 0 ns: 2 values; f has 1"),
-        ([(0, {"x": [1, 2]}), (100, {"x": [1]})], {}, "topic /a at 100000000 ns: 1 values; f has 2"),
-        ([(0, {"x": 1}), (100, {"y": 1})], {}, "topic /a at 100000000 ns: x: no field 'x'"),
+        (ramp([0, 100, 400, 500]), {}, r"topic /a, f: a gap at 0\.2 s .*nearest allows 0\.02 s: raise its tolerance"),
+        ([(0, {"x": "1"})], {}, r"topic /a, f at 0 ns: \['1'\]; expected float64"),
+        ([(0, {"x": 1}), (100, {"x": float("nan")})], {}, r"f at 100000000 ns: \[nan\]; expected finite numbers"),
+        ([(0, {"x": 1e39})], {"dtype": "float32"}, r"\[1e\+39\]; expected finite numbers of float32"),
+        ([(0, {"x": 1.5})], {"dtype": "int64"}, r"\[1.5\]; expected finite numbers of int64"),
+        ([(0, {"x": [1, 2]})], {"names": ["a"]}, "f at 0 ns: 2 values; expected 1"),
+        ([(0, {"x": 1}), (100, {"y": 1})], {}, "f at 100000000 ns: no field 'x'"),
         (ramp(STEADY), {"topic": "/b"}, "has no messages of /b .*its topics: /a, /late, /steady"),
         (ramp(STEADY), {"topic": "/late"}, r"/steady ends 4\.1 s before /late starts"),
     ],
@@ -186,50 +98,27 @@ STEADY = range(0, 1000, 100)
 def test_what_cannot_be_is_refused_by_file_topic_and_time(
     tmp_path: Path, messages: Messages, changes: dict[str, Any], why: str
 ) -> None:
-    topics = {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])}
-    path = write(tmp_path / "bad.mcap", topics)
+    path = write(tmp_path / "bad.mcap", {"/a": messages, "/steady": ramp(STEADY), "/late": ramp([5000, 5100])})
+    steady = {"g": feature("/steady")} if "topic" in changes else {}
     with pytest.raises(ManipError, match=rf"bad\.mcap.*{why}"):
-        read_import(path, load(tmp_path, {"f": feature(**changes), "g": feature("/steady")}))
-
-
-def test_an_encoding_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path / "ros.mcap", {"/a": ramp(STEADY)}, "cdr")
-    with pytest.raises(ManipError, match=r"ros\.mcap, topic /a at 0 ns: messages encoded as 'cdr'; expected protobuf"):
-        read_import(path, load(tmp_path, {"f": feature()}))
-
-
-@pytest.mark.parametrize("keep", [0, 5, 0.3, 0.9, 0.99])
-def test_a_file_that_is_cut_is_refused(tmp_path: Path, keep: float) -> None:
-    path = write(tmp_path / "cut.mcap", {"/a": ramp(range(1000))})
-    data = path.read_bytes()
-    path.write_bytes(data[: keep if isinstance(keep, int) else int(len(data) * keep)])
-    with pytest.raises(ManipError, match=r"cannot read .*cut\.mcap: .*; expected a complete MCAP file"):
-        read_import(path, load(tmp_path, {"f": feature()}))
+        list(read_frames(path, load(tmp_path, {"f": feature(**changes), **steady})))
 
 
 @pytest.mark.parametrize(
-    ("message", "why"),
+    ("message", "encoding", "why"),
     [
-        (raw(0, "mono8"), "encoded as 'mono8'; expected rgb8 or bgr8"),
-        (RawImage(width=6, height=4, encoding="rgb8", data=b"12"), "a picture of 4 x 6 with 2 bytes, 18 a row"),
-        (CompressedImage(format="png", data=b"no"), "it is not a PNG or JPEG"),
-        ({"x": 1}, "a message of no schema; pictures are read from foxglove.RawImage"),
+        (raw(0, "mono8"), "", "topic /a at 0 ns: a picture encoded as 'mono8'; expected rgb8 or bgr8"),
+        (CompressedImage(format="png", data=b"no"), "", "topic /a at 0 ns: it is not a PNG or JPEG"),
+        ({"x": 1}, "cdr", r"messages are cdr .*expected protobuf, json or cdr .*ROS 2: pip install mcap-ros2-support"),
     ],
 )
-def test_what_is_no_picture_is_refused(tmp_path: Path, message: Any, why: str) -> None:
-    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]})
+def test_what_is_no_picture_or_of_another_encoding_is_refused(
+    tmp_path: Path, message: Any, encoding: str, why: str
+) -> None:
+    path = write(tmp_path / "p.mcap", {"/a": [(0, message)]}, encoding)
     mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
-    with pytest.raises(ManipError, match=rf"p\.mcap, topic /a at 0 ns: .*{why}"):
-        imported(path, mapping)
-
-
-def test_files_that_do_not_fit_each_other_are_refused(tmp_path: Path) -> None:
-    mapping = load(tmp_path, {"f": feature()})
-    first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
-    second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
-    features = features_of(read_import(first, mapping), mapping)
-    with pytest.raises(MismatchError, match=r"shape of 'f' differs: .*b\.mcap has \(3,\), the first file has \(2,\)"):
-        list(frames_of(read_import(second, mapping), mapping, features))
+    with pytest.raises(ManipError, match=rf"p\.mcap.* {why}"):
+        list(read_frames(path, mapping))
 
 
 def test_our_journals_come_in_by_a_mapping_of_their_topics(
@@ -237,33 +126,23 @@ def test_our_journals_come_in_by_a_mapping_of_their_topics(
 ) -> None:
     episode = make_episode(3, 6)
     path = Journal(tmp_path, spec, {}).write(episode)
-    joints = [f"joints[name={name}].position" for name in spec.joint_names]
     places = [f"transforms[child_frame_id=ee].translation.{axis}" for axis in "xyz"]
-    mapping = load(
-        tmp_path,
-        {
-            STATE: feature("/joint_states", field=joints, dtype="float32", names=list(spec.joint_names)),
-            ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="hold"),
-            "place": feature("/tf", field=places, resample="interpolate", tolerance=0.1),
-            SUCCESS: feature("/scalars", field="scalars[label=next.success].value", dtype="bool"),
-        },
-        fps=spec.fps,
-    )
-    found = read_import(path, mapping).columns
+    features = {
+        STATE: feature("/joint_states", field="joints[:].position", dtype="float32", names=list(spec.joint_names)),
+        ACTION: feature("/action", field="joints[:].position", dtype="float32", resample="previous"),
+        "place": feature("/tf", field=places),
+        SUCCESS: feature("/scalars", field="scalars[label=next.success].value", dtype="bool"),
+    }
+    rows = list(read_frames(path, load(tmp_path, features, fps=spec.fps)))
     for key in (STATE, ACTION, SUCCESS):
-        np.testing.assert_array_equal(found[key], episode.columns[key])
-    np.testing.assert_array_equal(found["place"], episode.columns[ENVIRONMENT_STATE][:, :3])
+        np.testing.assert_array_equal([row[key] for row in rows], episode.columns[key])
+    np.testing.assert_array_equal([row["place"] for row in rows], episode.columns[ENVIRONMENT_STATE][:, :3])
 
 
 def test_files_are_taken_in_the_order_of_their_names(tmp_path: Path) -> None:
     for name in ("b.mcap", "a.mcap", ".c.mcap", "d.txt"):
         (tmp_path / name).touch()
     assert [path.name for path in list_files(tmp_path)] == ["a.mcap", "b.mcap"]
-    assert list_files(tmp_path / "b.mcap") == [tmp_path / "b.mcap"]
-    (tmp_path / "empty").mkdir()
-    for nothing in ("x", "empty"):
-        with pytest.raises(ManipError, match=r"is no file, and holds no \*\.mcap files"):
-            list_files(tmp_path / nothing)
 
 
 @pytest.mark.slow
@@ -280,76 +159,65 @@ def test_a_file_that_would_fill_the_memory_is_refused_in_one_line(tmp_path: Path
     assert not (tmp_path / "new").exists()
 
 
-SECOND = NANOSECONDS
 stamp_lists = st.lists(st.integers(0, 40), min_size=1, max_size=12, unique=True).map(sorted)
 
 
-def expected(method: Method, stamps: list[int], time: int, tolerance: int) -> tuple[int, int] | None:
-    """The messages before and after one frame, or None for a gap, by looking at every message."""
-    before = [number for number, stamp in enumerate(stamps) if stamp <= time]
-    after = [number for number, stamp in enumerate(stamps) if stamp >= time]
-    if method == "nearest":
-        best = min(range(len(stamps)), key=lambda number: (abs(stamps[number] - time), number))
-        return (best, best) if abs(stamps[best] - time) <= tolerance else None
-    if method == "hold":
-        return (before[-1], before[-1]) if before and time - stamps[before[-1]] <= tolerance else None
-    if not before or not after or stamps[after[0]] - stamps[before[-1]] > tolerance:
-        return None
-    return before[-1], after[0]
-
-
 @settings(max_examples=300)
-@given(st.sampled_from(["nearest", "hold", "interpolate"]), stamp_lists, stamp_lists, st.integers(0, 20))
+@given(st.sampled_from(["nearest", "previous"]), stamp_lists, stamp_lists, st.integers(0, 20))
 def test_every_frame_gets_what_a_full_search_finds(
-    method: Method, stamps: list[int], times: list[int], tolerance: int
+    method: Any, stamps: list[int], later: list[int], tolerance: int
 ) -> None:
-    wanted = [expected(method, stamps, time, tolerance) for time in times]
-    arrays = np.array(stamps) * SECOND, np.array(times) * SECOND
-    if None in wanted:
-        frame = wanted.index(None)
-        why = rf"f, topic /t: a gap at {times[frame] - times[0]} s .*frame {frame}\); {method} allows {tolerance} s"
-        with pytest.raises(ManipError, match=why):
-            pick("f, topic /t", method, *arrays, tolerance)
-        return
-    left, right = pick("f, topic /t", method, *arrays, tolerance)
-    assert list(zip(left, right, strict=True)) == wanted
-
-
-@given(stamp_lists, stamp_lists, st.floats(-10, 10), st.floats(-10, 10))
-def test_interpolation_is_exact_on_a_line_and_at_a_message(
-    stamps: list[int], times: list[int], slope: float, offset: float
-) -> None:
-    times = [time for time in times if stamps[0] <= time <= stamps[-1]]
-    assume(times)
-    here, there = np.array(stamps), np.array(times)
-    line = np.outer(here, [slope, 2 * slope]) + offset
-    found = blend(here * SECOND, line, there * SECOND)
-    np.testing.assert_allclose(found, np.outer(there, [slope, 2 * slope]) + offset, atol=1e-9)
-    np.testing.assert_array_equal(blend(here * SECOND, line, here * SECOND), line)
+    times = [stamps[0] + time for time in later]
+    near = [min(stamps, key=lambda stamp: (abs(stamp - time), stamp)) for time in times]
+    before = [max(stamp for stamp in stamps if stamp <= time) for time in times]
+    wanted = near if method == "nearest" else before
+    gaps = [frame for frame, time in enumerate(times) if abs(wanted[frame] - time) > tolerance]
+    source, second = Source("/t", method, tolerance, "x", "float32"), 10**9
+    arrays = np.array(stamps) * second, np.array(times) * second
+    if gaps:
+        place = f"a gap at {times[gaps[0]] - times[0]} s"
+        with pytest.raises(ManipError, match=rf"f, topic /t: {place} .*frame {gaps[0]}\); {method} allows"):
+            pick("f, topic /t", source, *arrays)
+    else:
+        assert [stamps[number] for number in pick("f", source, *arrays)] == wanted
 
 
 IMPORT = """
 import sys
 from pathlib import Path
-from manip_il.data.lerobot_library import join_datasets
 from manip_il.mcap.importing import import_files
 from manip_il.mcap.mapping import load_mapping
 source, target = map(Path, sys.argv[1:])
-list(import_files([source / "a.mcap"] * 2, target / "new", load_mapping(source / "m.yaml")))
-join_datasets([target / "new"] * 2, target / "joined", "a/b")
+list(import_files([source / "a.mcap"] * 2, target, load_mapping(source / "m.yaml")))
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("video", [False, True])
-def test_two_imports_and_joins_of_the_same_files_give_the_same_bytes(tmp_path: Path, video: bool) -> None:
+def test_two_imports_give_the_same_bytes(tmp_path: Path) -> None:
     big = np.zeros((64, 64, 3), np.uint8)
     pictures = [(stamp, CompressedImage(format="png", data=encoded(big + stamp // 10))) for stamp in STEADY]
-    write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/b": ramp(STEADY), "/c": pictures})
-    camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02, "video": video}
-    load(tmp_path, {"observation.state": feature(), "action": feature("/b"), "observation.images.c": camera})
+    write(tmp_path / "a.mcap", {"/a": ramp(STEADY), "/c": pictures})
+    camera = {"topic": "/c", "resample": "nearest", "tolerance": 0.02}
+    stills, film = {**camera, "video": False}, {**camera, "video": True}
+    load(tmp_path, {"action": feature(), "observation.images.a": stills, "observation.images.b": film})
     for seed in ("1", "2"):  # of the order of sets
         command = [sys.executable, "-c", IMPORT, str(tmp_path), str(tmp_path / seed)]
         subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed})
-    assert (tmp_path / "1" / "joined" / "meta").is_dir()
     assert digests(tmp_path / "1") == digests(tmp_path / "2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [(False, r"shape of 'f' differs: .*b\.mcap has \(3,\), .*a\.mcap has \(2,\)"), (True, r"cannot read .*b\.mcap: .")],
+)
+def test_a_file_that_is_cut_or_does_not_fit_the_first_one_leaves_nothing(
+    tmp_path: Path, damage: bool, why: str
+) -> None:
+    first = write(tmp_path / "a.mcap", {"/a": [(0, {"x": [1, 2]})]})
+    second = write(tmp_path / "b.mcap", {"/a": [(0, {"x": [1, 2, 3]})]})
+    if damage:
+        second.write_bytes(first.read_bytes()[:-20])
+    with pytest.raises(ManipError, match=why):
+        list(import_files([first, second], tmp_path / "new", load(tmp_path, {"f": feature()})))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "m.yaml"]

@@ -1,18 +1,23 @@
-"""What tests of MCAP share: messages as decoded, mappings, and the frames that an import makes."""
+"""What tests of MCAP share: messages as others decode them, mappings, and files of messages."""
 
 from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
+from mcap_protobuf.schema import register_schema
 
-from manip_il.mcap.importing import features_of, frames_of, read_import
 from manip_il.mcap.mapping import Mapping, load_mapping
+
+MS = 1_000_000
+Messages = Iterable[tuple[int, Any]]  # stamp [ms], content
 
 
 def decoded(data: bytes) -> list[tuple[str, int, Any]]:
@@ -31,6 +36,29 @@ def load(folder: Path, features: Any, **more: Any) -> Mapping:
     return load_mapping(path)
 
 
-def imported(path: Path, mapping: Mapping) -> list[dict[str, Any]]:
-    episode = read_import(path, mapping)
-    return list(frames_of(episode, mapping, features_of(episode, mapping)))
+def feature(topic: str = "/a", **changes: Any) -> dict[str, Any]:
+    """A column of the field `x` in a mapping."""
+    return {"topic": topic, "field": "x", "dtype": "float64", "resample": "nearest", "tolerance": 0.02, **changes}
+
+
+def ramp(stamps: Iterable[int]) -> list[tuple[int, Any]]:
+    """Messages that hold their stamps."""
+    return [(stamp, {"x": float(stamp)}) for stamp in stamps]
+
+
+def write(path: Path, topics: dict[str, Messages], encoding: str = "json") -> Path:
+    """Write topics of JSON or protobuf messages, in this order."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, messages in topics.items():
+            channel = None
+            for stamp, content in messages:
+                is_json = isinstance(content, dict)
+                if channel is None:
+                    schema = 0 if is_json else register_schema(writer, type(content))
+                    channel = writer.register_channel(topic, encoding if is_json else "protobuf", schema)
+                data = json.dumps(content).encode() if is_json else content.SerializeToString()
+                writer.add_message(channel, stamp * MS, data, stamp * MS)
+        writer.finish()
+    return path
