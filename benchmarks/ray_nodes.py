@@ -20,12 +20,12 @@ from pathlib import Path
 
 import ray
 from _machine import describe_machine
+from manip_il.collect.task import run_seeds
 from ray.cluster_utils import Cluster
 
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.ray_pool import packed
-from manip_il.collect.task import run_seeds
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds

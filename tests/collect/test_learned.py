@@ -14,13 +14,13 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_fingerprint, env_spec, policy_cameras
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal, list_episodes, read_journal
 from manip_il.errors import ManipError, MismatchError
-from manip_il.evaluation.runner import evaluate
 from manip_il.learn.checkpoint import CheckpointMeta
+from manip_il.learn.policy_files import policy_cameras
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, Look
 from manip_il.sim.env import EnvConfig, ManipEnv
@@ -87,13 +87,6 @@ def test_pictures_are_kept_where_they_are_recorded_and_only_there(seeing, tmp_pa
     recorded = list(replace(job, cameras=both).run(SEEDS[:2]))
     assert recorded[0].columns["observation.images.wrist"].shape == (8, 32, 32, 3)
     assert written(episode.without_pictures() for episode in recorded) == written(episodes)
-
-
-@pytest.mark.gl
-def test_an_evaluation_says_which_pictures_it_was_made_with(seeing):
-    result = evaluate(Engine(1), RolloutJob(ENV, PolicyDriver((seeing,)), label="last"), SEEDS[:1], "seeing")
-    assert result.fingerprint == env_fingerprint(ENV, DIM)
-    assert result.fingerprint != env_fingerprint(ENV, replace(DIM, look=Look()))
 
 
 def test_a_checkpoint_says_what_it_must_be_shown(act, seeing, tmp_path):
