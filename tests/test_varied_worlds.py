@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from manip_il.collect.render import render_states
 
 from manip_il.cli.main import main
 from manip_il.cli.trials import varied
-from manip_il.collect.edits import open_source
+from manip_il.collect.edits import open_source, render_states
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob

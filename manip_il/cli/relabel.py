@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -50,23 +49,13 @@ class RelabelOptions:
         source = open_source(self.dataset, self.robot.type)
         warn(*source.warnings)
         with exclusive(target), progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
-            changes = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
-        frames = f"{source.dataset.info.episodes:,} episodes, {changes['frames']:,} frames"
-        say(f"relabelled {frames}: {in_words(changes)}")
+            changed = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
+        info, what = source.dataset.info, "all labels are as they were"
+        if changed:
+            what = f"{changed:,} labels differ: by more than 1 % of a joint's longest step, in phase, or in being sound"
+        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {what}")
         say(f"dataset: {target}")
 
     def _target(self) -> Path:
         folder = self.dataset.absolute()
         return self.target or self.dataset.with_name(f"{folder.name}_relabelled")
-
-
-def in_words(changes: Mapping[str, int]) -> str:
-    """Return what relabelling changed."""
-    parts = {
-        "actions differ by more than 1 % of a joint's longest step": changes["actions"],
-        "phases differ": changes["phases"],
-        "states have a sound label now": changes["gained"],
-        "states have none any more": changes["lost"],
-    }
-    found = [f"{count:,} {what}" for what, count in parts.items() if count]
-    return ", ".join(found) if found else "all labels are as they were"

@@ -49,7 +49,7 @@ class Driver:
     @property
     def name(self) -> str:
         """Name in datasets."""
-        return self.kind
+        return "mixture" if self.policies and self.beta > 0 else self.kind
 
     def start(self, setting: Setting) -> Act:
         """Return the driver at work, for the episodes of one process."""
@@ -111,11 +111,6 @@ class PolicyDriver(Driver):
     policies: tuple[Path, ...] = ()
     beta: float = 0.0
     trust: bool = False
-
-    @property
-    @override
-    def name(self) -> str:
-        return "mixture" if self.beta > 0 else "policy"
 
     @override
     def start(self, setting: Setting) -> Act:

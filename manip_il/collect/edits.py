@@ -5,7 +5,6 @@ All three work on the source by pieces, in processes of this machine, and write 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -100,18 +99,20 @@ class Target:
     on_piece: Callable[[], None] = lambda: None
 
 
-def relabel_dataset(source: Source, target: Target) -> Counter[str]:
+def relabel_dataset(source: Source, target: Target) -> int:
     """Write `source` anew with the expert's label of every state; executed actions, pictures and all else stay.
 
-    A state that the expert was not asked in when it was recorded is labelled, too. Returns how many `frames` there are,
-    and how many `gained` or `lost` a sound label, or have another action, by more than `NOTICEABLE`, or phase. Raises
-    what reading and `rewrite_columns` raise, `ManipError` where a worker dies.
+    A state that the expert was not asked in when it was recorded is labelled, too. Returns how many frames have another
+    label: its action by more than `NOTICEABLE`, its phase, or whether it is sound. Raises what reading and
+    `rewrite_columns` raise, `ManipError` where a worker dies.
     """
-    changes, scale, dataset = Counter[str](), env_actions(source.env).scale, source.dataset
+    scale, dataset = env_actions(source.env).scale, source.dataset
+    changed = 0
 
     def relabelled() -> Iterator[Columns]:
+        nonlocal changed
         for episode, columns in labels:
-            changes.update(_changes(episode.columns, columns, scale))
+            changed += _changed(episode.columns, columns, scale)
             target.on_piece()
             yield columns
 
@@ -122,7 +123,7 @@ def relabel_dataset(source: Source, target: Target) -> Counter[str]:
     episodes = dataset.read_episodes(pictures=False)
     with closing(map_in_order(partial(label_episode, source.env), episodes, target.workers)) as labels:
         rewrite_columns(dataset.root, target.root, relabelled(), about, replace=target.replace)
-    return changes
+    return changed
 
 
 def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
@@ -216,13 +217,10 @@ def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -
     return found
 
 
-def _changes(before: Columns, after: Columns, scale: NDArray[np.float64]) -> dict[str, int]:
-    was, now = (one[schema.LABEL_VALID].ravel().astype(bool) for one in (before, after))
+def _changed(before: Columns, after: Columns, scale: NDArray[np.float64]) -> int:
     gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
-    phases = before[schema.EXPERT_PHASE].ravel() != after[schema.EXPERT_PHASE].ravel()
-    changed = {"actions": was & now & (gaps > NOTICEABLE), "phases": was & now & phases}
-    changed |= {"gained": now & ~was, "lost": was & ~now}
-    return {"frames": len(was)} | {name: int(rows.sum()) for name, rows in changed.items()}
+    same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
+    return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
 
 
 def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> list[Episode]:

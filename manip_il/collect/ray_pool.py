@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
 import tempfile
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import zstandard
+
 from manip_il import __version__
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.workers import Seeds
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
@@ -30,8 +32,7 @@ except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
 Files = dict[str, bytes]
-Answer = list[tuple[Episode, bytes]]
-"""Episodes without pictures, each with its journal."""
+_LEVEL = 1  # of compression; an episode of numbers is then a fifth
 _DEATHS = (
     exceptions.WorkerCrashedError,
     exceptions.NodeDiedError,
@@ -61,7 +62,7 @@ class RayPool:
         """Tasks that run at once; more if nodes have come."""
         return self._most or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def submit(self, job: RolloutJob, seeds: Seeds, journal: Journal | None) -> Future[list[Episode]]:
+    def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
         """Send some seeds of a job to the cluster."""
         files = [self._ship(folder) for folder in job.driver.policies]
         reference = _run_remote.remote(__version__, job, seeds, journal, *files)
@@ -79,14 +80,15 @@ class RayPool:
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
-    def _settle(self, future: Future[list[Episode]], answer: Future[Answer], journal: Journal | None) -> None:
+    def _settle(self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None) -> None:
         """Store what came home, and hand the episodes or the error on."""
         self._running.pop(future, None)
         try:
-            for episode, content in answer.result():
+            found: list[tuple[Episode, bytes]] = pickle.loads(zstandard.decompress(answer.result()))
+            for episode, content in found:
                 if journal is not None:
                     journal.store(episode.seed, content)
-            future.set_result([episode for episode, _ in answer.result()])
+            future.set_result([episode for episode, _ in found])
         except _DEATHS as death:
             future.set_exception(BrokenExecutor(str(death)))
         except ManipError as error:
@@ -101,8 +103,10 @@ class RayPool:
         return self._folders[folder]
 
 
-def run_there(version: str, job: RolloutJob, seeds: Seeds, journal: Journal | None, *policies: Files) -> Answer:
-    """Return the answer of a task on a node. Raises `ManipError` if it has another version of the program."""
+def run_there(
+    version: str, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None, *policies: Files
+) -> bytes:
+    """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
@@ -110,7 +114,8 @@ def run_there(version: str, job: RolloutJob, seeds: Seeds, journal: Journal | No
         if isinstance(job.driver, PolicyDriver):
             here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
             job = replace(job, driver=replace(job.driver, policies=here))
-        return [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        found = [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
 # Deaths are counted by the engine: Ray itself is to try once. Its function keeps a name of its own, so that what is

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from manip_il.collect.environments import make_expert
 from manip_il.collect.query import branch
-from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Label, State, Transition
-from manip_il.seeding import BLOCK, rng_for, stream_base
+from manip_il.seeding import rng_for, stream_seeds
 from manip_il.sim.conditions import PICTURED, Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.env import ManipEnv
@@ -56,10 +55,7 @@ class Scenes:
     @property
     def numbers(self) -> range:
         """Numbers of the scenes in the stream of draws. Raises `UsageError` for more than a seed has."""
-        if self.first + self.frames > BLOCK:
-            raise UsageError(f"frames {self.first} to {self.first + self.frames}; a seed has {BLOCK:,}, take another")
-        base = stream_base("redraw", self.seed) + self.first
-        return range(base, base + self.frames)
+        return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
 
     def chunks(self, states: F64) -> Iterator[tuple[int, F64]]:
         """Yield the first number and the visited states of each `CHUNK` of scenes.

@@ -98,21 +98,25 @@ class Engine:
                 task = tasks.popleft()
                 running[pool.submit(job, task, journal)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
-            ended = [(running.pop(future), future.exception(), future) for future in done]
-            yield from (future.result() for _, death, future in ended if not isinstance(death, BrokenExecutor))
-            for seed in [seed for task, death, _ in ended if isinstance(death, BrokenExecutor) for seed in task]:
-                episodes = _run_alone(pool, job, seed, journal)
-                if episodes is not None:
+            lost: list[int] = []
+            for future in done:
+                task = running.pop(future)
+                if isinstance(future.exception(), BrokenExecutor):
+                    lost += task
+                else:
                     barren = 0
-                    yield episodes
-                    continue
-                self.given_up.append(seed)
-                barren += 1
+                    yield future.result()
+            for seed in lost:
+                episodes = _run_alone(pool, job, seed, journal)
+                if episodes is None:
+                    self.given_up.append(seed)
+                barren = 0 if episodes else barren + 1
                 if barren == MAX_DEATHS:
                     raise ManipError(
                         f"rollout workers died one after the other, of seeds {self.given_up[-barren:]}; out of memory? "
                         "Finished episodes are kept"
                     )
+                yield episodes or []
 
 
 class LocalPool:

@@ -95,9 +95,7 @@ def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvC
     bare = {key: np.zeros_like(second.columns[key]) for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)}
     older = [changed(first, **{schema.ACTION: action, schema.EXPERT_PHASE: phase}), changed(second, **bare)]
     root, whole = write(older, tmp_path / "older", env), write([first, second], tmp_path / "whole", env)
-    changes = relabel_dataset(open_source(root), Target(tmp_path / "new", workers=2))
-    frames = len(first) + len(second)
-    assert changes == {"frames": frames, "actions": 1, "phases": 1, "gained": len(second), "lost": 0}
+    assert relabel_dataset(open_source(root), Target(tmp_path / "new", workers=2)) == 2 + len(second)
     new, expected = Dataset.open(tmp_path / "new"), Dataset.open(whole)
     for key, column in expected.columns().items():
         np.testing.assert_array_equal(new.columns()[key], column)

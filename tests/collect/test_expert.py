@@ -18,7 +18,6 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import SCENES_KEPT, build_scene
-from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
@@ -69,19 +68,6 @@ def with_object(scene: Scene, state: State, move: np.ndarray) -> State:
     return replace(state, physics=world.physics())
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
-@every_scene
-def test_labels_do_not_depend_on_what_was_asked_before(robot: str, task: str, driver: str):
-    states = visited_states(robot, task, driver)
-    expert = expert_of(robot, task)
-    forward = [written(expert.label(state)) for state in states]
-    order = np.random.default_rng(0).permutation(len(states))
-    shuffled = {int(i): written(expert.label(states[i])) for i in order}
-    assert [shuffled[i] for i in range(len(states))] == forward
-    for i in (3, len(states) // 2):
-        assert written(Expert(build_scene(robot, task)).label(states[i])) == forward[i]
-
-
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), joint_noise=(0.01, 0.02))
 
 
@@ -106,14 +92,14 @@ from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 for pair in sys.argv[2:]:
     expert = Expert(build_scene(*pair.split()))
-    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{pair} states.npy")]
+    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{pair} states.npy")][::-1]
     answers = [[*label.action, label.residual, label.phase, label.valid] for label in labels]
     np.save(f"{sys.argv[1]}/{pair} labels.npy", answers)
 """
 
 
 @pytest.mark.slow
-def test_another_process_answers_the_same_bits(tmp_path):
+def test_another_process_answers_the_same_bits_in_another_order(tmp_path):
     here: dict[str, np.ndarray] = {}
     for robot, task in SCENES:
         expert = expert_of(robot, task)
@@ -122,7 +108,7 @@ def test_another_process_answers_the_same_bits(tmp_path):
         here[f"{robot} {task}"] = np.array(
             [[*label.action, label.residual, label.phase, label.valid] for label in labels]
         )
-        np.save(tmp_path / f"{robot} {task} states.npy", [state.to_vector() for state in states])
+        np.save(tmp_path / f"{robot} {task} states.npy", [state.to_vector() for state in states[::-1]])
     subprocess.run([sys.executable, "-c", IN_ANOTHER_PROCESS, tmp_path, *here], check=True)
     for pair, labels in here.items():
         assert np.load(tmp_path / f"{pair} labels.npy").tobytes() == labels.tobytes()
@@ -174,17 +160,6 @@ def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str
     np.testing.assert_array_equal(label.action, held)
 
 
-@every_scene
-def test_without_a_solution_the_arm_holds_still_and_says_so(robot: str, task: str, monkeypatch):
-    scene = build_scene(robot, task)
-    expert, state = Expert(scene), visited_states(robot, task, "expert")[3]
-    monkeypatch.setattr(expert._ik, "step", lambda *_: None)
-    label = expert.label(state)
-    assert (label.valid, label.reason) == (False, "inverse kinematics has no solution")
-    held = scene.actions.join(joints(scene, state), world_in(scene, state).opening)
-    np.testing.assert_array_equal(label.action, held)
-
-
 @every_robot
 def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label(robot: str):
     env = started(robot, "reach")
@@ -196,15 +171,6 @@ def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label(robot: str):
         reasons.add(label.reason)
         env.advance(label.action)
     assert reasons == {"", "no joint step brings the hand nearer"}
-
-
-@every_scene_with_a_cube
-def test_a_heavier_cube_is_grasped_alike(robot: str, task: str):
-    # A label is geometry: what the cube weighs is felt on the next step, not foreseen.
-    scene, expert = build_scene(robot, task), expert_of(robot, task)
-    for state in visited_states(robot, task, "expert"):
-        heavy = replace(state, variation=with_drawn(scene.nominal, {"mass": 0.3}))
-        assert written(expert.label(heavy)) == written(expert.label(state))
 
 
 @pytest.mark.parametrize("offset", np.linspace(-0.3, 0.3, 7).tolist())

@@ -20,7 +20,6 @@ from manip_il.data.schema import fitted_columns
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
@@ -92,41 +91,11 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
     assert written(replace(job, batch=1).run(SEEDS[::-1])) == bits
 
 
-def test_hold_ends_an_episode_so_many_steps_after_success():
-    for episode in run(EXPERT).values():
-        assert len(episode) == int(np.argmax(episode.columns["next.success"])) + 1 + 3
-        assert episode.success
-        assert episode.columns["next.done"].ravel().tolist() == [False] * (len(episode) - 1) + [True]
-    whole = replace(EXPERT, hold=None, env=EnvConfig("fetch", horizon=37))
-    assert [len(episode) for episode in whole.run(SEEDS[:2])] == [37, 37]
-
-
-@pytest.mark.parametrize(
-    ("condition", "actor", "off"),
-    [
-        (Condition("noisy", action_noise=(0.1, 0.1)), Actor.NOISY_EXPERT, True),
-        (Condition("knocked", knock=(0.05, 0.08)), Actor.EXPERT, False),
-    ],
-)
-def test_under_action_noise_the_actor_is_the_noisy_expert(condition, actor: Actor, off: bool):
-    for episode in replace(EXPERT, conditions=(condition,)).run(SEEDS[:2]):
-        assert set(episode.columns["actor"].ravel()) == {actor}
-        assert ((episode.columns["executed_action"] != episode.columns["action"]).any(axis=1) == off).all()
-
-
 def test_a_noisy_expert_has_its_noise():
     for episode in run(RolloutJob(EnvConfig("panda"), NoisyExpertDriver(NOISE), hold=3)).values():
         assert (episode.columns["actor"] == Actor.NOISY_EXPERT).all()
         off = np.subtract(episode.columns["executed_action"], episode.columns["action"])
         assert off.std(axis=0)[:7] == pytest.approx(0.01, rel=0.4)
-
-
-def test_labels_of_the_last_step_alone_tell_the_phase_at_the_end():
-    job = replace(EXPERT, driver=RandomDriver(), env=EnvConfig("fetch", horizon=8))
-    every = run(job, SEEDS[:2])
-    for episode in replace(job, label="last").run(SEEDS[:2]):
-        assert "action" not in episode.columns
-        assert episode.columns["expert_phase"][-1] == every[episode.seed].columns["expert_phase"][-1]
 
 
 def test_where_the_expert_was_not_queried_the_label_is_not_to_be_learnt_from(job: RolloutJob):

@@ -126,18 +126,6 @@ def one_episode(env: Counter, driver, rules: Rules, gate=always) -> list[Transit
     return list(rollout([env], [0], driver, rules, Ones(), gate))
 
 
-@pytest.mark.parametrize("envs", [2, 5])
-def test_an_episode_does_not_depend_on_its_neighbours(envs: int):
-    def run(count: int) -> dict[int, list[tuple]]:
-        found = rollout([Kicked(3) for _ in range(count)], range(9), follow, Rules(horizon=20, hold=1), Ones())
-        return {seed: list(map(columns, frames)) for seed, frames in episodes(found).items()}
-
-    def columns(t: Transition) -> tuple:
-        return t.step, t.state.physics[0], t.observation.state[0], t.executed_action[0], t.actor, t.success, t.done
-
-    assert run(envs) == run(1)
-
-
 def test_a_frame_holds_what_was_before_the_step_and_what_came_of_it():
     frames = one_episode(Counter(), follow, Rules(horizon=4))
     assert [frame.state.physics[0] for frame in frames] == [0, 1, 2, 3]
@@ -194,11 +182,6 @@ def test_an_expert_that_takes_over_drives_to_the_end_and_leaves_the_others_alone
     assert [frame.actor for frame in found[0]] == [Actor.LEARNER] * 5
     assert [frame.actor for frame in found[1]] == [Actor.LEARNER] * 2 + [Actor.EXPERT] * 3
     assert learner.rows == [2, 2, 2, 1, 1]
-
-
-def test_episodes_may_all_begin_in_one_state():
-    frames = list(rollout([Counter()], [7, 8], Halves(), Rules(2), first=State(np.array([2.0]), np.empty(0))))
-    assert [frame.state.physics[0] for frame in frames] == [2.0, 2.5, 2.0, 2.5]
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from manip_il.collect.scenes import SceneDrawer, Scenes
 
 from manip_il.cli.main import main
 from manip_il.collect.expert import Expert
+from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, EnvConfig
