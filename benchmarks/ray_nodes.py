@@ -22,10 +22,10 @@ import ray
 from _machine import describe_machine
 from ray.cluster_utils import Cluster
 
+from manip_il import __version__
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.ray_pool import packed
-from manip_il.collect.task import run_seeds
+from manip_il.collect.ray_pool import run_there
 from manip_il.collect.workers import Engine
 from manip_il.data.journal import Journal
 from manip_il.seeding import stream_seeds
@@ -91,7 +91,7 @@ def wire(job: RolloutJob) -> float:
     with tempfile.TemporaryDirectory() as folder:
         keep = Journal(Path(folder), env_spec(job.env), env_fingerprint(job.env))
         seeds = tuple(stream_seeds("certificate", 8))
-        return len(packed(run_seeds(job, seeds, keep, store=False))) / len(seeds)
+        return len(run_there(__version__, job, seeds, keep)) / len(seeds)
 
 
 def spread(above: list[float], below: list[float]) -> str:

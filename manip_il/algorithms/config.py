@@ -246,11 +246,11 @@ class RunConfig:
 
         `per_state`: everywhere; `takeover`: once; `branch`: for as many labels as steps.
         """
-        from manip_il.collect.query import Every, One, Probability
+        from manip_il.collect.query import Query
 
         if self.query_rule is not None or self.label == "per_state":
-            return self.query_rule or Every()
-        return One() if self.label == "takeover" else Probability(1 / self.steps_of_branch)
+            return self.query_rule or Query()
+        return Query("one") if self.label == "takeover" else Query("probability", 1 / self.steps_of_branch)
 
 
 def plan_of(fit: FitConfig) -> tuple[int, int]:

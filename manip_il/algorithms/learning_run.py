@@ -27,7 +27,7 @@ from manip_il.algorithms.learning_config import LONGER, LearningConfig
 from manip_il.algorithms.run import BEST, Watch
 from manip_il.algorithms.vector_env import ActionRange, Lockstep, RobotEpisode
 from manip_il.collect.drivers import PolicyDriver
-from manip_il.collect.environments import env_fingerprint, env_spec, policy_sha256
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.workers import Engine
 from manip_il.data.atomic import new_folder
@@ -50,6 +50,7 @@ from manip_il.learn.checkpoint import (
 from manip_il.learn.discriminators import Discriminator
 from manip_il.learn.limits import threads
 from manip_il.learn.network import MLPNetwork
+from manip_il.learn.policy_files import policy_sha256
 from manip_il.learn.ppo import Learner, lent_generators
 from manip_il.learn.start import start_conversion, start_policy
 from manip_il.learn.train import save_policy

@@ -28,19 +28,12 @@ from manip_il.algorithms.config import RunConfig, check_labels
 from manip_il.algorithms.fitting import fit_round, round_fit
 from manip_il.algorithms.rounds import Fitted, Rollouts, RoundResult, best_round
 from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver
+from manip_il.collect.edits import Source, Target, redraw_dataset
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import Every, Query, Safety
-from manip_il.collect.record import (
-    MAX_TRIES,
-    collect,
-    collect_successes,
-    journal_of,
-    provenance,
-    record,
-    redraw,
-)
-from manip_il.collect.redraw import RedrawJob
-from manip_il.collect.workers import Engine
+from manip_il.collect.query import Query
+from manip_il.collect.record import MAX_TRIES, collect, collect_successes, journal_of, provenance, record
+from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.collect.workers import Engine, default_workers
 from manip_il.data import schema
 from manip_il.data.atomic import new_folder
 from manip_il.data.build import Recording, dataset_sha256, merge_datasets
@@ -114,7 +107,7 @@ class Run:
         query: when the expert is queried; None: in every state. disturbed: share of the episodes that run under
         `STANDARD` as well.
         """
-        config, rule = self.config, query or Every()
+        config, rule = self.config, query or Query()
         count, per_state = config.episodes_per_round, config.label == "per_state"
         self._watch.on_stage("collect", round_, count)
         with self._timed("collect"):
@@ -126,7 +119,7 @@ class Run:
                 left = self._left(round_)
                 recording = Recording(name, provenance=provenance(job), only_labelled=gated, labels=left)
                 self._record(job, self._collect(job, count, round(disturbed * count)), recording)
-            return self._keep(round_, driver.beta, per_state and isinstance(rule, Every | Safety))
+            return self._keep(round_, driver.beta, per_state and rule.kind in ("every", "safety"))
 
     def fit(self, data: Sequence[Rollouts]) -> Fitted:
         """Fit the policy, and the others of an ensemble after it, to rollouts; it belongs to the last one's round."""
@@ -155,12 +148,12 @@ class Run:
             return rollouts.dataset
         if not root.is_dir():
             frames, first = self._scenes(rollouts.round)
-            journals = root.with_name(f"{REDRAWN}.journals")
-            job = RedrawJob(config.env, config.cameras, journals, frames, config.seed, first=first)
-            job = replace(job, conditions=config.conditions)
-            self._watch.on_stage("redraw", rollouts.round, len(job.seeds))
+            scenes = Scenes(config.cameras, frames, config.seed, conditions=config.conditions, first=first)
+            self._watch.on_stage("redraw", rollouts.round, len(scenes.numbers[::CHUNK]))
+            workers = min(self._engine.workers or default_workers(), default_workers())
             with self._timed("redraw"):
-                redraw(self._engine, rollouts.dataset, job, root, lambda _: self._watch.on_step())
+                target = Target(root, workers, on_piece=self._watch.on_step)
+                redraw_dataset(Source(Dataset.open(rollouts.dataset), config.env), scenes, target)
         return root
 
     def _scenes(self, round_: int) -> tuple[int, int]:

@@ -178,7 +178,7 @@ class DaggerOptions(common.EnvOptions):
         cameras = self.image.config(self.cameras or CAMERAS if sees else self.cameras)
         if start is None:
             return self.observation, cameras
-        from manip_il.collect.environments import policy_cameras
+        from manip_il.learn.policy_files import policy_cameras
         from manip_il.learn.pretrained import observation_of, read_interface
 
         observation = self.observation or observation_of(read_interface(start).columns)

@@ -70,9 +70,10 @@ class EpisodeJournal:
 
 
 def _common(job: RolloutJob, suite: str) -> dict[str, Any]:
-    from manip_il.collect.environments import env_fingerprint, policy_sha256
+    from manip_il.collect.environments import env_fingerprint
     from manip_il.collect.job import observed_cameras
     from manip_il.evaluation.results import EvalSettings
+    from manip_il.learn.policy_files import policy_sha256
 
     return {
         "policy_sha256": policy_sha256(job.policy) if job.policy is not None else job.driver.name,
@@ -139,10 +140,11 @@ class ReplayOptions:
     def _job(self, result: EvalResult) -> RolloutJob:
         """Return the rollouts of the evaluation; warn where policy or program have changed since."""
         from manip_il.collect.drivers import PolicyDriver, driver_of
-        from manip_il.collect.environments import env_fingerprint, policy_sha256
+        from manip_il.collect.environments import env_fingerprint
         from manip_il.collect.job import RolloutJob
         from manip_il.data.fingerprint import compare_fingerprints
         from manip_il.learn.checkpoint import read_meta
+        from manip_il.learn.policy_files import policy_sha256
 
         env = result.settings.env(result.robot, result.task)
         conditions, hold = result.settings.conditions, result.settings.hold

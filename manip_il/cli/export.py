@@ -36,8 +36,8 @@ class ExportOptions:
         """Export, compare, write."""
         output = self.output or Path(f"policy{SUFFIXES[self.format]}")
         path = self._find(output)
-        from manip_il.collect.environments import policy_sha256
         from manip_il.learn.export import export_onnx, export_torchscript
+        from manip_il.learn.policy_files import policy_sha256
 
         write = export_onnx if self.format == "onnx" else export_torchscript
         exported = write(path, policy_sha256(path))

@@ -158,9 +158,10 @@ def check_policy(
     `MismatchError` unless the policy can drive `env`, `RenderError` where there is no OpenGL for its pictures, and what
     `LearnedPolicy.load` raises.
     """
-    from manip_il.collect.environments import env_spec, policy_cameras
+    from manip_il.collect.environments import env_spec
     from manip_il.learn.checkpoint import check_fits
     from manip_il.learn.policy import LearnedPolicy
+    from manip_il.learn.policy_files import policy_cameras
     from manip_il.learn.pretrained import check_interface, read_interface
 
     cameras = policy_cameras(path)

@@ -225,24 +225,13 @@ class RenderOptions:
         cameras = self.image.config(self.cameras, self.look)
         if cameras is None:
             raise UsageError("--cameras names none; expected any of front, side, wrist")
-        from manip_il.collect.render import render_dataset
-        from manip_il.collect.source import open_source
+        from manip_il.collect.edits import Target, open_source, render_dataset
         from manip_il.collect.workers import default_workers
-        from manip_il.data.build import local_id
-        from manip_il.data.dataset import Dataset
 
-        source = open_source(self.source, self.robot.type)
+        source, workers = open_source(self.source, self.robot.type), self.workers or default_workers()
         warn(*source.warnings)
-        with exclusive(self.target), progress(Dataset.open(self.source).info.episodes, f"render {self.source}") as bar:
-            info = render_dataset(
-                source,
-                self.target,
-                cameras,
-                repo_id=local_id(self.target.name),
-                workers=self.workers or default_workers(),
-                replace=self.overwrite,
-                on_episode=lambda _: bar.advance(),
-            )
+        with exclusive(self.target), progress(source.dataset.info.episodes, f"render {self.source}") as bar:
+            info = render_dataset(source, cameras, Target(self.target, workers, self.overwrite, bar.advance))
         what = f"{', '.join(cameras.names)}, {cameras.height} x {cameras.width} pixels"
         say(f"rendered {info.episodes:,} episodes, {info.frames:,} frames: {what}")
         say(f"dataset: {self.target}")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset
-from manip_il.cli.outputs import check_output, check_same_options, prepare_output, require_output, save_options
+from manip_il.cli.outputs import require_new
 from manip_il.cli.progress import progress, say, warn
 from manip_il.cli.record import OwnRobotGroup
 from manip_il.cli.trials import varied
@@ -16,10 +16,6 @@ from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.option import option
 from manip_il.sim.config import CAMERAS
-
-if TYPE_CHECKING:
-    from manip_il.collect.redraw import RedrawJob
-    from manip_il.collect.source import Source
 
 _RUN = "dataset"  # the folder of a DAgger run that has the states of all its rounds
 
@@ -29,7 +25,7 @@ class RedrawOptions:
     """Draw goals, untouched objects and looks anew in the states that were visited; the expert labels, cameras see.
 
     TARGET is a LeRobot dataset to train policies on pictures from, each frame an episode of its own. Scenes without a
-    sound label are left out. A killed redraw goes on where it was.
+    sound label are left out.
     """
 
     example: ClassVar[str] = "manip-il redraw runs/dagger datasets/redrawn --frames=20000"
@@ -43,9 +39,7 @@ class RedrawOptions:
     image: common.SmallImageGroup = field(default_factory=common.SmallImageGroup)
     vary: list[str] = option(list, "how every frame looks: view, clutter, object (its colour), or YAMLs of ranges")
     seed: int = common.seed_option()
-    engine: Literal["local", "ray"] = common.engine_option()
-    workers: int | None = common.workers_option()
-    resume: bool = option(False, "continue an interrupted redraw")
+    workers: int | None = option(None, "processes; by default one per core")
     overwrite: bool = option(False, "replace an existing dataset")
 
     def check(self) -> None:
@@ -58,9 +52,7 @@ class RedrawOptions:
         source, target = self._dataset().resolve(), self.target.resolve()
         if source.is_relative_to(target) or target.is_relative_to(source):
             raise UsageError(f"TARGET {self.target} overlaps SOURCE {self.source}; expected a folder of its own")
-        check_output(self.target, resume=self.resume, overwrite=self.overwrite)
-        if not self.target.is_dir():
-            require_output(self._journals(), resume=self.resume, overwrite=self.overwrite)
+        require_new(self.target, overwrite=self.overwrite)
         if self.image.config(self.cameras) is None:
             raise UsageError(f"--cameras names none; expected any of {', '.join(CAMERAS)}")
 
@@ -73,59 +65,26 @@ class RedrawOptions:
 
     def make(self) -> None:
         """Draw all frames, and say nothing of what comes next."""
-        from manip_il.collect.source import open_source
+        from manip_il.collect.edits import Target, open_source, redraw_dataset
+        from manip_il.collect.scenes import CHUNK, Scenes
+        from manip_il.collect.workers import default_workers
 
-        source = open_source(self._dataset(), self.robot.type)
+        source, cameras = open_source(self._dataset(), self.robot.type), self.image.config(self.cameras)
         warn(*source.warnings)
-        job = self._job(source)
-        with exclusive(self.target):
-            journals = self._journals()
-            prepare_output(self.target, resume=self.resume, overwrite=self.overwrite)
-            prepare_output(journals, resume=self.resume, overwrite=self.overwrite)
-            if self.resume:
-                check_same_options(journals, self, ("workers", "engine"))
-                if self.target.is_dir() and not journals.is_dir():
-                    require_dataset(self.target)
-                    say(f"{self.target} is complete already")
-                    return
-            save_options(journals, self)
-            self._redraw(source, job)
+        assert cameras is not None
+        conditions, workers = varied(self.vary, source.env, sees=True), self.workers or default_workers()
+        scenes = Scenes(cameras, self.frames, self.seed, self.scenes, conditions, self.branch_steps)
+        with exclusive(self.target), progress(self.frames, f"redraw {self._dataset()}") as bar:
+            target = Target(self.target, workers, self.overwrite, lambda: bar.advance(CHUNK))
+            info = redraw_dataset(source, scenes, target)
+        left = self.frames - info.episodes
+        what = f"{', '.join(cameras.names)}, {cameras.height} x {cameras.width} pixels"
+        say(
+            f"redrew {info.episodes:,} scenes, {info.frames:,} frames: {what}; {left:,} left out, without a sound label"
+        )
+        say(f"dataset: {self.target}")
 
     def _dataset(self) -> Path:
         root = self.source / _RUN if (self.source / _RUN / "meta" / "info.json").is_file() else self.source
         require_dataset(root)
         return root
-
-    def _journals(self) -> Path:
-        return self.target.with_name(f"{self.target.name}.journals")
-
-    def _job(self, source: Source) -> RedrawJob:
-        from manip_il.collect.redraw import RedrawJob
-
-        cameras = self.image.config(self.cameras)
-        assert cameras is not None
-        conditions = varied(self.vary, source.env, sees=True)
-        return RedrawJob(
-            source.env,
-            cameras,
-            self._journals(),
-            self.frames,
-            self.seed,
-            self.scenes,
-            conditions,
-            self.branch_steps,
-        )
-
-    def _redraw(self, source: Source, job: RedrawJob) -> None:
-        from manip_il.collect.record import redraw
-        from manip_il.collect.workers import Engine
-
-        asked = self.frames * self.branch_steps
-        with progress(asked, f"redraw {source.root}") as bar, Engine(self.workers, self.engine) as engine:
-            info = redraw(engine, source.root, job, self.target, lambda episode: bar.advance(len(episode)))
-        left = self.frames - info.episodes
-        what = f"{', '.join(job.cameras.names)}, {job.cameras.height} x {job.cameras.width} pixels"
-        say(
-            f"redrew {info.episodes:,} scenes, {info.frames:,} frames: {what}; {left:,} left out, without a sound label"
-        )
-        say(f"dataset: {self.target}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.cli import common_options as common
 from manip_il.cli.inputs import require_dataset
@@ -14,9 +14,6 @@ from manip_il.cli.record import OwnRobotGroup
 from manip_il.data.atomic import exclusive
 from manip_il.errors import UsageError
 from manip_il.option import option
-
-if TYPE_CHECKING:
-    from manip_il.collect.relabel import Changes
 
 
 @dataclass
@@ -45,39 +42,20 @@ class RelabelOptions:
 
     def run(self) -> None:
         """Label every state; TARGET appears when all are labelled."""
-        from manip_il.collect.relabel import relabel_dataset
-        from manip_il.collect.source import open_source
+        from manip_il.collect.edits import Target, open_source, relabel_dataset
         from manip_il.collect.workers import default_workers
-        from manip_il.data.build import local_id
-        from manip_il.data.dataset import Dataset
 
         target, workers = self._target(), self.workers or default_workers()
         source = open_source(self.dataset, self.robot.type)
         warn(*source.warnings)
-        with exclusive(target), progress(Dataset.open(self.dataset).info.episodes, f"relabel {self.dataset}") as bar:
-            changes = relabel_dataset(
-                source,
-                target,
-                repo_id=local_id(target.name),
-                workers=workers,
-                replace=self.overwrite,
-                on_episode=lambda _: bar.advance(),
-            )
-        say(f"relabelled {changes.episodes:,} episodes, {changes.frames:,} frames: {in_words(changes)}")
+        with exclusive(target), progress(source.dataset.info.episodes, f"relabel {self.dataset}") as bar:
+            changed = relabel_dataset(source, Target(target, workers, self.overwrite, bar.advance))
+        info, what = source.dataset.info, "all labels are as they were"
+        if changed:
+            what = f"{changed:,} labels differ: by more than 1 % of a joint's longest step, in phase, or in being sound"
+        say(f"relabelled {info.episodes:,} episodes, {info.frames:,} frames: {what}")
         say(f"dataset: {target}")
 
     def _target(self) -> Path:
         folder = self.dataset.absolute()
         return self.target or self.dataset.with_name(f"{folder.name}_relabelled")
-
-
-def in_words(changes: Changes) -> str:
-    """Return what relabelling changed."""
-    parts = {
-        "actions differ by more than 1 % of a joint's longest step": changes.actions,
-        "phases differ": changes.phases,
-        "states have a sound label now": changes.gained,
-        "states have none any more": changes.lost,
-    }
-    found = [f"{count:,} {what}" for what, count in parts.items() if count]
-    return ", ".join(found) if found else "all labels are as they were"

@@ -161,15 +161,14 @@ class TrainOptions:
 
     def _redrawn(self, held: contextlib.ExitStack) -> Path:
         """The dataset of redrawn scenes in the run's folder, which is held from here on; made where it is not there."""
-        from manip_il.collect.source import open_source
+        from manip_il.collect.edits import open_source
 
         source, target = self.dataset.root[0], self.output_dir / "redrawn"
         open_source(source)  # refuses one without states before anything is removed
         self._prepare(held)
         save_options(self.output_dir, self)
         if not target.is_dir():
-            begun = target.with_name(f"{target.name}.journals").is_dir()
-            RedrawOptions(source, target, self.redraw, seed=self.seed, resume=begun).make()
+            RedrawOptions(source, target, self.redraw, seed=self.seed).make()
         return target
 
     def _fit_config(self) -> FitConfig:

@@ -59,7 +59,7 @@ class Trial:
     @classmethod
     def of(cls, env: EnvConfig, seeds: range, suite: str, policies: Iterable[Path], trust: bool = False) -> Trial:
         """Make one of a suite's conditions, without those of cameras where none of the policies uses any."""
-        from manip_il.collect.environments import policy_cameras
+        from manip_il.learn.policy_files import policy_cameras
 
         sees = any(policy_cameras(policy) is not None for policy in policies)
         return cls(env, seeds, suite, suite_conditions(suite, env.task, env.object, sees=sees), trust)
@@ -78,9 +78,10 @@ class Trial:
 
         So another policy of the same name is another file, and what was measured before stays true.
         """
-        from manip_il.collect.environments import env_fingerprint, policy_sha256
+        from manip_il.collect.environments import env_fingerprint
         from manip_il.data.fingerprint import canonical_json
         from manip_il.evaluation.results import EvalSettings
+        from manip_il.learn.policy_files import policy_sha256
 
         settings = EvalSettings.of(self.job(policy), self.suite).to_json()
         made_of = (
@@ -247,10 +248,8 @@ class Shot:
         """Return the episode as it looked, as a strip of pictures too. Raises `RenderError` without OpenGL."""
         from manip_il.evaluation.film import film, make_film, pictures_of
         from manip_il.evaluation.report_data import Strip
-        from manip_il.sim.conditions import NOMINAL, draw
 
-        drawn = draw(self.job.conditions or (NOMINAL,), self.episode.seed)
-        frames = film(self.episode, self.job.env, every=FILM_EVERY, drawn=drawn)
+        frames = film(self.episode, self.job.env, every=FILM_EVERY)
         fps = self.job.env.control_hz // FILM_EVERY or 1
         made = make_film(self.title, frames, fps, self.caption, success=self.success)
         return made, Strip(self.title, pictures_of(frames, fps), self.caption) if strip else None

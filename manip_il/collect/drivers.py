@@ -6,8 +6,9 @@ from the turns of a step to each turn's action (n,) and who chose it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, override
 
@@ -48,7 +49,7 @@ class Driver:
     @property
     def name(self) -> str:
         """Name in datasets."""
-        return self.kind
+        return "mixture" if self.policies and self.beta > 0 else self.kind
 
     def start(self, setting: Setting) -> Act:
         """Return the driver at work, for the episodes of one process."""
@@ -64,7 +65,6 @@ class ExpertDriver(Driver):
 
     @override
     def start(self, setting: Setting) -> Act:
-        """Return the driver at work."""
         return expert_actions
 
 
@@ -78,15 +78,13 @@ class NoisyExpertDriver(Driver):
 
     @override
     def start(self, setting: Setting) -> Act:
-        """Return the driver at work; every episode has its own generator."""
-        covariance, rngs = np.asarray(self.covariance), Generators("dart")
-        mean = np.zeros(len(covariance))
+        covariance, rngs = np.asarray(self.covariance), generators("dart")
 
-        def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-            noise = [rngs[turn.seed].multivariate_normal(mean, covariance) for turn in turns]
-            return [(turn.query().action + one, Actor.NOISY_EXPERT) for turn, one in zip(turns, noise, strict=True)]
+        def act(turn: Turn) -> tuple[F64, Actor]:
+            noise = rngs(turn.seed).multivariate_normal(np.zeros(len(covariance)), covariance)
+            return turn.query().action + noise, Actor.NOISY_EXPERT
 
-        return act
+        return lambda turns: list(map(act, turns))
 
 
 @dataclass(frozen=True)
@@ -97,13 +95,8 @@ class RandomDriver(Driver):
 
     @override
     def start(self, setting: Setting) -> Act:
-        """Return the driver at work; every episode has its own generator."""
-        draw, rngs = setting.actions.random_near, Generators("random policy")
-
-        def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-            return [(draw(turn.observation.state, rngs[turn.seed]), Actor.LEARNER) for turn in turns]
-
-        return act
+        draw, rngs = setting.actions.random_near, generators("random policy")
+        return lambda turns: [(draw(turn.observation.state, rngs(turn.seed)), Actor.LEARNER) for turn in turns]
 
 
 @dataclass(frozen=True)
@@ -119,17 +112,18 @@ class PolicyDriver(Driver):
     beta: float = 0.0
     trust: bool = False
 
-    @property
-    @override
-    def name(self) -> str:
-        """Name in datasets."""
-        return "mixture" if self.beta > 0 else "policy"
-
     @override
     def start(self, setting: Setting) -> Act:
-        """Return the driver at work."""
-        learner = learner_actions(setting.policies[0])
-        return mixture(learner, self.beta) if self.beta > 0 else learner
+        policy, rngs = setting.policies[0], generators("mixture")
+
+        def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
+            actions = [(action, Actor.LEARNER) for action in policy_actions(policy, turns)]
+            for i, turn in enumerate(turns if self.beta > 0 else ()):
+                if rngs(turn.seed).uniform() < self.beta:
+                    actions[i] = (turn.query().action, Actor.EXPERT)
+            return actions
+
+        return act
 
 
 def driver_of(name: str | None) -> Driver:
@@ -140,25 +134,6 @@ def driver_of(name: str | None) -> Driver:
 def expert_actions(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
     """Return the expert's label (n,) of every turn."""
     return [(turn.query().action, Actor.EXPERT) for turn in turns]
-
-
-def learner_actions(policy: Policy) -> Act:
-    """Return a driver that executes a policy's actions, one call a step for all episodes."""
-    return lambda turns: [(action, Actor.LEARNER) for action in policy_actions(policy, turns)]
-
-
-def mixture(learner: Act, beta: float) -> Act:
-    """Return a driver whose every step is the expert's with probability beta, by each episode's own generator."""
-    rngs = Generators("mixture")
-
-    def act(turns: Sequence[Turn]) -> list[tuple[F64, Actor]]:
-        actions = learner(turns)
-        for i, turn in enumerate(turns):
-            if rngs[turn.seed].uniform() < beta:
-                actions[i] = (turn.query().action, Actor.EXPERT)
-        return actions
-
-    return act
 
 
 def policy_actions(policy: Policy, turns: Sequence[Turn]) -> F64:
@@ -180,12 +155,6 @@ def observations(turns: Sequence[Turn], cameras: Sequence[str]) -> tuple[F32, F3
     )
 
 
-class Generators(dict[int, np.random.Generator]):
-    """A random generator for every episode, by its seed."""
-
-    def __init__(self, stream: str):
-        super().__init__()
-        self._stream = stream
-
-    def __missing__(self, seed: int) -> np.random.Generator:
-        return self.setdefault(seed, rng_for(seed, self._stream))
+def generators(stream: str) -> Callable[[int], np.random.Generator]:
+    """Return a function from an episode's seed to its own random generator."""
+    return cache(lambda seed: rng_for(seed, stream))

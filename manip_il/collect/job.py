@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -9,17 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manip_il.collect.drivers import Driver, ExpertDriver, PolicyDriver, Setting
-from manip_il.collect.environments import env_actions, env_spec, make_env, make_expert, policy_cameras, shares_models
-from manip_il.collect.query import Every, LabelMode, Query, branches, cut_at_takeover, gate_of, labelled
-from manip_il.collect.rollout import Act, Environment, Labeller, Rules, rollout
+from manip_il.collect.environments import env_actions, env_spec, make_env, make_expert
+from manip_il.collect.query import LabelMode, Query, branch, cut_at_takeover, gate_of, labelled
+from manip_il.collect.rollout import Act, Environment, Rules, rollout
 from manip_il.data.episodes import group_rollouts, to_episode
 from manip_il.errors import MismatchError, UsageError
+from manip_il.learn.policy_files import policy_cameras
 from manip_il.learn.pretrained import check_interface
 from manip_il.mdp import Episode, Transition
 from manip_il.sim.conditions import Condition, draw
 from manip_il.sim.config import CameraConfig, EnvConfig
 from manip_il.sim.scene import SCENES_KEPT
 from manip_il.sim.shape import draws_shape
+from manip_il.stock.table import ROBOT as STOCK
 
 if TYPE_CHECKING:  # torch only where a learner drives
     from manip_il.learn.policy import LearnedPolicy
@@ -44,7 +47,7 @@ class RolloutJob:
     hold: int | None = None
     patience: int | None = None
     label: LabelMode = "per_state"
-    query: Query = field(default_factory=Every)
+    query: Query = field(default_factory=Query)
     branch_steps: int = 1
     conditions: tuple[Condition, ...] = ()
     batch: int = LOCKSTEP
@@ -54,10 +57,9 @@ class RolloutJob:
     def __post_init__(self) -> None:
         if self.label == "takeover" and self.driver.name != "policy":
             raise UsageError(f"the expert takes over from a policy; this rollout is driven by {self.driver.name!r}")
-        if self.batch < 1:
-            raise UsageError(f"batch is {self.batch}; expected at least 1")
-        if self.branch_steps < 1:
-            raise UsageError(f"branch_steps is {self.branch_steps}; expected at least 1")
+        for name in ("batch", "branch_steps"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 1")
 
     @property
     def policy(self) -> Path | None:
@@ -65,38 +67,43 @@ class RolloutJob:
         return next(iter(self.driver.policies), None)
 
     @property
-    def learned(self) -> bool:
-        """Whether a policy drives."""
-        return self.policy is not None
-
-    @property
-    def files(self) -> Path | None:
-        """A folder that workers on other machines need a copy of."""
-        return self.policy
-
-    def with_files(self, files: Path) -> RolloutJob:
-        """Return the same where its folder has been copied to."""
-        assert isinstance(self.driver, PolicyDriver)
-        return replace(self, driver=replace(self.driver, policies=(files, *self.driver.policies[1:])))
-
-    @property
     def labels_all(self) -> bool:
         """Whether every state gets its label, whoever drives."""
-        return self.label == "per_state" and isinstance(self.query, Every)
+        return self.label == "per_state" and self.query.kind == "every"
 
     def run(self, seeds: Sequence[int]) -> Iterator[Episode]:
         """Yield one episode a seed, in the order in which they end."""
         if not seeds:
             return
         cameras = observed_cameras(self)
-        envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(lockstep(self), len(seeds)))]
-        steps = run_steps(self, envs, seeds)
-        if self.cameras is None and cameras is not None:
-            steps = map(_without_pictures, steps)
+        envs = [make_env(self.env, cameras, self.conditions) for _ in range(min(self._lockstep(), len(seeds)))]
         branch_env = make_env(self.env, self.cameras) if self.label == "branch" else None
-        for frames in group_rollouts(steps):
+        steps = run_steps(self, envs, seeds)
+        for frames in group_rollouts(map(_without_pictures, steps) if self.cameras is None and cameras else steps):
             drawn = draw(self.conditions, frames[0].seed, self.env.object).values
-            yield replace(_to_episode(self, frames, _expert(self.env), branch_env), drawn=drawn)
+            yield replace(self._to_episode(frames, branch_env), drawn=drawn)
+
+    def _lockstep(self) -> int:
+        """Environments that run in lockstep in one process."""
+        if self.policy is None:
+            return 1  # alone, an environment has the processor's cache
+        varies = draws_shape(self.env.object) or any(one.changes_model() for one in self.conditions)
+        return min(self.batch, OWN_MODELS) if varies or self.env.robot == STOCK else self.batch
+
+    def _to_episode(self, frames: list[Transition], branch_env: Environment | None) -> Episode:
+        """An episode's frames as columns, with what the expert gives as `label` has it."""
+        beta, expert = self.driver.beta, _expert(self.env)
+        if self.label == "last":
+            return to_episode(frames, self.round, beta, labelled=False)
+        if self.label == "takeover":
+            return to_episode(cut_at_takeover(frames, self.env.horizon), self.round, beta)
+        frames = labelled(frames, self.query, expert)
+        if branch_env is None:
+            return to_episode(frames, self.round, beta)
+        path = [replace(frame, label=None) for frame in frames]
+        starts = [frame for frame in frames if frame.label is not None and frame.label.valid]
+        found = (branch(branch_env, expert, one.state, one.seed, self.branch_steps) for one in starts)
+        return to_episode([*path, *itertools.chain(*found)], self.round, beta, path=len(path))
 
 
 def run_steps(
@@ -110,14 +117,6 @@ def run_steps(
     rules = Rules(horizon, job.hold, job.patience, takeover)
     gate = gate_of(job.label, job.query, setting)
     return rollout(envs, seeds, act or job.driver.start(setting), rules, _expert(job.env), gate)
-
-
-def lockstep(job: RolloutJob) -> int:
-    """Return how many environments of a job run in lockstep in one process."""
-    if job.policy is None:
-        return 1  # alone, an environment has the processor's cache
-    varies = draws_shape(job.env.object) or any(one.changes_model() for one in job.conditions)
-    return job.batch if shares_models(job.env) and not varies else min(job.batch, OWN_MODELS)
 
 
 def observed_cameras(job: RolloutJob) -> CameraConfig | None:
@@ -144,25 +143,8 @@ def _load(job: RolloutJob, path: Path, env: Environment) -> LearnedPolicy:
     return policy
 
 
-def _to_episode(job: RolloutJob, frames: list[Transition], expert: Labeller, branch_env: Environment | None) -> Episode:
-    """An episode's frames as columns, with what the expert gives as `job.label` has it."""
-    beta = job.driver.beta
-    if job.label == "last":
-        return to_episode(frames, job.round, beta, labelled=False)
-    if job.label == "takeover":
-        return to_episode(cut_at_takeover(frames, job.env.horizon), job.round, beta)
-    frames = labelled(frames, job.query, expert)
-    if branch_env is None:
-        return to_episode(frames, job.round, beta)
-    path = [replace(frame, label=None) for frame in frames]
-    found = branches(branch_env, expert, frames, job.branch_steps)
-    return to_episode([*path, *found], job.round, beta, path=len(path))
+def _without_pictures(frame: Transition) -> Transition:
+    return replace(frame, observation=replace(frame.observation, images={}, keypoints={}))
 
 
-def _without_pictures(transition: Transition) -> Transition:
-    return replace(transition, observation=replace(transition.observation, images={}, keypoints={}))
-
-
-@lru_cache(SCENES_KEPT)
-def _expert(config: EnvConfig) -> Labeller:
-    return make_expert(config)
+_expert = lru_cache(SCENES_KEPT)(make_expert)

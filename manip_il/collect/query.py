@@ -10,20 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manip_il.collect.drivers import Generators, Setting, expert_actions, observations, policy_actions
-from manip_il.collect.rollout import Environment, Labeller, Rules, Turn, rollout
+from manip_il.collect.drivers import Setting, expert_actions, generators, observations, policy_actions
+from manip_il.collect.rollout import Environment, Gate, Labeller, Rules, Turn, rollout
 from manip_il.errors import UnknownName, UsageError
 from manip_il.mdp import Actor, State, Transition
 from manip_il.seeding import rng_for
 
 F64 = NDArray[np.float64]
-Gate = Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]]
-"""Return whether the expert is queried in each turn, given the actions (n,) that the learner would execute."""
 LabelMode = Literal["per_state", "takeover", "branch", "last"]
 """What the expert gives when it is queried.
 
@@ -35,160 +33,136 @@ _STREAM = "ask"  # of random numbers; another name would draw other states
 
 @dataclass(frozen=True)
 class Query:
-    """A rule that says when the expert is queried. bound: 0 for rules without one.
+    """A rule that says when the expert is queried, one of `RULES`. bound: 0 for rules without one.
 
-    Raises `UsageError` for a bound outside the rule's range.
+    Raises `UnknownName` for its kind, `UsageError` for a bound outside the rule's range.
     """
 
+    kind: str = "every"
     bound: float = 0.0
-    kind: ClassVar[str]
-    words: ClassVar[str]  # for help and errors
-    limits: ClassVar[tuple[float, float] | None] = None  # of the bound; None for a rule without one
 
     def __post_init__(self) -> None:
-        if self.limits is None:
-            return
-        low, high = self.limits
-        if not (math.isfinite(self.bound) and low <= self.bound <= high):
-            raise UsageError(f"query is {self}; expected {self.words}")
+        if self.kind not in RULES:
+            raise UnknownName("query rule", self.kind, RULES)
+        if limits := RULES[self.kind].limits:
+            low, high = limits
+            if not (math.isfinite(self.bound) and low <= self.bound <= high):
+                raise UsageError(f"query is {self}; expected {RULES[self.kind].words}")
 
     def __str__(self) -> str:
-        return self.kind if self.limits is None else f"{self.kind}:{self.bound:g}"
+        return f"{self.kind}:{self.bound:g}" if RULES[self.kind].limits else self.kind
 
     def start(self, setting: Setting) -> Gate:
-        """Return the rule at work, for the episodes of one process."""
-        raise NotImplementedError
+        """Return the rule at work, for the episodes of one process. Raises `UsageError` for policies that lack it."""
+        return RULES[self.kind].start(self.bound, setting)
 
 
-class Every(Query):
-    """Every state."""
+@dataclass(frozen=True)
+class Rule:
+    """A kind of rule. words: for errors. start: gives the rule of a bound at work. limits: of the bound, if any."""
 
-    kind, words = "every", "in every state (Ross et al. 2011)"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work."""
-        return lambda turns, actions: [True] * len(turns)
-
-
-class One(Query):
-    """One step of an episode, drawn evenly; of a takeover from the horizon, so never if the episode ends before."""
-
-    kind, words = "one", "once an episode, at a drawn step (with one episode a round: Stagger, Li & Zhang 2025)"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work."""
-        return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
+    words: str
+    start: Callable[[float, Setting], Gate]
+    limits: tuple[float, float] | None = None
 
 
-class Probability(Query):
-    """Each step with the same probability, drawn from the episode's own generator."""
-
-    kind, limits = "probability", (math.ulp(0.0), 1.0)
-    words = "probability:0.1, at each step by chance; more than 0, at most 1"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work."""
-        rngs = Generators(_STREAM)
-        return lambda turns, actions: [rngs[turn.seed].uniform() < self.bound for turn in turns]
+def _every(bound: float, setting: Setting) -> Gate:
+    return lambda turns, actions: [True] * len(turns)
 
 
-class Ensemble(Query):
-    """States where an ensemble's actions spread: root mean square distance to their mean, in the worst dimension."""
-
-    kind, limits = "ensemble", (0.0, math.inf)
-    words = "ensemble:0.2, where policies that differ by their seed disagree by more (Menda et al. 2019); 0 or more"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work."""
-        if len(setting.policies) < 2:
-            raise UsageError("query=ensemble needs other policies to disagree with")
-        others = setting.policies[1:]
-
-        def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
-            answers = np.stack([np.stack(actions), *(policy_actions(policy, turns) for policy in others)])
-            return ((answers.std(axis=0) / setting.actions.scale).max(axis=-1) > self.bound).tolist()
-
-        return gate
+def _one(bound: float, setting: Setting) -> Gate:
+    """One step, drawn evenly; of a takeover from the horizon, so never if the episode ends before."""
+    return lambda turns, actions: [turn.step == drawn_step(turn.seed, setting.horizon) for turn in turns]
 
 
-class Likelihood(Query):
-    """States where the learner finds its own action less likely than the bound [nats a dimension]."""
-
-    kind, limits = "likelihood", (-math.inf, math.inf)
-    words = "likelihood:-2, where the policy finds its own action less likely, in nats a joint; a finite number"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work. Raises `UsageError` for a policy without a likelihood."""
-        learner = setting.policies[0]
-        learner.require_likelihood()
-
-        def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
-            stacked = np.stack(actions)
-            likelihood = learner.log_prob(*observations(turns, learner.cameras), stacked)
-            return (likelihood / stacked.shape[1] < self.bound).tolist()
-
-        return gate
+def _probability(bound: float, setting: Setting) -> Gate:
+    rngs = generators(_STREAM)
+    return lambda turns, actions: [rngs(turn.seed).uniform() < bound for turn in turns]
 
 
-class Safety(Query):
-    """States where expert and learner differ by more than the bound.
+def _ensemble(bound: float, setting: Setting) -> Gate:
+    """Root mean square distance of the members' actions to their mean, in the worst dimension."""
+    if len(setting.policies) < 2:
+        raise UsageError("query=ensemble needs other policies to disagree with")
+    others = setting.policies[1:]
 
-    To know that, the expert labels every state; its label is kept where they differ.
-    """
+    def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
+        answers = np.stack([np.stack(actions), *(policy_actions(policy, turns) for policy in others)])
+        return ((answers.std(axis=0) / setting.actions.scale).max(axis=-1) > bound).tolist()
 
-    kind, limits = "safety", (0.0, math.inf)
-    words = "safety:0.5, where expert and learner differ by more (Zhang & Cho 2017); 0 or more"
-
-    def start(self, setting: Setting) -> Gate:
-        """Return the rule at work."""
-
-        def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
-            labels = [turn.label or turn.peek() for turn in turns]
-            pairs = zip(labels, actions, strict=True)
-            gaps = [action_gap(label.action, action, setting.actions.scale) for label, action in pairs]
-            return [bool(gap > self.bound) for gap in gaps]
-
-        return gate
+    return gate
 
 
-QUERIES: dict[str, type[Query]] = {
-    "every": Every,
-    "one": One,
-    "probability": Probability,
-    "ensemble": Ensemble,
-    "likelihood": Likelihood,
-    "safety": Safety,
+def _likelihood(bound: float, setting: Setting) -> Gate:
+    learner = setting.policies[0]
+    learner.require_likelihood()
+
+    def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
+        stacked = np.stack(actions)
+        likelihood = learner.log_prob(*observations(turns, learner.cameras), stacked)
+        return (likelihood / stacked.shape[1] < bound).tolist()
+
+    return gate
+
+
+def _safety(bound: float, setting: Setting) -> Gate:
+    """To know where they differ, the expert labels every state; its label is kept where they do."""
+
+    def gate(turns: Sequence[Turn], actions: Sequence[F64]) -> Sequence[bool]:
+        labels = [turn.label or turn.peek() for turn in turns]
+        pairs = zip(labels, actions, strict=True)
+        return [bool(action_gap(one.action, action, setting.actions.scale) > bound) for one, action in pairs]
+
+    return gate
+
+
+RULES = {
+    "every": Rule("in every state (Ross et al. 2011)", _every),
+    "one": Rule("once an episode, at a drawn step (with one episode a round: Stagger, Li & Zhang 2025)", _one),
+    "probability": Rule(
+        "probability:0.1, at each step by chance; more than 0, at most 1", _probability, (math.ulp(0.0), 1.0)
+    ),
+    "ensemble": Rule(
+        "ensemble:0.2, where policies that differ by their seed disagree by more (Menda et al. 2019); 0 or more",
+        _ensemble,
+        (0.0, math.inf),
+    ),
+    "likelihood": Rule(
+        "likelihood:-2, where the policy finds its own action less likely, in nats a joint; a finite number",
+        _likelihood,
+        (-math.inf, math.inf),
+    ),
+    "safety": Rule(
+        "safety:0.5, where expert and learner differ by more (Zhang & Cho 2017); 0 or more", _safety, (0.0, math.inf)
+    ),
 }
 
 
 def parse_query(text: str) -> Query:
     """Return a rule as it is written; `UnknownName` for its kind, `UsageError` for a wrong or missing bound."""
     kind, colon, bound = text.partition(":")
-    if kind not in QUERIES:
-        raise UnknownName("query rule", kind, QUERIES)
-    rule = QUERIES[kind]
-    if rule.limits is None:
-        if colon:
-            raise UsageError(f"query is {text!r}; expected {kind} alone")
-        return rule()
+    if kind not in RULES or (RULES[kind].limits is None and not colon):
+        return Query(kind)
+    if RULES[kind].limits is None:
+        raise UsageError(f"query is {text!r}; expected {kind} alone")
     try:
-        return rule(float(bound))
+        return Query(kind, float(bound))
     except ValueError:
-        raise UsageError(f"query is {text!r}; expected {kind}:NUMBER ({rule.words})") from None
+        raise UsageError(f"query is {text!r}; expected {kind}:NUMBER ({RULES[kind].words})") from None
 
 
 def gate_of(label: LabelMode, query: Query, setting: Setting) -> Gate:
     """Return when a rollout queries the expert; `one` waits for the end (`labelled`) unless the expert takes over."""
     if label == "last":
         return lambda turns, actions: [turn.step == setting.horizon - 1 for turn in turns]
-    if isinstance(query, One) and label != "takeover":
+    if query.kind == "one" and label != "takeover":
         return lambda turns, actions: [False] * len(turns)
     return query.start(setting)
 
 
 def labelled(frames: list[Transition], query: Query, expert: Labeller) -> list[Transition]:
     """Return an episode's frames, for `one` with the label of a step drawn from those that there are."""
-    if isinstance(query, One):
+    if query.kind == "one":
         step = drawn_step(frames[0].seed, len(frames))
         frames[step] = replace(frames[step], label=expert.label(frames[step].state))
     return frames
@@ -202,13 +176,6 @@ def cut_at_takeover(frames: list[Transition], horizon: int) -> list[Transition]:
     last = min(len(frames) if taken is None else taken, horizon) - 1
     rest = [] if taken is None else frames[taken:]
     return [*frames[:last], replace(frames[last], done=True), *rest]
-
-
-def branches(env: Environment, expert: Labeller, frames: Sequence[Transition], steps: int) -> Iterator[Transition]:
-    """Yield what the expert does for some steps from every frame that has a valid label."""
-    for frame in frames:
-        if frame.label is not None and frame.label.valid:
-            yield from branch(env, expert, frame.state, frame.seed, steps)
 
 
 def branch(env: Environment, expert: Labeller, first: State, seed: int, steps: int) -> Iterator[Transition]:

@@ -1,27 +1,28 @@
 """Workers of a Ray cluster: of `RAY_ADDRESS` or one that runs on this machine, else a local one that is started.
 
-They send what is to be stored to this process, and get the policy's files from it, once a node: nodes need no shared
+They send what is to be stored to this process, and get the policies' files from it, once a node: nodes need no shared
 disk.
 """
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import pickle
 import tempfile
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import zstandard
 
 from manip_il import __version__
-from manip_il.collect.task import Answer, Job, Seeds, run_seeds
-from manip_il.data.atomic import new_folder
+from manip_il.collect.drivers import PolicyDriver
+from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
-from manip_il.errors import FolderExistsError, ManipError
+from manip_il.errors import ManipError
+from manip_il.mdp import Episode
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read when ray is imported
 try:
@@ -30,25 +31,24 @@ try:
 except ImportError as missing:
     raise ManipError("--engine=ray needs Ray: pip install 'manip_il[ray]'") from missing
 
-_LEVEL = 1  # of compression; what is below 100 kB then goes by Ray's short way, past its object stores
 Files = dict[str, bytes]
+_LEVEL = 1  # of compression; an episode of numbers is then a fifth
+_DEATHS = (
+    exceptions.WorkerCrashedError,
+    exceptions.NodeDiedError,
+    exceptions.ObjectLostError,
+    exceptions.OutOfMemoryError,
+)
 
 
-class RayCluster:
+class RayPool:
     """Up to `workers` tasks at once, one core each; by default as many as the cluster has cores now.
 
     Raises `ManipError` if there is no cluster.
     """
 
-    died = (
-        exceptions.WorkerCrashedError,
-        exceptions.NodeDiedError,
-        exceptions.ObjectLostError,
-        exceptions.OutOfMemoryError,
-    )
-
     def __init__(self, workers: int | None):
-        self._running: dict[Future[Answer], Any] = {}  # with Ray's reference of each
+        self._running: dict[Future[list[Episode]], Any] = {}  # with Ray's reference of each
         self._folders: dict[Path, Any] = {}  # folder -> its files in Ray's store
         self._most, self._ours = workers, not ray.is_initialized()
         if self._ours:
@@ -62,12 +62,13 @@ class RayCluster:
         """Tasks that run at once; more if nodes have come."""
         return self._most or max(1, int(ray.cluster_resources().get("CPU", 1)))
 
-    def submit(self, job: Job, seeds: Seeds, journal: Journal | None) -> Future[Answer]:
+    def submit(self, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None) -> Future[list[Episode]]:
         """Send some seeds of a job to the cluster."""
-        reference = _run_remote.remote(__version__, job, self._ship(job.files), seeds, journal)
-        future: Future[Answer] = Future()
+        files = [self._ship(folder) for folder in job.driver.policies]
+        reference = _run_remote.remote(__version__, job, seeds, journal, *files)
+        future: Future[list[Episode]] = Future()
         self._running[future] = reference
-        reference.future().add_done_callback(lambda answer: self._settle(future, answer))
+        reference.future().add_done_callback(lambda answer: self._settle(future, answer, journal))
         return future
 
     def close(self, in_order: bool) -> None:
@@ -79,31 +80,42 @@ class RayCluster:
         if self._ours and ray.is_initialized():
             ray.shutdown()
 
-    def _settle(self, future: Future[Answer], answer: Future[bytes]) -> None:
+    def _settle(self, future: Future[list[Episode]], answer: Future[bytes], journal: Journal | None) -> None:
+        """Store what came home, and hand the episodes or the error on."""
         self._running.pop(future, None)
         try:
-            future.set_result(pickle.loads(zstandard.decompress(answer.result())))
-        except exceptions.RayTaskError as failure:
-            cause = failure.cause
-            future.set_exception(cause if isinstance(cause, ManipError) else ManipError(str(failure).splitlines()[-1]))
+            found: list[tuple[Episode, bytes]] = pickle.loads(zstandard.decompress(answer.result()))
+            for episode, content in found:
+                if journal is not None:
+                    journal.store(episode.seed, content)
+            future.set_result([episode for episode, _ in found])
+        except _DEATHS as death:
+            future.set_exception(BrokenExecutor(str(death)))
+        except ManipError as error:
+            future.set_exception(getattr(error, "cause", error))  # as it was raised on its node
         except Exception as error:
-            future.set_exception(error if isinstance(error, self.died) else ManipError(f"Ray: {error}"))
+            future.set_exception(ManipError(f"Ray: {(str(error) or repr(error)).splitlines()[-1]}"))
 
-    def _ship(self, folder: Path | None) -> Any:
-        if folder is None:
-            return None
+    def _ship(self, folder: Path) -> Any:
         if folder not in self._folders:
             files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*.*"))}
             self._folders[folder] = ray.put(files)
         return self._folders[folder]
 
 
-def run_there(version: str, job: Job, files: Files | None, seeds: Seeds, journal: Journal | None) -> bytes:
+def run_there(
+    version: str, job: RolloutJob, seeds: tuple[int, ...], journal: Journal | None, *policies: Files
+) -> bytes:
     """Return the packed answer of a task on a node. Raises `ManipError` if it has another version of the program."""
     if version != __version__:
         node = ray.util.get_node_ip_address()
         raise ManipError(f"the Ray node {node} has manip_il {__version__}, not {version}; install {version} there")
-    return packed(run_seeds(job if files is None else job.with_files(_unpack(files)), seeds, journal, store=False))
+    with tempfile.TemporaryDirectory(prefix="manip_il-") as folder:
+        if isinstance(job.driver, PolicyDriver):
+            here = tuple(_unpack(files, Path(folder) / str(number)) for number, files in enumerate(policies))
+            job = replace(job, driver=replace(job.driver, policies=here))
+        found = [(one.without_pictures(), journal.encode(one) if journal else b"") for one in job.run(seeds)]
+        return zstandard.compress(pickle.dumps(found), _LEVEL)
 
 
 # Deaths are counted by the engine: Ray itself is to try once. Its function keeps a name of its own, so that what is
@@ -111,24 +123,8 @@ def run_there(version: str, job: Job, files: Files | None, seeds: Seeds, journal
 _run_remote = ray.remote(num_cpus=1, max_retries=0)(run_there)
 
 
-def packed(answer: Answer) -> bytes:
-    """Return what goes over the wire."""
-    return zstandard.compress(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL), _LEVEL)
-
-
-def _unpack(files: Files) -> Path:
-    """The policy's folder on this node, written once for all tasks that bring the same files."""
-    content = hashlib.sha256()
-    for name, data in sorted(files.items()):
-        content.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
-    folder = Path(tempfile.gettempdir()) / f"manip_il-policy-{os.getuid()}-{content.hexdigest()[:32]}"
-    if folder.is_dir():
-        return folder
-    try:
-        with new_folder(folder) as new:
-            for name, data in files.items():
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                (new / name).write_bytes(data)
-    except FolderExistsError:  # another task on this node was faster
-        pass
+def _unpack(files: Files, folder: Path) -> Path:
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
     return folder

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import itertools
 import logging
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.redraw import STATES, RedrawJob, write_states
-from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
-from manip_il.data.build import Recording, dataset_sha256, local_id
+from manip_il.data.build import Recording
 from manip_il.data.info import DatasetInfo
 from manip_il.data.journal import Header, Journal, list_seeds
 from manip_il.data.schema import IMAGES
@@ -30,13 +26,13 @@ _BETWEEN = 20  # at most so many are handed on between two that end, as there ma
 MAX_TRIES = 3  # times the asked number of episodes, before an expert that mostly fails is given up
 
 
-def journal_of(journals: Path, job: Job) -> Journal:
+def journal_of(journals: Path, job: RolloutJob) -> Journal:
     """Return the folder that a job's episodes are stored in."""
     return Journal(journals, env_spec(job.env, job.cameras), env_fingerprint(job.env, job.cameras))
 
 
 def collect(
-    engine: Engine, job: Job, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
+    engine: Engine, job: RolloutJob, seeds: Sequence[int], journals: Path, on_episode: OnEpisode | None = None
 ) -> Iterator[tuple[Header, Episode]]:
     """Run the seeds that have no journal in `journals` yet; each finished episode becomes one file at once.
 
@@ -76,7 +72,7 @@ def collect(
 
 def collect_successes(
     engine: Engine,
-    job: Job,
+    job: RolloutJob,
     seeds: Sequence[int],
     count: int,
     journals: Path,
@@ -101,7 +97,7 @@ def record(
     episodes: Iterable[tuple[Header, Episode]],
     journals: Path,
     root: Path,
-    job: Job,
+    job: RolloutJob,
     recording: Recording,
     replace: bool = False,
 ) -> tuple[DatasetInfo, int]:
@@ -117,26 +113,6 @@ def record(
         return writer.finish(recording.provenance | selection.provenance), selection.failed
 
 
-def redraw(
-    engine: Engine, source: Path, job: RedrawJob, root: Path, on_episode: OnEpisode | None = None
-) -> DatasetInfo:
-    """Write the dataset of a job's scenes of a dataset's states; its journals, in `job.files`, go once it is whole.
-
-    A job that was killed goes on from them. Raises `NothingToLearnError` where no scene has a sound label.
-    """
-    for line in journal_of(job.files, job).prepare():
-        _LOG.warning("%s", line)
-    if not (job.files / STATES).is_file():
-        write_states(source, job.files, job.seed)
-    drawn = {"scenes": job.scenes, "branch_steps": job.branch_steps, "cameras": asdict(job.cameras)}
-    vary = {"vary": [condition.to_json() for condition in job.conditions]} if job.conditions else {}
-    about = {"redrawn": {"from": source.name, "sha256": dataset_sha256(source), **drawn, **vary}}
-    recording = Recording(local_id(root.name), only_labelled=True, provenance=about, stills=True)
-    info, _ = record(collect(engine, job, job.seeds, job.files, on_episode), job.files, root, job, recording)
-    shutil.rmtree(job.files)
-    return info
-
-
 def provenance(job: RolloutJob) -> dict[str, Any]:
     """Return a job's driver, round and labels, as datasets name them, and the ranges that its episodes draw from.
 
@@ -145,7 +121,7 @@ def provenance(job: RolloutJob) -> dict[str, Any]:
     source: dict[str, Any] = {"driver": job.driver.name, "round": job.round, "beta": job.driver.beta}
     if job.conditions:
         source["vary"] = [condition.to_json() for condition in job.conditions]
-    if not job.learned:
+    if job.policy is None:
         return source
     steps = {"branch_steps": job.branch_steps} if job.label == "branch" else {}
     return {**source, "label": job.label, "query": str(job.query), **steps}

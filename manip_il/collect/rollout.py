@@ -9,77 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manip_il.collect.expert import Expert
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor, Label, Observation, State, Transition
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.world import World
+from manip_il.stock.environment import StockEnv
+from manip_il.stock.expert import StockExpert
 
 F64 = NDArray[np.float64]
+Environment = ManipEnv | StockEnv
+Labeller = Expert | StockExpert
 GROWTH = 0.01  # of the share of a task that is done: less is no progress
-
-
-class Environment(Protocol):
-    """Interface of an environment."""
-
-    @property
-    def task_description(self) -> str:
-        """Instruction of the episode, for policies that read language."""
-        ...
-
-    @property
-    def solved(self) -> bool:
-        """Whether the task is solved now."""
-        ...
-
-    @property
-    def reward(self) -> float:
-        """Reward of the last control step."""
-        ...
-
-    @property
-    def progress(self) -> float:
-        """Share of the task that is done, 0 to 1."""
-        ...
-
-    @property
-    def world(self) -> object | None:
-        """Physics in the present state, which a labeller of the same scene may read; None if there is none."""
-        ...
-
-    def start(self, seed: int) -> None:
-        """Begin the episode of a seed."""
-        ...
-
-    def begin_step(self) -> None:
-        """Apply what disturbs the world before a control step; called before its state is read."""
-        ...
-
-    def advance(self, action: F64) -> F64:
-        """Apply an action (n,) for one control step; returns it as it reached the robot."""
-        ...
-
-    def observe(self) -> Observation:
-        """Return what a learner observes now."""
-        ...
-
-    def get_state(self) -> State:
-        """Return everything that the future depends on."""
-        ...
-
-    def set_state(self, state: State) -> None:
-        """Restore a state."""
-        ...
-
-
-class Labeller(Protocol):
-    """Interface of the expert."""
-
-    def label(self, state: State, world: object | None = None) -> Label:
-        """Return the expert's action in `state`. world: one that is in it, so that nothing need be restored."""
-        ...
 
 
 @dataclass(slots=True)
@@ -96,7 +41,7 @@ class Turn:
     labeller: Labeller | None = None
     label: Label | None = None
     progress: float = 0.0
-    world: object | None = None
+    world: World | None = None
 
     def query(self) -> Label:
         """Return the expert's label of this state and keep it. Raises `ManipError` where there is no expert."""
@@ -113,6 +58,10 @@ class Turn:
 
 Act = Callable[[Sequence[Turn]], list[tuple[F64, Actor]]]
 """A driver at work: returns an action (n,) and who chose it, for every turn of a step."""
+Gate = Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]]
+"""A query rule at work: returns whether the expert is queried in each turn, given the actions (n,) that would be
+executed.
+"""
 
 
 @dataclass(frozen=True)
@@ -154,15 +103,15 @@ def rollout(
     act: Act,
     rules: Rules,
     labeller: Labeller | None = None,
-    gate: Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]] | None = None,
+    gate: Gate | None = None,
     *,
     first: State | None = None,
 ) -> Iterator[Transition]:
     """Run one episode per seed, `len(envs)` at a time; yields every step's transition as it happens.
 
     An environment whose episode ends takes the next seed. An episode depends on its seed alone, not on its neighbours.
-    gate: whether the labeller is queried in each turn, given the actions (n,) that would be executed. first: the state
-    in which every episode begins, in place of its seed's.
+    gate: when the labeller is queried; None for never. first: the state in which every episode begins, in place of its
+    seed's.
     """
     waiting = iter(seeds)
     running = [slot for env in envs if (slot := _next_episode(env, waiting, first)) is not None]
@@ -198,12 +147,7 @@ def _begin_step(slot: _Slot, labeller: Labeller | None) -> None:
     slot.turn = Turn(slot.seed, slot.step, seen, state, labeller, progress=env.progress, world=env.world)
 
 
-def _choose(
-    running: Sequence[_Slot],
-    act: Act,
-    gate: Callable[[Sequence[Turn], Sequence[F64]], Sequence[bool]] | None,
-    takeover: bool,
-) -> None:
+def _choose(running: Sequence[_Slot], act: Act, gate: Gate | None, takeover: bool) -> None:
     """Choose every episode's action and, where the gate says so, query the expert."""
     led = [slot for slot in running if not slot.taken_over]
     turns = [slot.turn for slot in led]

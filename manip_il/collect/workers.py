@@ -7,43 +7,26 @@ nothing but time: what it had not finished runs again, each seed alone, so that 
 from __future__ import annotations
 
 import os
-from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from types import TracebackType
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Union
 
 from manip_il.child_processes import kill_pool, open_pool, start_server
-from manip_il.collect.task import Answer, Job, Seeds, run_seeds
+from manip_il.collect.job import RolloutJob
 from manip_il.data.journal import Journal
 from manip_il.errors import ManipError, UsageError
 from manip_il.mdp import Episode
 
-MAX_DEATHS = 3  # of workers that ran one seed alone, before it is left out
+if TYPE_CHECKING:
+    from manip_il.collect.ray_pool import RayPool
+
+MAX_DEATHS = 3  # of workers that ran one seed alone, before it is left out; so many seeds in a row end the work
 Backend = Literal["local", "ray"]
+Seeds = tuple[int, ...]
+Pool = Union["LocalPool", "RayPool"]
 _EVERY_JOB, _LEARNED_JOB = ("manip_il.collect.job",), ("manip_il.collect.job", "manip_il.learn.policy")
-
-
-class Workers(Protocol):
-    """Workers of one backend."""
-
-    @property
-    def died(self) -> tuple[type[BaseException], ...]:
-        """Errors of a future whose worker died."""
-        ...
-
-    @property
-    def count(self) -> int:
-        """Tasks that run at once."""
-        ...
-
-    def submit(self, job: Job, seeds: Seeds, journal: Journal | None) -> Future[Answer]:
-        """Start some seeds of a job."""
-        ...
-
-    def close(self, in_order: bool) -> None:
-        """End all workers; those still at work are killed unless all is `in_order`."""
-        ...
 
 
 class Engine:
@@ -59,9 +42,9 @@ class Engine:
         self.workers = default_workers() if workers is None and backend == "local" else workers
         self.given_up: list[int] = []
         self._backend: Backend = backend
-        self._pool: Workers | None = None
+        self._pool: Pool | None = None
 
-    def run(self, job: Job, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
         """Yield one episode a seed as they end, in no fixed order, each once it is in the journal.
 
         Pictures stay in the process that made them: episodes from another one come without. Raises what the work
@@ -69,15 +52,12 @@ class Engine:
         """
         wanted = [seed for seed in seeds if seed not in self.given_up]
         if self._backend == "local" and (self.workers == 1 or (len(wanted) == 1 and self._pool is None)):
-            yield from job.run(wanted) if journal is None else _stored(job.run(wanted), journal)
+            yield from run_seeds(job, wanted, journal)
             return
-        pool = self._pool = self._pool or _open_workers(self._backend, self.workers)
+        self._pool = self._pool or self._open()
         try:
-            for answer in self._answers(pool, job, wanted, journal):
-                for episode, packed in answer:
-                    if packed is not None and journal is not None:
-                        journal.store(episode.seed, packed)
-                    yield episode
+            for episodes in self._results(self._pool, job, wanted, journal):
+                yield from episodes
         except BaseException:
             self._close(in_order=False)  # nobody takes the episodes that still run
             raise
@@ -95,102 +75,108 @@ class Engine:
     ) -> None:
         self._close(in_order=kind is None)
 
+    def _open(self) -> Pool:
+        if self._backend == "local":
+            return LocalPool(self.workers or 1)
+        from manip_il.collect.ray_pool import RayPool  # here, as Ray is an extra
+
+        return RayPool(self.workers)
+
     def _close(self, in_order: bool) -> None:
         if self._pool is not None:
             self._pool.close(in_order)
             self._pool = None
 
-    def _answers(self, pool: Workers, job: Job, seeds: Sequence[int], journal: Journal | None) -> Iterator[Answer]:
-        """Yield what tasks answer; those whose worker died run again, seed by seed, with no other beside."""
-        tasks, alone = split(job, seeds, pool.count), deque[Seeds]()
-        running: dict[Future[Answer], Seeds] = {}
-        deaths: Counter[int] = Counter()
-        in_a_row = 0
-        while tasks or alone or running:
-            is_alone = bool(alone) and not running
-            start = [alone.popleft()] if is_alone else []
-            while tasks and not alone and not is_alone and len(running) + len(start) < pool.count:
-                start.append(tasks.popleft())
-            running |= {pool.submit(job, task, journal): task for task in start}
+    def _results(
+        self, pool: Pool, job: RolloutJob, seeds: Sequence[int], journal: Journal | None
+    ) -> Iterator[list[Episode]]:
+        """Yield what tasks give; the seeds of those whose worker died run again, one by one."""
+        tasks, running = split(job, seeds, pool.count), dict[Future[list[Episode]], Seeds]()
+        barren = 0  # seeds given up in a row
+        while tasks or running:
+            while tasks and len(running) < pool.count:
+                task = tasks.popleft()
+                running[pool.submit(job, task, journal)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
+            lost: list[int] = []
             for future in done:
                 task = running.pop(future)
-                try:
-                    answer = future.result()
-                except pool.died as death:
-                    in_a_row += 1
-                    if in_a_row > MAX_DEATHS * (pool.count + 1):
-                        raise ManipError(
-                            f"{in_a_row} rollout workers died one after the other ({death}); out of memory? Finished "
-                            "episodes are kept"
-                        ) from death
-                    if is_alone:  # else another seed may have killed the worker
-                        deaths.update(task)
-                    self.given_up += [seed for seed in task if deaths[seed] >= MAX_DEATHS]
-                    alone.extend((seed,) for seed in task if deaths[seed] < MAX_DEATHS)
-                    continue
-                in_a_row = 0
-                yield answer
+                if isinstance(future.exception(), BrokenExecutor):
+                    lost += task
+                else:
+                    barren = 0
+                    yield future.result()
+            for seed in lost:
+                episodes = _run_alone(pool, job, seed, journal)
+                if episodes is None:
+                    self.given_up.append(seed)
+                barren = 0 if episodes else barren + 1
+                if barren == MAX_DEATHS:
+                    raise ManipError(
+                        f"rollout workers died one after the other, of seeds {self.given_up[-barren:]}; out of memory? "
+                        "Finished episodes are kept"
+                    )
+                yield episodes or []
 
 
-class LocalProcesses:
+class LocalPool:
     """Processes of this machine."""
-
-    died = (BrokenExecutor,)
 
     def __init__(self, count: int):
         self.count = count
         self._pool: ProcessPoolExecutor | None = None
 
-    def submit(self, job: Job, seeds: Seeds, journal: Journal | None) -> Future[Answer]:
+    def submit(self, job: RolloutJob, seeds: Seeds, journal: Journal | None) -> Future[list[Episode]]:
         """Start some seeds of a job, in new processes if one had died."""
         if self._pool is None:
-            self._pool = open_pool(self.count, _LEARNED_JOB if job.learned else _EVERY_JOB)
+            self._pool = open_pool(self.count, _LEARNED_JOB if job.policy else _EVERY_JOB)
         try:
-            return self._pool.submit(run_seeds, job, seeds, journal, True)
+            return self._pool.submit(run_task, job, seeds, journal)
         except BrokenExecutor:
             self.close(in_order=False)
             return self.submit(job, seeds, journal)
 
     def close(self, in_order: bool) -> None:
-        """End all processes."""
+        """End all processes; those still at work are killed unless all is `in_order`."""
         if self._pool is not None:
             self._pool.shutdown() if in_order else kill_pool(self._pool)
             self._pool = None
 
 
-def split(job: Job, seeds: Sequence[int], workers: int) -> deque[Seeds]:
+def run_seeds(job: RolloutJob, seeds: Sequence[int], journal: Journal | None) -> Iterator[Episode]:
+    """Yield the episodes of some seeds as they end, each once it is in the journal."""
+    for episode in job.run(seeds):
+        if journal is not None:
+            journal.write(episode)
+        yield episode
+
+
+def run_task(job: RolloutJob, seeds: Seeds, journal: Journal | None) -> list[Episode]:
+    """Return the episodes of some seeds, without pictures: what a worker of this machine does."""
+    try:
+        return [episode.without_pictures() for episode in run_seeds(job, seeds, journal)]
+    except ManipError:
+        raise
+    except Exception as error:  # which need not pickle
+        raise ManipError(f"{type(error).__name__}: {error}") from None
+
+
+def split(job: RolloutJob, seeds: Sequence[int], workers: int) -> deque[Seeds]:
     """Return one seed a task; where a learner drives, a lockstep batch, smaller if that would leave a worker idle."""
-    size = 1 if not job.learned else max(1, min(job.batch, -(-len(seeds) // workers)))
+    size = 1 if job.policy is None else max(1, min(job.batch, -(-len(seeds) // workers)))
     return deque(tuple(seeds[i : i + size]) for i in range(0, len(seeds), size))
-
-
-def _stored(episodes: Iterable[Episode], journal: Journal) -> Iterator[Episode]:
-    """Yield episodes once they are stored; the disk takes each while the next one runs."""
-    with ThreadPoolExecutor(1, "store") as disk:
-        before: tuple[Episode, Future[None]] | None = None
-        for episode in episodes:
-            storing = episode, disk.submit(journal.store, episode.seed, journal.encode(episode))
-            if before is not None:
-                yield _settled(*before)
-            before = storing
-        if before is not None:
-            yield _settled(*before)
-
-
-def _settled(episode: Episode, stored: Future[None]) -> Episode:
-    stored.result()
-    return episode
-
-
-def _open_workers(backend: Backend, workers: int | None) -> Workers:
-    if backend == "local":
-        return LocalProcesses(workers or default_workers())
-    from manip_il.collect.ray_pool import RayCluster  # here, as Ray is an extra
-
-    return RayCluster(workers)
 
 
 def default_workers() -> int:
     """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0))
+
+
+def _run_alone(pool: Pool, job: RolloutJob, seed: int, journal: Journal | None) -> list[Episode] | None:
+    """The episodes of a seed that runs with no other in its worker; None if every one of its workers died."""
+    for _ in range(MAX_DEATHS):
+        try:
+            return pool.submit(job, (seed,), journal).result()
+        except BrokenExecutor:
+            continue
+    return None

@@ -17,7 +17,7 @@ import numpy as np
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.environments import env_fingerprint
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import One
+from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import ManipError, UsageError
@@ -128,7 +128,7 @@ class _Run:
     def taken_over(self, policy: Path, trust: bool) -> Row:
         """States that a learner visits: at a drawn step of a horizon the expert takes over."""
         driver = PolicyDriver((policy,), trust=trust)
-        job = RolloutJob(self._env, driver, hold=0, label="takeover", query=One())
+        job = RolloutJob(self._env, driver, hold=0, label="takeover", query=Query("one"))
         cases: list[Case] = []
         for episode in self._episodes(job, self._seeds):
             taken = np.flatnonzero(episode.columns[schema.ACTOR].ravel() == Actor.EXPERT)

@@ -17,14 +17,13 @@ from PIL import Image
 
 # First: it chooses the OpenGL that mujoco takes on import.
 import manip_il.sim  # noqa: F401  # pyright: ignore[reportUnusedImport]
+from manip_il.collect.edits import render_states
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.render import render_states
 from manip_il.data import schema
 from manip_il.data.schema import RobotTaskSpec
 from manip_il.errors import ManipError
 from manip_il.evaluation.report_data import Film, Paths
 from manip_il.mdp import Episode
-from manip_il.sim.conditions import NOMINAL_VALUES, Drawn
 from manip_il.sim.config import FILM, CameraConfig
 from manip_il.sim.env import EnvConfig
 
@@ -43,14 +42,13 @@ def film(
     camera: str = "front",
     size: tuple[int, int] = (240, 320),
     every: int = 1,
-    drawn: Drawn = NOMINAL_VALUES,
 ) -> list[NDArray[np.uint8]]:
     """Return one picture each `every` control steps, uint8 (height, width, 3), until shortly after success.
 
-    drawn: what the episode draws. Raises `RenderError` without off-screen OpenGL, `UnknownName` for the camera.
+    Raises `RenderError` without off-screen OpenGL, `UnknownName` for the camera.
     """
     states = episode.columns[schema.SIM_STATE][: filmed_steps(episode, env_config.control_hz) : every]
-    pictures = render_states(env_config, CameraConfig((camera,), *size, FILM), states, drawn)
+    pictures = render_states(env_config, CameraConfig((camera,), *size, FILM), states)
     return list(pictures[schema.IMAGES + camera])
 
 

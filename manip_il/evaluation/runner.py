@@ -8,14 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from manip_il.collect.environments import env_fingerprint, env_spec, policy_sha256, positions
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.job import RolloutJob, observed_cameras
 from manip_il.collect.workers import Engine
 from manip_il.data import schema
 from manip_il.errors import UsageError
 from manip_il.evaluation.episodes import EpisodeResult, EvalSettings
 from manip_il.evaluation.intervals import Proportion
+from manip_il.evaluation.positions import positions
 from manip_il.evaluation.results import EvalResult
+from manip_il.learn.policy_files import policy_sha256
 from manip_il.mdp import Episode
 from manip_il.sim.conditions import NOMINAL, draw
 

@@ -15,8 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from manip_il.collect.render import render_states
-from manip_il.collect.source import Source, open_source
+from manip_il.collect.edits import Source, open_source, render_states
 from manip_il.data import schema
 from manip_il.errors import ManipError
 from manip_il.evaluation.film import encode_mp4

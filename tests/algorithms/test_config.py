@@ -6,12 +6,12 @@ import pytest
 
 from manip_il.algorithms.config import BetaSchedule, RunConfig, check_cameras, check_labels, plan_of
 from manip_il.algorithms.table import check_method
-from manip_il.collect.query import Ensemble, Every, Likelihood, One
+from manip_il.collect.query import Query
 from manip_il.errors import UsageError
 from manip_il.learn.fit_config import FitConfig
 from manip_il.sim.config import CameraConfig
 
-LIKELIHOOD = Likelihood(-2)
+LIKELIHOOD = Query("likelihood", -2)
 FRONT = CameraConfig(("front",))
 CNN = FitConfig({"type": "cnn"})
 ACT = FitConfig({"type": "act", "chunk_size": 8, "n_action_steps": 4})
@@ -22,10 +22,10 @@ DIFFUSION = FitConfig({"type": "diffusion", "horizon": 16, "n_action_steps": 8})
     ("options", "says"),
     [
         ({"label_budget": 0}, "label_budget is 0; expected at least 1"),
-        ({"query_rule": Ensemble(0.1)}, "there is one policy; give ensemble=2"),
+        ({"query_rule": Query("ensemble", 0.1)}, "there is one policy; give ensemble=2"),
         ({"ensemble": 3}, "no query uses it"),
         ({"label": "takeover", "beta": BetaSchedule("linear", 3)}, "learner rolls in alone"),
-        ({"label": "takeover", "query_rule": Every()}, "from the first step on"),
+        ({"label": "takeover", "query_rule": Query("every")}, "from the first step on"),
         ({"rounds": -1}, "rounds is -1"),
         ({"rounds": 100}, "rounds is 100; expected fewer than 100"),
         ({"episodes_per_round": 0}, "episodes_per_round is 0"),
@@ -42,7 +42,7 @@ def test_options_that_contradict_each_other_are_refused(options, says: str):
 @pytest.mark.parametrize(
     ("check", "options", "says"),
     [
-        (check_labels, {"fit": ACT, "query_rule": One()}, "act learns from 8 in a row; use label=branch"),
+        (check_labels, {"fit": ACT, "query_rule": Query("one")}, "act learns from 8 in a row; use label=branch"),
         (
             check_labels,
             {"fit": DIFFUSION, "label": "branch", "branch_steps": 4},
@@ -53,7 +53,7 @@ def test_options_that_contradict_each_other_are_refused(options, says: str):
         (check_labels, {"fit": ACT, "label": "branch", "query_rule": LIKELIHOOD}, "--policy.type=mlp"),
         (check_method, {"method": "daggr"}, "unknown method 'daggr' .did you mean 'dagger'"),
         (check_method, {"method": "cloning", "label": "branch"}, "the expert drive throughout"),
-        (check_method, {"method": "dart", "query_rule": One()}, "the expert drive throughout"),
+        (check_method, {"method": "dart", "query_rule": Query("one")}, "the expert drive throughout"),
         (check_method, {"method": "dart", "fit": CNN, "cameras": FRONT}, "not for a policy on images"),
         (check_cameras, {"fit": CNN}, "give --cameras=front,side,wrist"),
         (check_cameras, {"cameras": FRONT}, "the policy takes none"),

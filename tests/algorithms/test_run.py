@@ -16,7 +16,7 @@ from manip_il.algorithms.config import BetaSchedule, RunConfig
 from manip_il.algorithms.rounds import RoundResult, best_round
 from manip_il.algorithms.run import Watch, round_folder
 from manip_il.algorithms.table import run_algorithm
-from manip_il.collect.query import Ensemble, Safety
+from manip_il.collect.query import Query
 from manip_il.collect.workers import Engine
 from manip_il.data.dataset import Dataset, joined_columns
 from manip_il.errors import MismatchError
@@ -244,7 +244,7 @@ def test_what_dagger_is_compared_with_learns_from_expert_states(method, tmp_path
 
 
 def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(tmp_path, caplog):
-    config = replace(CONFIG, beta=ALONE, query_rule=Safety(1000), rounds=2)
+    config = replace(CONFIG, beta=ALONE, query_rule=Query("safety", 1000), rounds=2)
     results = list(run_algorithm(config, tmp_path, Engine()))
     assert len({result.labels for result in results}) == 1
     assert not (round_folder(tmp_path, 1) / "dataset").exists()
@@ -254,7 +254,7 @@ def test_a_round_in_which_nobody_queries_leaves_no_dataset_and_the_run_goes_on(t
 
 
 def test_every_policy_of_an_ensemble_is_fitted_from_a_seed_of_its_own(tmp_path):
-    config = replace(CONFIG, beta=ALONE, query_rule=Ensemble(0.05), ensemble=2)
+    config = replace(CONFIG, beta=ALONE, query_rule=Query("ensemble", 0.05), ensemble=2)
     results = list(run_algorithm(config, tmp_path, Engine()))
     first, second = (round_folder(tmp_path, 0) / name for name in ("policy", "policy_1"))
     assert files(first).keys() == files(second).keys()

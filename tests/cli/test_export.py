@@ -13,9 +13,10 @@ import pytest
 
 import manip_il.cli.export as command
 from manip_il.cli.main import main
-from manip_il.collect.environments import env_spec, policy_sha256
+from manip_il.collect.environments import env_spec
 from manip_il.learn.checkpoint import CheckpointMeta
 from manip_il.learn.policy import LearnedPolicy
+from manip_il.learn.policy_files import policy_sha256
 from manip_il.sim.env import EnvConfig
 
 from ..learn.tiny_policies import write_checkpoint

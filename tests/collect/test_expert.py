@@ -18,7 +18,6 @@ from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig, ManipEnv
 from manip_il.sim.scene import SCENES_KEPT, build_scene
-from manip_il.sim.variation import with_drawn
 from manip_il.sim.world import GOAL, Scene, World
 from manip_il.tasks.pick_place import OBJECT
 from manip_il.tasks.starts import UPRIGHT
@@ -69,19 +68,6 @@ def with_object(scene: Scene, state: State, move: np.ndarray) -> State:
     return replace(state, physics=world.physics())
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
-@every_scene
-def test_labels_do_not_depend_on_what_was_asked_before(robot: str, task: str, driver: str):
-    states = visited_states(robot, task, driver)
-    expert = expert_of(robot, task)
-    forward = [written(expert.label(state)) for state in states]
-    order = np.random.default_rng(0).permutation(len(states))
-    shuffled = {int(i): written(expert.label(states[i])) for i in order}
-    assert [shuffled[i] for i in range(len(states))] == forward
-    for i in (3, len(states) // 2):
-        assert written(Expert(build_scene(robot, task)).label(states[i])) == forward[i]
-
-
 KNOCKED = Condition("knocked", knock=(0.05, 0.08), knock_step=(5, 9), joint_noise=(0.01, 0.02))
 
 
@@ -98,17 +84,6 @@ def test_a_label_read_off_a_running_world_is_that_of_its_state(robot: str, task:
         assert written(step.label) == written(expert.label(step.state))
 
 
-@every_scene
-def test_asking_changes_neither_state_nor_answer_and_clock_and_count_do_not_matter(robot: str, task: str):
-    expert, states = expert_of(robot, task), visited_states(robot, task, "expert")
-    before, first = states[5].to_vector().tobytes(), expert.label(states[5])
-    answer = written(first)
-    assert written(expert.label(replace(states[5], step=77, streak=3, ever=True))) == answer
-    expert.label(states[9])
-    assert states[5].to_vector().tobytes() == before
-    assert written(first) == answer
-
-
 IN_ANOTHER_PROCESS = """
 import sys
 import numpy as np
@@ -117,14 +92,14 @@ from manip_il.mdp import State
 from manip_il.sim.scene import build_scene
 for pair in sys.argv[2:]:
     expert = Expert(build_scene(*pair.split()))
-    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{pair} states.npy")]
+    labels = [expert.label(State.from_vector(row)) for row in np.load(f"{sys.argv[1]}/{pair} states.npy")][::-1]
     answers = [[*label.action, label.residual, label.phase, label.valid] for label in labels]
     np.save(f"{sys.argv[1]}/{pair} labels.npy", answers)
 """
 
 
 @pytest.mark.slow
-def test_another_process_answers_the_same_bits(tmp_path):
+def test_another_process_answers_the_same_bits_in_another_order(tmp_path):
     here: dict[str, np.ndarray] = {}
     for robot, task in SCENES:
         expert = expert_of(robot, task)
@@ -133,7 +108,7 @@ def test_another_process_answers_the_same_bits(tmp_path):
         here[f"{robot} {task}"] = np.array(
             [[*label.action, label.residual, label.phase, label.valid] for label in labels]
         )
-        np.save(tmp_path / f"{robot} {task} states.npy", [state.to_vector() for state in states])
+        np.save(tmp_path / f"{robot} {task} states.npy", [state.to_vector() for state in states[::-1]])
     subprocess.run([sys.executable, "-c", IN_ANOTHER_PROCESS, tmp_path, *here], check=True)
     for pair, labels in here.items():
         assert np.load(tmp_path / f"{pair} labels.npy").tobytes() == labels.tobytes()
@@ -153,18 +128,6 @@ def test_a_label_is_a_step_that_the_arm_can_make(robot: str, task: str, driver: 
         assert (label.action <= actions.high).all()
         assert label.residual >= 0
         assert label.valid == (label.phase != 0) == (label.reason == "")
-
-
-@every_scene
-def test_an_arm_outside_its_limits_is_led_back(robot: str, task: str):
-    expert, scene = expert_of(robot, task), build_scene(robot, task)
-    state = visited_states(robot, task, "expert")[0]
-    high, _ = scene.actions.split(scene.actions.high)
-    limited = int(np.flatnonzero(np.isfinite(high))[0])
-    world = world_in(scene, state)
-    world.data.qpos[scene.arm_q[limited]] = high[limited] + 0.02
-    action = expert.label(replace(state, physics=world.physics())).action
-    assert action[scene.actions.arm][limited] <= scene.actions.high[scene.actions.arm][limited]
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e-5, 1e-4])
@@ -197,17 +160,6 @@ def test_where_there_is_no_sound_label_the_arm_holds_still(robot: str, task: str
     np.testing.assert_array_equal(label.action, held)
 
 
-@every_scene
-def test_without_a_solution_the_arm_holds_still_and_says_so(robot: str, task: str, monkeypatch):
-    scene = build_scene(robot, task)
-    expert, state = Expert(scene), visited_states(robot, task, "expert")[3]
-    monkeypatch.setattr(expert._ik, "step", lambda *_: None)
-    label = expert.label(state)
-    assert (label.valid, label.reason) == (False, "inverse kinematics has no solution")
-    held = scene.actions.join(joints(scene, state), world_in(scene, state).opening)
-    np.testing.assert_array_equal(label.action, held)
-
-
 @every_robot
 def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label(robot: str):
     env = started(robot, "reach")
@@ -219,27 +171,6 @@ def test_a_goal_that_the_arm_cannot_get_nearer_to_is_no_label(robot: str):
         reasons.add(label.reason)
         env.advance(label.action)
     assert reasons == {"", "no joint step brings the hand nearer"}
-
-
-@every_scene_with_a_cube
-def test_a_label_is_for_the_cube_that_the_state_says(robot: str, task: str):
-    scene = build_scene(robot, task)
-    expert, answers = expert_of(robot, task), dict[float, list[bytes]]()
-    states = visited_states(robot, task, "expert")[4:8]
-    for edge in (0.05, 0.07, 0.03, 0.05, 0.07):
-        varied = [replace(state, variation=with_drawn(scene.nominal, {"size": edge})) for state in states]
-        answers.setdefault(edge, []).append(b"".join(written(expert.label(state)) for state in varied))
-    assert all(len(set(same)) == 1 for same in answers.values())
-    assert len({same[0] for same in answers.values()}) == 3
-
-
-@every_scene_with_a_cube
-def test_a_heavier_cube_is_grasped_alike(robot: str, task: str):
-    # A label is geometry: what the cube weighs is felt on the next step, not foreseen.
-    scene, expert = build_scene(robot, task), expert_of(robot, task)
-    for state in visited_states(robot, task, "expert"):
-        heavy = replace(state, variation=with_drawn(scene.nominal, {"mass": 0.3}))
-        assert written(expert.label(heavy)) == written(expert.label(state))
 
 
 @pytest.mark.parametrize("offset", np.linspace(-0.3, 0.3, 7).tolist())

@@ -14,14 +14,12 @@ from manip_il.collect.drivers import ExpertDriver, NoisyExpertDriver, PolicyDriv
 from manip_il.collect.environments import env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
-from manip_il.collect.query import Ensemble, Likelihood, One, Probability, Safety
-from manip_il.collect.workers import Engine, default_workers
+from manip_il.collect.query import Query
 from manip_il.data.episodes import parts
 from manip_il.data.schema import fitted_columns
 from manip_il.errors import UsageError
 from manip_il.mdp import Actor, Episode, State
 from manip_il.seeding import stream_seeds
-from manip_il.sim.conditions import Condition
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import STANDARD
 from manip_il.sim.scene import build_scene
@@ -32,14 +30,14 @@ SEEDS = stream_seeds("round/1", 4)
 ENV = EnvConfig(horizon=30)
 EXPERT = RolloutJob(EnvConfig("fetch"), hold=3)
 NOISE = tuple(map(tuple, np.diag([1e-4] * 7 + [1e-6]).tolist()))
-ONE, SELDOM, SAFETY = One(), Probability(0.2), Safety(0.5)
+ONE, SELDOM, SAFETY = Query("one"), Query("probability", 0.2), Query("safety", 0.5)
 JOBS = {
     "expert": {"driver": ExpertDriver(), "conditions": (STANDARD,), "round": 4},
     "noisy expert": {"driver": NoisyExpertDriver(NOISE)},
     "random": {"driver": RandomDriver()},
     "mixture": {"beta": 0.5},
     "policy of chunks": {"conditions": suite_conditions("all", "pick_place", sees=False), "batch": 3},
-    "probability": {"query": Probability(0.3)},
+    "probability": {"query": Query("probability", 0.3)},
     "takeover": {"label": "takeover", "query": ONE},
     "branch": {"label": "branch", "query": ONE, "branch_steps": 4},
     "branches": {"label": "branch", "query": SELDOM, "branch_steps": 3},
@@ -93,40 +91,6 @@ def test_labels_are_the_experts_and_an_episode_depends_on_its_seed_alone(job: Ro
     assert written(replace(job, batch=1).run(SEEDS[::-1])) == bits
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("beta", [0.0, 0.5])
-def test_two_processes_give_the_same_bits(beta, job, two_processes):
-    job = replace(job, driver=replace(job.driver, beta=beta))
-    assert written(two_processes.run(job, SEEDS)) == written(job.run(SEEDS))
-
-
-def test_hold_ends_an_episode_so_many_steps_after_success():
-    for episode in run(EXPERT).values():
-        assert len(episode) == int(np.argmax(episode.columns["next.success"])) + 1 + 3
-        assert episode.success
-        assert episode.columns["next.done"].ravel().tolist() == [False] * (len(episode) - 1) + [True]
-    whole = replace(EXPERT, hold=None, env=EnvConfig("fetch", horizon=37))
-    assert [len(episode) for episode in whole.run(SEEDS[:2])] == [37, 37]
-
-
-def test_a_disturbed_episode_is_another_one():
-    disturbed, plain = (written(one.run(SEEDS[:2])) for one in (replace(EXPERT, conditions=(STANDARD,)), EXPERT))
-    assert all(disturbed[seed]["executed_action"] != plain[seed]["executed_action"] for seed in SEEDS[:2])
-
-
-@pytest.mark.parametrize(
-    ("condition", "actor", "off"),
-    [
-        (Condition("noisy", action_noise=(0.1, 0.1)), Actor.NOISY_EXPERT, True),
-        (Condition("knocked", knock=(0.05, 0.08)), Actor.EXPERT, False),
-    ],
-)
-def test_under_action_noise_the_actor_is_the_noisy_expert(condition, actor: Actor, off: bool):
-    for episode in replace(EXPERT, conditions=(condition,)).run(SEEDS[:2]):
-        assert set(episode.columns["actor"].ravel()) == {actor}
-        assert ((episode.columns["executed_action"] != episode.columns["action"]).any(axis=1) == off).all()
-
-
 def test_a_noisy_expert_has_its_noise():
     for episode in run(RolloutJob(EnvConfig("panda"), NoisyExpertDriver(NOISE), hold=3)).values():
         assert (episode.columns["actor"] == Actor.NOISY_EXPERT).all()
@@ -134,16 +98,8 @@ def test_a_noisy_expert_has_its_noise():
         assert off.std(axis=0)[:7] == pytest.approx(0.01, rel=0.4)
 
 
-def test_labels_of_the_last_step_alone_tell_the_phase_at_the_end():
-    job = replace(EXPERT, driver=RandomDriver(), env=EnvConfig("fetch", horizon=8))
-    every = run(job, SEEDS[:2])
-    for episode in replace(job, label="last").run(SEEDS[:2]):
-        assert "action" not in episode.columns
-        assert episode.columns["expert_phase"][-1] == every[episode.seed].columns["expert_phase"][-1]
-
-
 def test_where_the_expert_was_not_queried_the_label_is_not_to_be_learnt_from(job: RolloutJob):
-    for episode in run(replace(job, query=Probability(0.3))).values():
+    for episode in run(replace(job, query=Query("probability", 0.3))).values():
         queried, columns = labelled(episode), episode.columns
         assert 0 < queried.sum() < len(episode)
         assert (columns["expert_phase"].ravel()[~queried] == 0).all()
@@ -180,26 +136,9 @@ def test_a_takeover_is_the_learners_path_and_the_experts_recovery(job: RolloutJo
         assert len(recovery) >= ENV.horizon  # the expert has a horizon of its own
 
 
-def test_an_expert_that_is_never_wanted_takes_nothing_over(job: RolloutJob):
-    free = run(replace(job, label="last"))
-    for episode in run(replace(job, label="takeover", query=Safety(1e6))).values():
-        assert (len(parts(episode)), len(episode)) == (1, ENV.horizon)
-        assert not labelled(episode).any()
-        alone = free[episode.seed].columns["executed_action"]
-        np.testing.assert_array_equal(episode.columns["executed_action"], alone)
-
-
 def test_an_expert_that_takes_over_solves_what_it_took_over(job: RolloutJob):
     episodes = run(replace(job, env=EnvConfig(), label="takeover", query=ONE, hold=3))
     assert all(episode.success for episode in episodes.values())
-
-
-def test_a_takeover_in_a_disturbed_world_is_cut_where_the_expert_took_over(job: RolloutJob):
-    for episode in run(replace(job, label="takeover", query=ONE, conditions=(STANDARD,))).values():
-        rolled_in, recovery = parts(episode)
-        assert (rolled_in.columns["actor"] == Actor.LEARNER).all()
-        assert (recovery.columns["actor"] == Actor.NOISY_EXPERT).all()
-        is_the_experts(recovery)
 
 
 def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJob):
@@ -227,17 +166,10 @@ def test_branches_begin_in_visited_states_and_the_learner_goes_on(job: RolloutJo
             {"driver": ExpertDriver(), "label": "takeover"},
             "takes over from a policy; this .* driven by 'expert'",
         ),
-        ({"query": Ensemble(0.1)}, "needs other policies to disagree with"),
-        ({"query": Likelihood(0.0)}, "needs a policy with a likelihood"),
+        ({"query": Query("ensemble", 0.1)}, "needs other policies to disagree with"),
+        ({"query": Query("likelihood", 0.0)}, "needs a policy with a likelihood"),
     ],
 )
 def test_what_a_job_lacks_is_said_before_it_runs(job: RolloutJob, changes, words: str):
     with pytest.raises(UsageError, match=words):
         next(replace(job, **changes).run(SEEDS))
-
-
-def test_no_seeds_give_no_episodes_and_an_engine_wants_a_worker():
-    assert list(EXPERT.run([])) == list(Engine().run(EXPERT, [])) == []
-    with pytest.raises(UsageError, match="workers is 0"):
-        Engine(0)
-    assert default_workers() >= 1

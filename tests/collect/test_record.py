@@ -11,12 +11,10 @@ import pytest
 
 from manip_il.collect.job import RolloutJob
 from manip_il.collect.record import collect, collect_successes, journal_of, record
-from manip_il.collect.task import Job
 from manip_il.collect.workers import Engine
-from manip_il.data import journal as journals
 from manip_il.data.build import Recording, build
 from manip_il.data.dataset import Dataset
-from manip_il.data.journal import Journal, list_episodes, read_header, read_journal
+from manip_il.data.journal import Journal, list_episodes, read_header
 from manip_il.errors import ManipError, MismatchError
 from manip_il.mdp import Episode
 from manip_il.sim.config import CameraConfig
@@ -36,7 +34,7 @@ class Recorded(Engine):
         self.asked: list[int] = []
         self._failing = set(failing)
 
-    def run(self, job: Job, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
         self.asked += seeds
         for episode in job.run(seeds):
             if episode.seed in self._failing:
@@ -53,17 +51,6 @@ def names(folder: Path) -> list[int]:
 
 def contents(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in list_episodes(folder)]
-
-
-def test_every_seed_becomes_a_file_that_holds_its_episode(tmp_path):
-    seen: list[Episode] = []
-    given = [header.seed for header, _ in collect(Recorded(), JOB, SEEDS[:3], tmp_path, seen.append)]
-    assert given == names(tmp_path) == list(SEEDS[:3])
-    by_seed = {episode.seed: episode for episode in seen}
-    for path in list_episodes(tmp_path):
-        episode = read_journal(path)[1]
-        for key, column in by_seed[episode.seed].columns.items():
-            assert episode.columns[key].tobytes() == column.tobytes()
 
 
 def test_what_is_there_is_not_run_again(tmp_path):
@@ -89,16 +76,6 @@ def test_a_failed_demonstration_is_replaced_by_the_next_seeds(tmp_path):
     assert [header.seed for header, _ in found] == list(SEEDS[:7])
 
 
-def test_which_demonstrations_come_out_does_not_depend_on_what_was_there(tmp_path):
-    failing = [SEEDS[1]]
-    first = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "a"))
-    list(collect(Recorded(failing), JOB, SEEDS[2:8], tmp_path / "b"))
-    second = list(collect_successes(Recorded(failing), JOB, SEEDS, 3, tmp_path / "b"))
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")[: len(first)]
-    assert [one for one, _ in first] == [one for one, _ in second]
-    assert [one.success for one, _ in first] == [True, False, True, True]
-
-
 def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
     with pytest.raises(ManipError, match="only 0 of 9 demonstrations succeeded; 3 are needed"):
         list(collect_successes(Recorded(SEEDS), JOB, SEEDS[:9], 3, tmp_path))
@@ -107,7 +84,7 @@ def test_an_expert_that_mostly_fails_is_given_up(tmp_path):
 class Shuffled(Recorded):
     """Episodes end in another order than their seeds'; the seed that kills its worker never ends."""
 
-    def run(self, job: Job, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
+    def run(self, job: RolloutJob, seeds: Sequence[int], journal: Journal | None = None) -> Iterator[Episode]:
         yield from super().run(job, [seed for seed in reversed(seeds) if seed != SEEDS[2]], journal)
 
 
@@ -144,18 +121,6 @@ def test_a_damaged_journal_is_set_aside_and_its_seed_runs_again(tmp_path, caplog
     [record] = caplog.records
     assert f"{damaged} is not a complete episode" in record.getMessage()
     assert damaged.with_name(damaged.name + ".damaged").read_bytes() == whole[1][:5000]
-
-
-def test_new_episodes_run_before_all_that_are_there_have_been_read(tmp_path, monkeypatch):
-    before = [header.seed for header, _ in collect(Recorded(), JOB, SEEDS[:3], tmp_path)]
-    steps: list[str] = []
-    monkeypatch.setattr(journals, "read_journal", lambda path: steps.append(path.name) or read_journal(path))
-    assert journal_of(tmp_path, JOB).prepare() == []
-    episodes = collect(Recorded(), JOB, SEEDS[:4], tmp_path, lambda _: steps.append("new"))
-    assert next(episodes)[0].seed == before[0]
-    assert steps == ["new", list_episodes(tmp_path)[0].name]
-    assert [header.seed for header, _ in episodes][:2] == before[1:]
-    assert len(steps) == 4
 
 
 def test_a_dataset_recorded_as_it_goes_is_the_one_built_later(tmp_path):

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import LABEL_VALID
 from manip_il.seeding import stream_seeds
 from manip_il.sim.conditions import NOMINAL, Condition
 from manip_il.sim.env import EnvConfig
 from manip_il.sim.events import KINDS, Perturbation, kinds_for
-from manip_il.tasks.starts import UPRIGHT
 from manip_il.tasks.table import TASKS
 
-from ..scenes import SIZES, half_height, sizes_of, started
+from ..scenes import SIZES, sizes_of
 from ..tables import LARGE, SCENES, WITH_A_CUBE
 
 KNOCKED = Condition("knocked", action_noise=(0.05, 0.05), knock=(0.05, 0.08))
@@ -76,22 +73,3 @@ def test_the_expert_recovers_or_says_that_it_cannot(robot: str, task: str, kind:
         assert not episode.columns[LABEL_VALID][at:].any()
     else:
         assert episode.success
-
-
-@pytest.mark.parametrize("x", [0.2, 0.25, 0.86])  # near the base and far from it [m]
-@pytest.mark.parametrize("task", ["pick_place", "clear_table"])
-def test_the_expert_lifts_what_the_hand_does_not_reach_upright(task: str, x: float):
-    env, name = started(task=task), TASKS[task].grasped[0]
-    expert, half = Expert(env.scene), half_height(env.world, name)
-    place = np.array([x, 0.0, half])
-    assert not env.world.reach.nearly(place)
-    env.world.place(name, place, UPRIGHT)
-    env.world.update()
-    highest = 0.0
-    for _ in range(60):
-        env.begin_step()
-        label = expert.label(env.get_state())
-        assert label.valid
-        env.advance(label.action)
-        highest = max(highest, env.world.pose(name).position[2])
-    assert highest > half + 0.03

@@ -1,102 +1,164 @@
-"""Where episodes run does not matter, and a worker that dies costs no episode."""
+"""Where episodes run does not matter, and a worker that dies costs no episode: in processes, and on a Ray cluster."""
 
 from __future__ import annotations
 
+import logging
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from kept import DeadlyKeep, FailingKeep, contents, journal
+import ray
+from kept import DeadlyJournal, contents, written
+from ray.cluster_utils import Cluster
 
+import manip_il
 from manip_il.collect.drivers import PolicyDriver
 from manip_il.collect.job import RolloutJob
+from manip_il.collect.record import journal_of
 from manip_il.collect.workers import Engine, split
 from manip_il.data.journal import list_seeds
-from manip_il.errors import ManipError
+from manip_il.errors import ManipError, UsageError
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig
 
 from ..faults.child import living
 from ..test_child_processes import wait_for
 
-SEEDS = stream_seeds("certificate", 6)
+SEEDS = stream_seeds("certificate", 8)
 JOB = RolloutJob(EnvConfig("fetch", "reach"), hold=3)
+both_backends = pytest.mark.parametrize("backend", ["local", "ray"])
 
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> dict[str, bytes]:
     """What this process alone writes."""
     folder = tmp_path_factory.mktemp("here")
-    assert len(list(Engine().run(JOB, SEEDS, journal(folder, JOB)))) == len(SEEDS)
+    assert len(list(Engine().run(JOB, SEEDS, journal_of(folder, JOB)))) == len(SEEDS)
     return contents(folder)
 
 
-@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (60, 2), (200, 3)])
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory) -> Iterator[Cluster]:
+    """Two nodes of one core each on this machine, whose workers find `kept`."""
+    patch = pytest.MonkeyPatch()
+    patch.chdir(tmp_path_factory.mktemp("cwd"))  # workers on this machine would find its packages there
+    patch.setenv("PYTHONPATH", f"{Path(__file__).parent}:{Path(__file__).parents[2]}")
+    quick = {"health_check_initial_delay_ms": 500, "health_check_period_ms": 500}  # a dead node is missed five times
+    two = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": quick})
+    two.add_node(num_cpus=1)
+    two.wait_for_nodes()
+    ray.init(address=two.address, log_to_driver=False, logging_level=logging.ERROR)
+    yield two
+    ray.shutdown()
+    two.shutdown()
+    patch.undo()
+
+
+@pytest.fixture
+def engine(backend: str, request: pytest.FixtureRequest) -> Iterator[Engine]:
+    if backend == "ray":
+        request.getfixturevalue("cluster")
+    with Engine(2, backend) as two:
+        yield two
+
+
+@pytest.mark.parametrize(("seeds", "workers"), [(1, 2), (7, 2), (200, 3)])
 def test_every_seed_is_in_one_task_and_no_worker_idles(seeds: int, workers: int):
-    learner = replace(JOB, driver=PolicyDriver((Path("x"),)))
-    for job in (JOB, learner):
+    for job in (JOB, replace(JOB, driver=PolicyDriver((Path("x"),)))):
         tasks = split(job, range(seeds), workers)
         assert [seed for task in tasks for seed in task] == list(range(seeds))
         assert len(tasks) >= min(seeds, workers)
-    assert max(len(task) for task in tasks) <= 25
+    with pytest.raises(UsageError, match="workers is 0"):
+        Engine(0)
 
 
 @pytest.mark.slow
-def test_an_episode_is_on_disk_before_it_arrives(two_processes, tmp_path, expected):
-    for episode in two_processes.run(JOB, SEEDS, journal(tmp_path, JOB)):
+@both_backends
+def test_an_episode_is_on_disk_before_it_arrives_with_the_bytes_of_one_process(engine: Engine, tmp_path, expected):
+    for episode in engine.run(JOB, SEEDS, journal_of(tmp_path, JOB)):
         assert episode.seed in list_seeds(tmp_path)
     assert contents(tmp_path) == expected
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_is_replaced_and_its_seed_runs_again(two_processes, tmp_path, expected):
-    keep = DeadlyKeep.of(tmp_path, JOB, SEEDS[1], SEEDS[4], times=2)
-    episodes = list(two_processes.run(JOB, SEEDS, keep))
-    assert sorted(episode.seed for episode in episodes) == list(SEEDS)
-    assert contents(tmp_path / "journals") == expected
-    assert keep.deaths() == 4
-    assert two_processes.given_up == []
+@both_backends
+def test_a_policy_acts_the_same_everywhere(engine: Engine, checkpoint):
+    job = RolloutJob(EnvConfig(horizon=10), PolicyDriver((checkpoint,), 0.5))
+    assert written(engine.run(job, SEEDS[:4])) == written(job.run(SEEDS[:4]))
 
 
 @pytest.mark.slow
-def test_a_seed_that_kills_its_worker_three_times_is_left_out_and_named(tmp_path, expected):
-    keep = DeadlyKeep.of(tmp_path, JOB, SEEDS[2])
-    with Engine(2) as engine:
-        episodes = list(engine.run(JOB, SEEDS, keep))
-        assert engine.given_up == [SEEDS[2]]
-        assert [*engine.run(JOB, [SEEDS[2]], keep)] == []  # known by now
+@both_backends
+def test_a_seed_runs_again_where_its_worker_died_and_after_three_times_is_left_out(engine: Engine, tmp_path, expected):
+    (tmp_path / "twice").mkdir()
+    twice = DeadlyJournal.of(tmp_path / "twice", JOB, SEEDS[1], SEEDS[4], times=2)
+    assert sorted(episode.seed for episode in engine.run(JOB, SEEDS, twice)) == list(SEEDS)
+    assert contents(tmp_path / "twice" / "journals") == expected
+    assert (twice.deaths(), engine.given_up) == (4, [])
+    journal = DeadlyJournal.of(tmp_path, JOB, SEEDS[2])
+    episodes = list(engine.run(JOB, SEEDS, journal))
     assert sorted(episode.seed for episode in episodes) == [seed for seed in SEEDS if seed != SEEDS[2]]
-    assert 3 <= keep.deaths() <= 4  # the first time it may not have been alone
+    assert 3 <= journal.deaths() <= 4  # the first time it may not have been alone
+    assert engine.given_up == [SEEDS[2]]
 
 
 @pytest.mark.slow
 def test_of_a_lockstep_batch_only_the_seed_that_kills_is_left_out(checkpoint, tmp_path):
     job = RolloutJob(EnvConfig(horizon=10), PolicyDriver((checkpoint,)), label="per_state")
-    keep = DeadlyKeep.of(tmp_path, job, SEEDS[0])
     with Engine(2) as engine:
-        done = {episode.seed for episode in engine.run(job, SEEDS, keep)}
+        done = {episode.seed for episode in engine.run(job, SEEDS, DeadlyJournal.of(tmp_path, job, SEEDS[0]))}
         assert engine.given_up == [SEEDS[0]]
     assert done == set(SEEDS[1:]) == set(list_seeds(tmp_path / "journals"))
 
 
 @pytest.mark.slow
 def test_where_every_worker_dies_the_work_ends_with_an_error(tmp_path):
-    seeds = stream_seeds("certificate", 40)
-    keep = DeadlyKeep.of(tmp_path, JOB, *seeds)
     with Engine(2) as engine, pytest.raises(ManipError, match="rollout workers died one after the other"):
-        list(engine.run(JOB, seeds, keep))
+        list(engine.run(JOB, SEEDS, DeadlyJournal.of(tmp_path, JOB, *SEEDS)))
 
 
 @pytest.mark.slow
-def test_what_a_worker_raises_arrives_and_the_engine_goes_on(two_processes, tmp_path):
-    with pytest.raises(ManipError, match="no such folder"):
-        list(two_processes.run(RolloutJob(EnvConfig(), PolicyDriver((Path("no such folder"),))), SEEDS))
-    with pytest.raises(ManipError, match=r"No space left on device.*episode of seed"):
-        list(two_processes.run(JOB, SEEDS, FailingKeep()))
-    assert len(list(two_processes.run(JOB, SEEDS[:2]))) == 2
+@both_backends
+def test_what_a_worker_raises_arrives_as_one_line_and_the_engine_goes_on(engine: Engine, tmp_path):
+    with pytest.raises(ManipError, match="unknown robot 'nobody'"):
+        list(engine.run(replace(JOB, env=replace(JOB.env, robot="nobody")), SEEDS))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ManipError, match="cannot write") as caught:
+        list(engine.run(JOB, SEEDS, journal_of(tmp_path / "file" / "journals", JOB)))
+    assert "\n" not in str(caught.value)
+    assert len(list(engine.run(JOB, SEEDS[:2]))) == 2
+
+
+@pytest.mark.slow
+def test_nodes_come_and_go(cluster, tmp_path, expected):
+    node, counts = cluster.add_node(num_cpus=2), list[int]()
+    cluster.wait_for_nodes()
+    with Engine(None, "ray") as engine:
+        for count, _ in enumerate(engine.run(JOB, SEEDS, journal_of(tmp_path, JOB))):
+            if count == 1:
+                cluster.remove_node(node, allow_graceful=False)
+            counts.append(engine._pool.count)
+        assert engine.given_up == []
+    assert counts[0] == 4
+    assert contents(tmp_path) == expected
+
+
+@pytest.mark.slow
+def test_a_node_with_another_version_is_one_line(cluster, tmp_path, monkeypatch):
+    (tmp_path / "manip_il").mkdir()
+    stub = f'__version__ = "0.0.0"\n__path__ = {manip_il.__path__!r}\n'
+    (tmp_path / "manip_il" / "__init__.py").write_text(stub)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    node = cluster.add_node(num_cpus=4)
+    cluster.wait_for_nodes()
+    with Engine(6, "ray") as engine, pytest.raises(ManipError, match=r"has manip_il 0\.0\.0, not") as caught:
+        list(engine.run(JOB, stream_seeds("certificate", 40)))
+    cluster.remove_node(node)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow

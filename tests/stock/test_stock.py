@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from manip_il.collect.drivers import Driver, ExpertDriver, NoisyExpertDriver, RandomDriver
-from manip_il.collect.environments import env_actions, env_spec, positions
+from manip_il.collect.environments import env_actions, env_spec
 from manip_il.collect.job import RolloutJob
 from manip_il.errors import MismatchError, UsageError
+from manip_il.evaluation.positions import positions
 from manip_il.learn.fit_config import FitConfig
 from manip_il.learn.lerobot_config import LeRobotFit
 from manip_il.mdp import State

@@ -10,7 +10,7 @@ import pytest
 
 from manip_il.cli.main import main
 from manip_il.collect.expert import Expert
-from manip_il.collect.redraw import _Redrawer
+from manip_il.collect.scenes import SceneDrawer, Scenes
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.config import CameraConfig, EnvConfig
@@ -191,9 +191,10 @@ def test_an_object_beside_a_low_thing_is_grasped_where_the_hand_fits():
 def test_scenes_that_are_drawn_anew_keep_the_taste():
     low = started("panda", "carry", reward="low")
     visited, seen = low.get_state(), set()
-    redrawer, rng = _Redrawer(EnvConfig("panda", "carry"), CameraConfig(("front",))), np.random.default_rng(0)
+    scenes = Scenes(CameraConfig(("front",)), frames=12)
+    drawer, rng = SceneDrawer(EnvConfig("panda", "carry"), scenes), np.random.default_rng(0)
     for _ in range(12):
-        state = redrawer._redrawn(visited, rng)
+        state = drawer.redrawn(visited, rng)
         if state is not None:
             low.set_state(state)
             assert reward_in(low.world) == TASTES["low"]

@@ -16,11 +16,12 @@ import pytest
 
 from manip_il.collect import environments
 from manip_il.collect.drivers import driver_of
-from manip_il.collect.environments import env_fingerprint, env_spec, positions
+from manip_il.collect.environments import env_fingerprint, env_spec
 from manip_il.collect.expert import Expert
 from manip_il.collect.job import RolloutJob
 from manip_il.data.schema import EXPERT_PHASE
 from manip_il.errors import UnknownName, UsageError
+from manip_il.evaluation.positions import positions
 from manip_il.mdp import State
 from manip_il.seeding import stream_seeds
 from manip_il.sim.env import EnvConfig, ManipEnv

@@ -1,0 +1,242 @@
+"""Another dataset made of the stored states of one: with other labels, other pictures, or other scenes.
+
+All three work on the source by pieces, in processes of this machine, and write a dataset that appears when it is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.child_processes import map_in_order
+from manip_il.collect.environments import env_actions, env_fingerprint, env_spec, is_known, make_expert
+from manip_il.collect.scenes import CHUNK, SceneDrawer, Scenes
+from manip_il.data import schema
+from manip_il.data.build import dataset_sha256, local_id, rewrite_columns
+from manip_il.data.dataset import UNKNOWN_TASK, Dataset
+from manip_il.data.episodes import to_episode
+from manip_il.data.fingerprint import compare_fingerprints
+from manip_il.data.info import DatasetInfo
+from manip_il.data.lerobot_layout import OURS
+from manip_il.data.lerobot_write import new_dataset
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.errors import ManipError, MismatchError, NothingToLearnError, RenderError
+from manip_il.mdp import Episode, State
+from manip_il.robots.robot import get_robot
+from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.variation import OLDER
+from manip_il.stock.table import ROBOT as STOCK
+from manip_il.tasks.table import TASKS
+
+Columns = dict[str, NDArray[Any]]
+_DECIDE = ("model_sha256", "mujoco")  # entries of a fingerprint that what is made of a state depends on
+NOTICEABLE = 0.01  # of a joint's longest step, or of the gripper's whole opening: a label that differs by less is none
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset whose states can be restored, and the environment that they fit.
+
+    warnings: what may make the restored world differ from the recorded one.
+    """
+
+    dataset: Dataset
+    env: EnvConfig
+    warnings: tuple[str, ...] = ()
+
+
+def open_source(root: Path, robot: str | None = None) -> Source:
+    """Read what is needed to restore a dataset's states; robot: the YAML of its robot, where that does not ship.
+
+    Raises `ManipError` for a folder that is no dataset, or one that lacks what this project's have or does not name
+    a robot and task that are known here, `MismatchError` where its states do not fit them.
+    """
+    dataset = Dataset.open(root)
+    spec = dataset.spec
+    if spec.task == UNKNOWN_TASK:
+        raise ManipError(
+            f"{root} does not name its task: {OURS} is missing; LeRobot's tools drop it: render or relabel first"
+        )
+    if not (spec.task in TASKS if robot else is_known(spec.robot, spec.task)):
+        raise ManipError(
+            f"{root} is for the robot {spec.robot!r} and the task {spec.task!r}, which are not both known here, so its "
+            f"states cannot be restored; a robot of your own is given by --robot.type=PATH/{spec.robot}.yaml"
+        )
+    if robot and (given := get_robot(robot).name) != spec.robot:
+        raise MismatchError("robot", str(root), spec.robot, "--robot.type", given)
+    env = EnvConfig(robot or spec.robot, spec.task, object=spec.object)
+    size = env_spec(env).sim_state_size
+    lacks = size - spec.sim_state_size  # of states from before they held all draws
+    if lacks not in (0, *OLDER):
+        raise MismatchError("size of sim_state", str(root), spec.sim_state_size, "this program", size)
+    here, there = env_fingerprint(env), dataset.fingerprint
+    left, right = ({key: one.get(key, "nothing") for key in _DECIDE} for one in (there, here))
+    warnings = compare_fingerprints(str(root), left, "this machine", right)
+    if lacks:
+        warnings.append(f"{root} was recorded before states held how episodes look: what they drew of that is not seen")
+    return Source(dataset, env, tuple(warnings))
+
+
+@dataclass(frozen=True)
+class Target:
+    """Folder of the new dataset, and how it is made.
+
+    replace: as in `new_folder`. on_piece: called after each episode of the source, or `CHUNK` of scenes.
+    """
+
+    root: Path
+    workers: int = 1
+    replace: bool = False
+    on_piece: Callable[[], None] = lambda: None
+
+
+def relabel_dataset(source: Source, target: Target) -> int:
+    """Write `source` anew with the expert's label of every state; executed actions, pictures and all else stay.
+
+    A state that the expert was not asked in when it was recorded is labelled, too. Returns how many frames have another
+    label: its action by more than `NOTICEABLE`, its phase, or whether it is sound. Raises what reading and
+    `rewrite_columns` raise, `ManipError` where a worker dies.
+    """
+    scale, dataset = env_actions(source.env).scale, source.dataset
+    changed = 0
+
+    def relabelled() -> Iterator[Columns]:
+        nonlocal changed
+        for episode, columns in labels:
+            changed += _changed(episode.columns, columns, scale)
+            target.on_piece()
+            yield columns
+
+    simulated = {key: value for key, value in dataset.fingerprint.items() if key.endswith("_sha256")}
+    fingerprint = {**env_fingerprint(source.env), **simulated}
+    provenance = {**dataset.provenance, "relabelled": _origin(source)}
+    about: dict[str, Any] = {"repo_id": local_id(target.root.name), "fingerprint": fingerprint}
+    episodes = dataset.read_episodes(pictures=False)
+    with closing(map_in_order(partial(label_episode, source.env), episodes, target.workers)) as labels:
+        rewrite_columns(dataset, target.root, relabelled(), provenance, replace=target.replace, **about)
+    return changed
+
+
+def render_dataset(source: Source, cameras: CameraConfig, target: Target) -> DatasetInfo:
+    """Write `source` anew with these cameras' pictures in place of its own; every other column stays as it is.
+
+    Raises `RenderError` where there is no OpenGL, and what reading and `new_dataset` raise.
+    """
+    dataset, here = source.dataset, env_spec(source.env, cameras)
+    spec = replace(dataset.spec, cameras=here.cameras, image_size=here.image_size, keypoints=here.keypoints)
+    look = env_fingerprint(source.env, cameras)["cameras_sha256"]
+    rendered = {"from": dataset.root.name, "cameras": asdict(cameras)}
+    provenance = {**dataset.provenance, "rendered": rendered}
+    fingerprint = {**dataset.fingerprint, "cameras_sha256": look}
+    work = partial(_render_episode, source.env, cameras)
+    episodes = (one.without_pictures() for one in dataset.read_episodes(pictures=False))
+    return _write(target, spec, fingerprint, provenance, work, episodes)
+
+
+def redraw_dataset(source: Source, scenes: Scenes, target: Target) -> DatasetInfo:
+    """Write the dataset of other scenes of a dataset's states, each frame or branch an episode.
+
+    The same seed gives the same scenes, and more frames begin with the same ones. Raises `NothingToLearnError` where no
+    scene has a sound label.
+    """
+    states = source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE]
+    drawn = {"scenes": scenes.anew, "branch_steps": scenes.branch_steps, "cameras": asdict(scenes.cameras)}
+    vary = {"vary": [condition.to_json() for condition in scenes.conditions]} if scenes.conditions else {}
+    seeds = scenes.numbers[::CHUNK]
+    tried = {"seeds": [seeds[0], seeds[-1]], "tried": len(seeds)}
+    provenance = {"redrawn": {**_origin(source), **drawn, **vary}, **tried}
+    spec = replace(env_spec(source.env, scenes.cameras), video=False)  # frames have nothing to do with each other
+    fingerprint = env_fingerprint(source.env, scenes.cameras)
+    work = partial(_draw_scenes, source.env, scenes)
+    return _write(target, spec, fingerprint, provenance, work, scenes.chunks(states))
+
+
+def _write[T](
+    target: Target,
+    spec: RobotTaskSpec,
+    fingerprint: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+    work: Callable[[T], list[Episode]],
+    pieces: Iterable[T],
+) -> DatasetInfo:
+    """Write the episodes that workers make of each piece, in order."""
+    repo_id = local_id(target.root.name)
+    with (
+        new_dataset(target.root, spec, repo_id=repo_id, fingerprint=fingerprint, replace=target.replace) as writer,
+        closing(map_in_order(work, pieces, target.workers)) as made,
+    ):
+        empty = True
+        for _, episodes in made:
+            for episode in episodes:
+                writer.add(episode)
+                empty = False
+            target.on_piece()
+        if empty:
+            raise NothingToLearnError("no scene has a sound label of the expert: there is nothing to learn from")
+        return writer.finish(provenance)
+
+
+def label_episode(env: EnvConfig, episode: Episode) -> Columns:
+    """Return the columns of the expert's labels of an episode's states, (T,) or (T, n), as datasets have them.
+
+    Where there is no sound label the action holds the arm still, and `label_valid` is 0.
+    """
+    expert = _expert(env)
+    labels = [expert.label(State.from_vector(state)) for state in episode.columns[schema.SIM_STATE]]
+    return {
+        schema.ACTION: np.stack([label.action for label in labels]).astype(np.float32),
+        schema.LABEL_VALID: np.array([label.valid for label in labels], np.int64),
+        schema.EXPERT_PHASE: np.array([label.phase for label in labels], np.int64),
+    }
+
+
+def render_states(env: EnvConfig, cameras: CameraConfig, states: NDArray[Any]) -> Columns:
+    """Return columns of states, rows of `sim_state` (T, m): pictures (T, height, width, 3), and keypoints (T, 3 K).
+
+    An environment with these cameras gives the same bytes in these states. Raises `RenderError` without OpenGL.
+    """
+    if env.robot == STOCK:
+        raise RenderError(f"{env.robot} has no cameras here")
+    view, spec, rows = ManipEnv.of(env, cameras), env_spec(env, cameras), len(states)
+    found: Columns = {key: np.empty((rows, *cameras.size, 3), np.uint8) for key in spec.image_keys}
+    found |= {key: np.empty((rows, 3 * len(spec.keypoints)), np.float32) for key in spec.keypoint_keys}
+    for row, state in enumerate(states):
+        view.set_state(State.from_vector(state))
+        seen = view.observe()
+        for name in cameras.names:
+            found[schema.IMAGES + name][row] = seen.images[name]
+            found[schema.KEYPOINTS + name][row] = seen.keypoints[name].ravel()
+    return found
+
+
+def _changed(before: Columns, after: Columns, scale: NDArray[np.float64]) -> int:
+    gaps = (np.abs(before[schema.ACTION] - after[schema.ACTION]) / scale).max(axis=1)
+    same = (before[key].ravel() == after[key].ravel() for key in (schema.LABEL_VALID, schema.EXPERT_PHASE))
+    return int((~np.logical_and(*same) | (gaps > NOTICEABLE)).sum())
+
+
+def _render_episode(env: EnvConfig, cameras: CameraConfig, episode: Episode) -> list[Episode]:
+    pictures = render_states(env, cameras, episode.columns[schema.SIM_STATE])
+    return [replace(episode, columns={**episode.columns, **pictures})]
+
+
+def _draw_scenes(env: EnvConfig, scenes: Scenes, chunk: tuple[int, NDArray[np.float64]]) -> list[Episode]:
+    seed, states = chunk
+    drawer = _drawer(env, scenes)
+    made = (drawer.frames(State.from_vector(row), seed + at, seed) for at, row in enumerate(states))
+    return [to_episode(frames) for frames in made if frames]
+
+
+def _origin(source: Source) -> dict[str, str]:
+    return {"from": source.dataset.root.name, "sha256": dataset_sha256(source.dataset.root)}
+
+
+_expert, _drawer = lru_cache(1)(make_expert), lru_cache(1)(SceneDrawer)

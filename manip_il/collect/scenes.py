@@ -1,0 +1,172 @@
+"""New scenes of visited states: goals and untouched objects drawn anew, looks too, then labelled and pictured.
+
+The expert is a function of the state, so it labels scenes that nobody drove to: as many as there are frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from manip_il.collect.environments import make_expert
+from manip_il.collect.query import branch
+from manip_il.mdp import Actor, Label, State, Transition
+from manip_il.seeding import rng_for, stream_seeds
+from manip_il.sim.conditions import PICTURED, Condition, draw
+from manip_il.sim.config import CameraConfig, EnvConfig
+from manip_il.sim.env import ManipEnv
+from manip_il.sim.variation import completed, with_drawn
+from manip_il.sim.world import World
+from manip_il.tasks.table import get_task
+from manip_il.tasks.task import TakesReward
+
+F64 = NDArray[np.float64]
+CHUNK = 25  # scenes that one worker draws at a time
+GOALS, OBJECTS, NEAR = 0.8, 0.7, 0.5  # shares: of new goals, of moved objects, and of those that come near the hand
+_UNTOUCHED = 0.04  # of an object's centre from the hand [m]
+_AROUND = 0.04  # standard deviation of an object's place near the hand, in x and y [m]
+_DEEP = 1e-3  # what is moved may overlap with something by so much [m]
+_TRIES = 5  # scenes drawn for a state, before it stays as it was visited
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """The scenes that are drawn of a dataset's states, and what is pictured of them.
+
+    anew: draw goals and objects anew, too, and not looks alone. conditions: what the looks of every frame are drawn
+    from. branch_steps: control steps for which the expert drives on from every state, for policies that plan. first:
+    number of the first frame in the stream of draws, so that several datasets of one seed have different scenes.
+    """
+
+    cameras: CameraConfig
+    frames: int
+    seed: int = 0
+    anew: bool = True
+    conditions: tuple[Condition, ...] = ()
+    branch_steps: int = 1
+    first: int = 0
+
+    @property
+    def numbers(self) -> range:
+        """Numbers of the scenes in the stream of draws. Raises `UsageError` for more than a seed has."""
+        return stream_seeds("redraw", self.first + self.frames, self.seed)[self.first :]
+
+    def chunks(self, states: F64) -> Iterator[tuple[int, F64]]:
+        """Yield the first number and the visited states of each `CHUNK` of scenes.
+
+        states: rows of `sim_state` (S, m), which are taken by turns, in an order that the seed draws.
+        """
+        order = rng_for(self.seed, "order of redrawn states").permutation(len(states))
+        for at in range(0, self.frames, CHUNK):
+            rows = np.arange(at, min(at + CHUNK, self.frames)) % len(states)
+            yield self.numbers[at], states[order[rows]]
+
+
+class SceneDrawer:
+    """Draws, labels and pictures scenes of one environment."""
+
+    def __init__(self, config: EnvConfig, scenes: Scenes):
+        self._env = ManipEnv.of(config, scenes.cameras)
+        self._task = get_task(config.task, config.object, config.reward)
+        self._expert = make_expert(config)
+        self._scenes = scenes
+
+    def frames(self, visited: State, number: int, seed: int) -> list[Transition]:
+        """Return what becomes of one visited state: one labelled frame, or those of a branch; none without a label.
+
+        number: of the scene in the stream of draws. seed: the column's.
+        """
+        rng = rng_for(number, "redraw")
+        visited = self._with_look(replace(visited, streak=0, ever=False), number)
+        for _ in range(_TRIES if self._scenes.anew else 0):
+            state = self.redrawn(visited, rng)
+            label = self._expert.label(state) if state is not None else None
+            if state is not None and label is not None and label.valid:
+                break
+        else:
+            state, label = visited, self._expert.label(visited)
+        if not label.valid:
+            return []
+        if self._scenes.branch_steps == 1:
+            return [self._frame(state, label, seed)]
+        return list(branch(self._env, self._expert, state, seed, self._scenes.branch_steps))
+
+    def _with_look(self, state: State, number: int) -> State:
+        """The state with the looks of a frame; as it was where nothing is drawn."""
+        conditions, shape = self._scenes.conditions, self._env.config.object
+        drawn = draw(conditions, number, shape).values if conditions else {}
+        variation = completed(state.variation, self._env.scene.nominal)
+        return replace(state, variation=with_drawn(variation, {key: drawn[key] for key in PICTURED if key in drawn}))
+
+    def _frame(self, state: State, label: Label, seed: int) -> Transition:
+        env, action = self._env, label.action
+        env.set_state(state)
+        return Transition(
+            seed, state.step, state, env.observe(), label, action, Actor.EXPERT, 0.0, False, True, env.progress
+        )
+
+    def redrawn(self, visited: State, rng: np.random.Generator) -> State | None:
+        """Return a scene with other goals and other places of what is untouched; None for one that cannot be."""
+        world = self._env.world
+        world.restore(visited.physics, visited.variation)
+        free = self._untouched(world)
+        poses = self._task.draw(rng, world).poses
+        kept = self._task.taste if isinstance(self._task, TakesReward) else ()
+        new_goals, moved = rng.uniform() < GOALS, list[int]()
+        for name, (at, turn) in poses.items():
+            body = world.scene.model.body(name).id
+            if name in kept:
+                continue
+            if body in self._markers:
+                if new_goals:
+                    world.place(name, at, turn)
+            elif body in free and rng.uniform() < OBJECTS:
+                near = name in world.scene.objects and rng.uniform() < NEAR
+                world.place(name, _near_hand(world, at, rng) if near else at, turn)
+                moved.append(body)
+        world.update()
+        if any(depth > _DEEP for depth in _overlaps(world, moved)):
+            return None
+        return replace(visited, physics=world.physics())
+
+    @cached_property
+    def _markers(self) -> set[int]:
+        """Bodies that show goals: starts place them, and nothing touches them."""
+        model = self._env.scene.model
+        solid = set(model.body_rootid[model.geom_bodyid[model.geom_contype > 0]].tolist())
+        return {body for body in range(model.nbody) if model.body_mocapid[body] >= 0 and body not in solid}
+
+    def _untouched(self, world: World) -> set[int]:
+        """Objects and furniture, as bodies, that touch nothing but what is fixed to the world, and rest."""
+        model, data = world.model, world.data
+        mujoco.mj_collision(model, data)
+        roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]  # (contacts, 2)
+        touched = set(roots[(roots > 0).all(axis=1) & (roots[:, 0] != roots[:, 1])].ravel().tolist())
+        ee = world.ee.position.tolist()
+        free = {
+            one.body
+            for name, one in world.scene.objects.items()
+            if world.at_rest(name) and math.dist(world.pose(name).position.tolist(), ee) > _UNTOUCHED
+        }
+        return (free | {body for body in range(model.nbody) if model.body_mocapid[body] >= 0}) - touched
+
+
+def _near_hand(world: World, at: F64, rng: np.random.Generator) -> F64:
+    """A place about the hand, at the height of another, (3,) [m]."""
+    return np.append(world.ee.position[:2] + rng.normal(0.0, _AROUND, 2), at[2])
+
+
+def _overlaps(world: World, bodies: Sequence[int]) -> Iterator[float]:
+    """Yield how deep these bodies are in others [m]."""
+    model, data = world.model, world.data
+    mujoco.mj_collision(model, data)
+    for contact in data.contact:
+        roots = [int(model.body_rootid[model.geom_bodyid[geom]]) for geom in contact.geom]
+        if roots[0] != roots[1] and not set(bodies).isdisjoint(roots):
+            yield -float(contact.dist)

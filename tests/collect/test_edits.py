@@ -1,0 +1,287 @@
+"""Datasets made of stored states: labels are the expert's, pictures those of recording, scenes sound."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.collect.edits import (
+    Source,
+    Target,
+    label_episode,
+    open_source,
+    redraw_dataset,
+    relabel_dataset,
+    render_dataset,
+    render_states,
+)
+from manip_il.collect.environments import env_fingerprint, env_spec
+from manip_il.collect.expert import Expert
+from manip_il.collect.job import RolloutJob
+from manip_il.collect.scenes import CHUNK, Scenes
+from manip_il.data import schema
+from manip_il.data.dataset import Dataset
+from manip_il.data.lerobot_write import write_dataset
+from manip_il.errors import ManipError, MismatchError
+from manip_il.mdp import Episode, State
+from manip_il.seeding import rng_for, stream_seeds
+from manip_il.sim.conditions import Condition
+from manip_il.sim.config import CameraConfig, Look
+from manip_il.sim.env import EnvConfig, ManipEnv
+from manip_il.sim.scene import build_scene
+from manip_il.sim.variation import drawn_in
+from manip_il.sim.world import World
+from manip_il.stock.table import ROBOT as STOCK
+
+from ..damage import digests
+from ..tables import every_scene, one_arm_per_task
+
+ENV, REACH = EnvConfig("panda", "pick_place"), EnvConfig("fetch", "reach")
+CAMERAS, SMALL = CameraConfig(("front", "wrist"), 64, 96), CameraConfig(("front", "wrist"), 32, 32)
+NOISE = Condition("noise", random_actions=(0.3, 0.3))
+
+
+def recorded(env: EnvConfig, count: int = 2, **settings) -> list[Episode]:
+    job = RolloutJob(env, hold=0, **settings)
+    return sorted(job.run(stream_seeds("demonstrations", count)), key=lambda episode: episode.seed)
+
+
+def write(episodes: list[Episode], root: Path, env: EnvConfig, cameras: CameraConfig | None = None) -> Path:
+    about = {"fingerprint": env_fingerprint(env, cameras), "provenance": {"round": 3}}
+    write_dataset(episodes, root, env_spec(env, cameras), repo_id=f"local/{root.name}", **about)
+    return root
+
+
+def changed(episode: Episode, **columns: np.ndarray) -> Episode:
+    return replace(episode, columns={**episode.columns, **columns})
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory) -> Path:
+    return write(recorded(ENV), tmp_path_factory.mktemp("source") / "demos", ENV)
+
+
+@pytest.fixture(scope="module")
+def visited(tmp_path_factory) -> Source:
+    """What the expert does with a third of its steps random."""
+    episodes = recorded(ENV, conditions=(NOISE,))
+    return open_source(write(episodes, tmp_path_factory.mktemp("visited") / "visited", ENV))
+
+
+@every_scene
+def test_labels_given_afterwards_are_those_given_while_recording(robot: str, task: str):
+    env = EnvConfig(robot, task)
+    for episode in recorded(env, 1, conditions=(NOISE,)):
+        for key, labels in label_episode(env, episode).items():
+            np.testing.assert_array_equal(labels.reshape(episode.columns[key].shape), episode.columns[key])
+
+
+@pytest.mark.parametrize("env", [REACH, EnvConfig(STOCK, "FetchReach-v4")], ids=lambda env: env.robot)
+def test_relabelling_counts_what_changed_and_gives_the_labels_of_today(env: EnvConfig, tmp_path):
+    [first, second] = recorded(env)
+    action, phase = first.columns[schema.ACTION].copy(), first.columns[schema.EXPERT_PHASE].copy()
+    action[0, 0] += 0.05
+    action[1, 0] += 1e-5  # nothing to speak of
+    phase[1] += 1
+    bare = {key: np.zeros_like(second.columns[key]) for key in (schema.ACTION, schema.LABEL_VALID, schema.EXPERT_PHASE)}
+    older = [changed(first, **{schema.ACTION: action, schema.EXPERT_PHASE: phase}), changed(second, **bare)]
+    root, whole = write(older, tmp_path / "older", env), write([first, second], tmp_path / "whole", env)
+    assert relabel_dataset(open_source(root), Target(tmp_path / "new", workers=2)) == 2 + len(second)
+    new, expected = Dataset.open(tmp_path / "new"), Dataset.open(whole)
+    for key, column in expected.columns().items():
+        np.testing.assert_array_equal(new.columns()[key], column)
+    statistics = [json.loads((root / "meta" / "stats.json").read_text()) for root in (new.root, whole)]
+    assert statistics[0] == statistics[1]
+    assert (new.provenance["round"], new.provenance["relabelled"]["from"]) == (3, "older")
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_relabelling_copies_videos(tmp_path):
+    root = write(recorded(REACH, cameras=SMALL), tmp_path / "demos", REACH, SMALL)
+    assert main(["relabel", str(root), "--workers=1", "--quiet"]) == 0
+    before, after = digests(root / "videos"), digests(tmp_path / "demos_relabelled" / "videos")
+    assert before == after != {}
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("robot", ["panda", "fetch"])
+def test_pictures_made_afterwards_are_those_made_while_recording(robot: str):
+    env = EnvConfig(robot)
+    for episode in recorded(env, 1, cameras=CAMERAS):
+        pictures, spec = render_states(env, CAMERAS, episode.columns[schema.SIM_STATE]), env_spec(env, CAMERAS)
+        assert set(pictures) == {*spec.image_keys, *spec.keypoint_keys}
+        for key, frames in pictures.items():
+            np.testing.assert_array_equal(frames, episode.columns[key])
+            assert not np.array_equal(frames[0], frames[-1])
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_a_dataset_gets_other_pictures_and_keeps_everything_else(demos, tmp_path):
+    dim, once = CameraConfig(("wrist",), 32, 48, Look(brightness=0.5)), tmp_path / "pictured"
+    render_dataset(open_source(demos), CAMERAS, Target(once, workers=2))
+    render_dataset(open_source(once), dim, Target(tmp_path / "dim"))
+    before = Dataset.open(demos)
+    for root, cameras in ((once, CAMERAS), (tmp_path / "dim", dim)):
+        after, spec = Dataset.open(root), env_spec(ENV, cameras)
+        assert after.columns().keys() == before.columns().keys() | spec.keypoint_keys.keys()
+        for key, column in before.columns().items():
+            np.testing.assert_array_equal(after.columns()[key], column)
+        assert (after.spec, after.fingerprint) == (spec, env_fingerprint(ENV, cameras))
+        assert (after.provenance["round"], after.provenance["rendered"]["from"]) == (
+            3,
+            "demos" if root == once else "pictured",
+        )
+        for episode in after.read_episodes():
+            exact = render_states(ENV, cameras, episode.columns[schema.SIM_STATE])
+            for key in spec.image_keys:  # but for what the video's compression costs
+                assert np.abs(episode.columns[key].astype(int) - exact[key]).mean() < 4
+
+
+@pytest.mark.gl
+def test_what_was_there_goes_only_once_the_new_dataset_is_whole(demos, tmp_path):
+    target = write(Dataset.open(demos).read_episodes(), tmp_path / "target", ENV)
+    before = digests(target)
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    for edit in (
+        partial(render_dataset, cameras=SMALL),
+        relabel_dataset,
+        partial(redraw_dataset, scenes=Scenes(SMALL, 3)),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            edit(open_source(demos), target=Target(target, replace=True, on_piece=stop))
+        assert digests(target) == before
+        assert [path.name for path in tmp_path.iterdir()] == ["target"]
+
+
+def edit_own_file(root: Path, part: str, **entries: object) -> None:
+    path = root / "meta" / "manip_il.json"
+    ours = json.loads(path.read_text())
+    ours[part] |= entries
+    path.write_text(json.dumps(ours))
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "words"),
+    [
+        (partial(edit_own_file, part="spec", robot="ur5"), ManipError, "the robot 'ur5' .* states cannot be restored"),
+        (partial(edit_own_file, part="spec", task="juggle"), ManipError, "the task 'juggle', which are not both known"),
+        (partial(edit_own_file, part="spec", sim_state_size=7), MismatchError, "size of sim_state differs: .* has 7"),
+        (lambda root: (root / "meta/manip_il.json").unlink(), ManipError, r"meta/manip_il\.json is missing"),
+        (lambda root: (root / "meta/info.json").unlink(), ManipError, "is not a LeRobot dataset"),
+    ],
+)
+def test_states_of_an_unknown_world_are_refused(change: Callable[[Path], object], kind, words: str, demos, tmp_path):
+    root = write(Dataset.open(demos).read_episodes(), tmp_path / "demos", ENV)
+    assert open_source(root).warnings == ()
+    edit_own_file(root, "fingerprint", model_sha256="0" * 64, torch="1.0")
+    (warning,) = open_source(root).warnings
+    assert "compiled MuJoCo model differs" in warning
+    change(root)
+    with pytest.raises(kind, match=words):
+        open_source(root)
+
+
+def redrawn(source: Source, root: Path, frames: int, workers: int = 1, **settings) -> list[Episode]:
+    redraw_dataset(source, Scenes(SMALL, frames, **settings), Target(root, workers))
+    return list(Dataset.open(root).read_episodes())
+
+
+def originals(source: Source, seed: int = 0) -> list[State]:
+    states = source.dataset.columns([schema.SIM_STATE])[schema.SIM_STATE]
+    order = rng_for(seed, "order of redrawn states").permutation(len(states))
+    return [State.from_vector(row) for row in states[order]]
+
+
+def world_in(world: World, state: State) -> World:
+    world.restore(state.physics, state.variation)
+    return world
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize(("robot", "task"), one_arm_per_task())
+def test_redrawn_scenes_are_other_scenes_around_the_same_hand_with_the_experts_label(robot: str, task: str, tmp_path):
+    env, scene = EnvConfig(robot, task), build_scene(robot, task)
+    source = open_source(write(recorded(env, 1, conditions=(NOISE,)), tmp_path / "visited", env))
+    frames, expert, world = 2 * CHUNK, Expert(scene), World(scene)
+    episodes = redrawn(source, tmp_path / "new", frames)
+    hands = {tuple(world_in(world, state).data.qpos[scene.arm_q]): state for state in originals(source)}
+    anew = 0
+    for episode in episodes:
+        state = State.from_vector(episode.columns[schema.SIM_STATE][0])
+        label = expert.label(state)
+        assert len(episode) == 1
+        assert label.valid
+        np.testing.assert_array_equal(label.action.astype(np.float32), episode.columns[schema.ACTION][0])
+        arm = tuple(world_in(world, state).data.qpos[scene.arm_q])
+        anew += not np.array_equal(state.physics, hands[arm].physics)
+    assert len(episodes) > 0.8 * frames
+    assert anew >= len(episodes) / 5  # a hand at the furniture leaves it alone
+
+
+@pytest.mark.gl
+def test_a_held_object_stays_in_the_hand_and_moved_ones_overlap_with_nothing(visited, tmp_path):
+    scene = build_scene("panda", "pick_place")
+    world, moved, new_goals = World(scene), 0, 0
+    before = {tuple(world_in(world, state).data.qpos[scene.arm_q]): state for state in originals(visited)}
+    for episode in redrawn(visited, tmp_path / "new", 4 * CHUNK):
+        state = State.from_vector(episode.columns[schema.SIM_STATE][0])
+        world_in(world, before[tuple(world_in(world, state).data.qpos[scene.arm_q])])
+        was, goal, held = world.pose("object").position.copy(), world.goal.copy(), world.touched("object")
+        mujoco.mj_collision(world.model, world_in(world, state).data)
+        shift = math.dist(was, world.pose("object").position)
+        assert not (held and shift)
+        moved += shift > 0
+        new_goals += not np.array_equal(goal, world.goal)
+        if shift:
+            assert all(
+                contact.dist > -2e-3 for contact in world.data.contact if scene.objects["object"].geom in contact.geom
+            )
+    assert moved >= 10
+    assert new_goals >= 60
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_redrawing_depends_on_the_seed_alone_and_more_frames_begin_with_the_same(visited, tmp_path):
+    once = redrawn(visited, tmp_path / "1" / "new", CHUNK + 3)
+    redrawn(visited, tmp_path / "2" / "new", CHUNK + 3, workers=2)
+    assert digests(tmp_path / "1" / "new") == digests(tmp_path / "2" / "new")
+    more, other = redrawn(visited, tmp_path / "more", 2 * CHUNK), redrawn(visited, tmp_path / "other", 5, seed=1)
+    for one, same in zip(once, more, strict=False):
+        for key in (schema.ACTION, schema.SIM_STATE, schema.IMAGES + "wrist"):
+            np.testing.assert_array_equal(one.columns[key], same.columns[key])
+    assert not np.array_equal(once[0].columns[schema.SIM_STATE], other[0].columns[schema.SIM_STATE])
+
+
+@pytest.mark.gl
+def test_a_branch_is_the_experts_next_steps_and_looks_are_those_of_the_state(visited, tmp_path):
+    looks = (Condition("looks", colour=(0, 1), clutter=(2, 4)),)
+    single = redrawn(visited, tmp_path / "1", 4, conditions=looks)
+    branches = redrawn(visited, tmp_path / "3", 4, branch_steps=3, conditions=looks)
+    env, colours = ManipEnv.of(ENV, SMALL), set()
+    for one, three in zip(single, branches, strict=True):
+        assert (len(one), len(three)) == (1, 3)
+        np.testing.assert_array_equal(one.columns[schema.ACTION][0], three.columns[schema.ACTION][0])
+        np.testing.assert_array_equal(three.columns[schema.ACTION], three.columns[schema.EXECUTED_ACTION])
+        env.set_state(State.from_vector(one.columns[schema.SIM_STATE][0]))
+        for camera, picture in env.observe().images.items():
+            np.testing.assert_array_equal(picture, one.columns[schema.IMAGES + camera][0])
+        colours.add(tuple(drawn_in(env.world.variation, env.scene.nominal)["colour"]))
+    assert len(colours) == 4
+    kept = redrawn(visited, tmp_path / "kept", 5, anew=False)
+    for episode, original in zip(kept, originals(visited), strict=False):
+        np.testing.assert_array_equal(State.from_vector(episode.columns[schema.SIM_STATE][0]).physics, original.physics)
