@@ -1,104 +1,28 @@
-"""Datasets through LeRobot's own code: for features that only its writer knows, and for what its policies ask for."""
+"""LeRobot's metadata of datasets, which its policies ask for."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import shutil
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, override
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
-from datasets.utils.logging import disable_progress_bar, enable_progress_bar, is_progress_bar_enabled
 from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.io_utils import load_info
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.data.atomic import PARTIAL
 from manip_il.data.dataset import Dataset
-from manip_il.data.info import read_info
-from manip_il.data.lerobot_layout import DATA_FILES, STATS, TASK_INDEX, TASKS, write_json
+from manip_il.data.lerobot_layout import TASK_INDEX, TASKS
 from manip_il.data.schema import ACTION, ENVIRONMENT_STATE, LABEL_VALID, STATE
 from manip_il.data.statistics import column_statistics
-from manip_il.data.video import scheduling_kept
 from manip_il.errors import ManipError, MismatchError
 
 I64 = NDArray[np.int64]
 LEARNT = (STATE, ENVIRONMENT_STATE, ACTION, LABEL_VALID)  # columns that datasets taken as one must share
-Frame = dict[str, Any]  # column -> array of the feature's dtype and shape, or text; and `task`
-
-
-def write_with_library(
-    root: Path,
-    fps: int,
-    robot_type: str | None,
-    features: dict[str, dict[str, Any]],
-    episodes: Iterable[Iterable[Frame]],
-) -> Generator[int]:
-    """Write a dataset to `root`, which must not exist; yield every episode's number of frames.
-
-    Not atomic: write into a `new_folder`. Tasks are numbered as they first appear. The repository's name is not
-    stored anywhere.
-    """
-    with_video = any(feature["dtype"] == "video" for feature in features.values())
-    dataset = LeRobotDataset.create(
-        f"local/{root.name}", fps, features, root=root, robot_type=robot_type, use_videos=with_video
-    )
-    try:
-        for frames in episodes:
-            count = 0
-            tasks: dict[str, None] = {}
-            for frame in frames:
-                count += 1
-                tasks[frame["task"]] = None
-                dataset.add_frame(frame)
-            dataset.meta.save_episode_tasks(list(tasks))  # LeRobot would number an episode's tasks in random order
-            _save(dataset)
-            yield count
-    except BaseException:
-        with contextlib.suppress(Exception):
-            dataset.finalize()  # else it writes when it is collected, into the folder that was removed
-        raise
-    dataset.finalize()
-    shutil.rmtree(root / "images", ignore_errors=True)  # empty folders: the pictures are in the data by now
-    _remove_chance(root)
-
-
-def _save(dataset: LeRobotDataset) -> None:
-    """Save an episode without LeRobot's progress bar."""
-    enabled = is_progress_bar_enabled()
-    disable_progress_bar()
-    try:
-        with scheduling_kept():
-            dataset.save_episode(parallel_encoding=False)
-    finally:
-        if enabled:
-            enable_progress_bar()
-
-
-def _remove_chance(root: Path) -> None:
-    """Order the statistics, which LeRobot leaves in a set's order, and drop the random fingerprint of data files."""
-    stats = checks.read_json(root / STATS, "a dataset's statistics")
-    write_json(root / STATS, {key: stats[key] for key in read_info(root).features if key in stats})
-    for path in sorted(root.glob(DATA_FILES)):
-        with pq.ParquetFile(path) as file:
-            schema = file.schema_arrow
-            about = json.loads((schema.metadata or {}).get(b"huggingface", b"{}"))
-            if about.pop("fingerprint", None) is None:
-                continue
-            named = schema.with_metadata({**(schema.metadata or {}), b"huggingface": json.dumps(about).encode()})
-            new = path.with_suffix(PARTIAL)
-            with pq.ParquetWriter(new, named, compression="snappy", use_dictionary=True) as writer:  # as LeRobot's
-                for group in range(file.num_row_groups):
-                    writer.write_table(file.read_row_group(group).cast(named))
-        new.replace(path)
 
 
 class Metadata(LeRobotDatasetMetadata):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from manip_il import checks
 from manip_il.data.atomic import new_folder
 from manip_il.data.foxglove import NANOSECONDS
+from manip_il.data.lerobot_write import TableWriter
 from manip_il.errors import ManipError, MismatchError, nearest
 from manip_il.mcap.mapping import TASK, TEXT, Mapping, Source, exact_rate, frame_times
 from manip_il.mcap.path import values_at
@@ -42,18 +43,16 @@ def import_files(paths: list[Path], root: Path, mapping: Mapping) -> Iterator[in
     holds something, `MismatchError` for files of different shapes, and what `checks.in_child` and `read_frames` raise.
     """
     checks.in_child(str(paths[0]), _read_all, paths, mapping)
-    from manip_il.data.lerobot_library import write_with_library  # imports torch
-
     fps: Any = mapping.fps if mapping.fps % 1 else int(mapping.fps)
     features = _features(next(read_frames(paths[0], mapping)), mapping)
-    episodes = (read_frames(path, mapping) for path in paths)
-    with new_folder(root) as folder:
-        work = folder / "dataset"  # LeRobot makes its folder itself
-        with closing(write_with_library(work, fps, mapping.robot_type, features, episodes)) as written:
-            yield from written
-        for path in list(work.iterdir()):
-            path.rename(folder / path.name)
-        work.rmdir()
+    with new_folder(root) as folder, closing(TableWriter(folder, root, features, fps, mapping.robot_type)) as writer:
+        for path in paths:
+            frames = list(read_frames(path, mapping))
+            columns = {key: np.stack([frame[key] for frame in frames]) for key in features}
+            texts = [frame[TASK] for frame in frames]
+            writer.add_columns({key: _column(values, features[key]) for key, values in columns.items()}, texts)
+            yield len(frames)
+        writer.close_files()
 
 
 def read_frames(path: Path, mapping: Mapping) -> Iterator[Frame]:
@@ -126,6 +125,12 @@ def _features(frame: Frame, mapping: Mapping) -> dict[str, dict[str, Any]]:
         names = ["height", "width", "channels"] if source.is_camera else source.names
         features[key] = {"dtype": dtype, "shape": np.shape(frame[key]) or (1,), "names": names}
     return features
+
+
+def _column(values: NDArray[Any], feature: dict[str, Any]) -> NDArray[Any]:
+    """Values of one number or text a frame as (T,)."""
+    values = values.reshape(-1) if feature["shape"] == (1,) else values
+    return values.astype(object) if feature["dtype"] == TEXT else values
 
 
 def _times(path: Path, stamps: dict[str, I64], rate: Fraction) -> I64:
