@@ -113,8 +113,9 @@ def test_what_cannot_be_is_refused_by_file_topic_and_time(
     ],
 )
 def test_what_is_no_picture_or_of_another_encoding_is_refused(
-    tmp_path: Path, message: Any, encoding: str, why: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Any, encoding: str, why: str
 ) -> None:
+    monkeypatch.setattr("manip_il.mcap.read.find_spec", lambda name: None)  # mcap-ros2-support may be installed
     path = write(tmp_path / "p.mcap", {"/a": [(0, message)]}, encoding)
     mapping = load(tmp_path, {"c": {"topic": "/a", "video": False, "resample": "nearest", "tolerance": 0.1}})
     with pytest.raises(ManipError, match=rf"p\.mcap.* {why}"):

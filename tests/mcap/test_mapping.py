@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -71,6 +72,9 @@ def test_a_path_leads_to_values_or_says_where_it_ends() -> None:
         joints.joints.add(name=name, position=number / 2)
     assert values_at("joints[:].position", joints) == [0.0, 0.5]
     assert values_at("joints[name=wrist.1].position", joints) == values_at("a b[1]", {"a b": [0, 0.5]}) == [0.5]
+    ros = type("JointState", (SimpleNamespace,), {"__slots__": ["position"]})()  # as mcap-ros2-support makes them
+    ros.position = [1.5, 2.5]
+    assert values_at("position", ros) == [1.5, 2.5]
     for path, why in (
         ("joint", r"no field 'joint' \(did you mean 'joints'\?\); known: timestamp, joints"),
         ("joints[name=elbo].name", r"\[name=elbo\] fits 0 of 2 elements"),
