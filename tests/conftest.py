@@ -37,6 +37,7 @@ IMPORTED_ONCE = [
     "manip_il.evaluation.eval_report",
     "manip_il.learn.policy",
     "manip_il.learn.train",
+    "manip_il.store.transfer",
     "lerobot.policies.act.modeling_act",
     "pyarrow.parquet",
 ]

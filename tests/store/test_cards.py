@@ -93,9 +93,9 @@ def test_a_policys_card_is_of_its_best_policy_and_says_how_well_it_does(tmp_path
     (run / "eval").mkdir()
     (run / "eval" / "eval.json").write_text(json.dumps(EVALUATION))
     text = cards(run, "policy", "user/act")[CARD].decode()
-    data = ModelCard(text).data
-    assert (data.license, data.library_name, data.pipeline_tag) == ("apache-2.0", "lerobot", "robotics")
-    assert data.eval_results[0].metric_value == pytest.approx(0.84)
+    data = ModelCard(text).data.to_dict()
+    assert (data["license"], data["library_name"], data["pipeline_tag"]) == ("apache-2.0", "lerobot", "robotics")
+    assert data["model-index"][0]["results"][0]["metrics"][0]["value"] == pytest.approx(0.84)
     assert "**84.0%** [75.6%, 89.9%] (95% interval, 100 episodes), on unseen seeds" in text
     assert "# act for panda pick_place\n" in text
     assert "--env.task=PandaPickPlace-v0" in text

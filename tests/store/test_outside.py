@@ -50,7 +50,7 @@ def test_a_hostile_manifest_is_refused_and_nothing_is_written(text: bytes, tmp_p
 
 
 @pytest.mark.parametrize("change", [lambda data: data[:-1], lambda data: data + b"x", lambda data: b"x" + data[1:]])
-def test_bytes_that_differ_are_refused(change: Callable[[bytes], bytes], place: str, tmp_path: Path, request):
+def test_bytes_that_differ_are_refused(change: Callable[[bytes], bytes], place: str, tmp_path: Path, monkeypatch):
     push(make_run(tmp_path / "run"), open_remote(place, quiet=True))
     remote = open_remote(place, quiet=True)
     fetch = remote.fetch
@@ -59,13 +59,12 @@ def test_bytes_that_differ_are_refused(change: Callable[[bytes], bytes], place: 
         fetch(manifest, paths, folder)
         (folder / "new.txt").write_bytes(change((folder / "new.txt").read_bytes()))
 
-    remote.fetch = lie
+    monkeypatch.setattr(remote, "fetch", lie)
     with pytest.raises(ManipError, match=r"'new\.txt' twice did not have the hash"):
         pull(remote, tmp_path / "got")
     assert not list(tmp_path.glob("*got*"))
-    (tmp_path / "got").mkdir()
     times = iter([lie, fetch])
-    remote.fetch = lambda *words: next(times)(*words)
+    monkeypatch.setattr(remote, "fetch", lambda *words: next(times)(*words))
     pull(remote, tmp_path / "got")
     assert content(tmp_path / "got") == content(tmp_path / "run")
 

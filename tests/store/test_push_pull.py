@@ -18,6 +18,7 @@ from manip_il.doctor.finding import NotWhole
 from manip_il.errors import FolderExistsError
 from manip_il.mdp import Episode
 from manip_il.store.errors import RemoteError
+from manip_il.store.objects import Objects
 from manip_il.store.transfer import open_remote, pull, push
 
 from .conftest import DATASET, POLICY, SAMPLE, content, make_run
@@ -72,7 +73,7 @@ def test_of_two_pushes_one_wins_and_the_other_is_told(place: str, tmp_path: Path
 
 
 def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(bucket: str, tmp_path: Path, monkeypatch):
-    remote = open_quietly(f"s3://{bucket}/a")
+    remote = Objects("s3", f"s3://{bucket}/a", quiet=True)
     push(make_run(tmp_path / "run"), remote)
     found = remote.read()
     answers = iter([(b"", '"an older tag"'), remote._read()])
