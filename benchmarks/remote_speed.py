@@ -1,15 +1,14 @@
 """Push and pull over loopback against the plain client's copy: 1,000 small files, and one large one.
 
-python benchmarks/remote_speed.py [--quick] [--repeats N] [--stores file,sftp,sftp-gcm,hub,s3]
+python benchmarks/remote_speed.py [--quick] [--repeats N] [--stores file,sftp,hub,s3]
 
 Ours hashes, verifies, and switches over in one step; the plain client only copies: shutil.copytree for file://;
-paramiko's put and get for sftp:// (Debian's sshd, which must be installed), as it comes and, in the rows of sftp-gcm,
-with the ciphers that ours prefers; huggingface_hub's upload_folder and snapshot_download for hf:// (the tests' server);
-s3fs' put and get for s3:// (moto, in a process of its own).
+paramiko's put and get for sftp:// (Debian's sshd, which must be installed); huggingface_hub's upload_folder and
+snapshot_download for hf:// (the tests' server); s3fs' put and get for s3:// (moto, in a process of its own).
 By turns in the same run, into new places each time; the median ratio of the repeats counts (above 1: ours is faster).
 
-ratio: of the commands as they are; a pull, and a push to file://, of ours ends when all is on the disk, the plain
-client's when it is in memory. on disk: of both until everything is on this machine's disk.
+ratio: of the commands as they are; a pull of ours ends when all is on the disk, the plain client's when in memory.
+on disk: of both until everything is on this machine's disk.
 """
 
 from __future__ import annotations
@@ -27,30 +26,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import boto3
 import huggingface_hub
 import paramiko
 from _machine import describe_machine
-from huggingface_hub import constants
 from huggingface_hub.utils import disable_progress_bars
 from s3fs import S3FileSystem
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from store.hub_server import Hub, hub_server  # pyright: ignore[reportMissingImports]
+from store.hub_server import TOKEN, Hub, hub_server, talk_to  # pyright: ignore[reportMissingImports]
 from store.s3 import KEY, SECRET, running_moto, variables  # pyright: ignore[reportMissingImports]
 from store.sshd import Sshd, running_sshd  # pyright: ignore[reportMissingImports]
 
-from manip_il.cli.push_pull import open_remote
-from manip_il.store.disk import sync_disk
-from manip_il.store.pull import pull
-from manip_il.store.push import push
-from manip_il.store.remote import RemoteUrl
-from manip_il.store.sftp_connection import quick_transport
+from manip_il.store.transfer import open_remote, pull, push
 
 BUCKET = "benchmark"
-TOKEN = "hf_OfTheBenchmark"
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a tenth of everything, once")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--stores", default="file,sftp,sftp-gcm,hub,s3")
+    parser.add_argument("--stores", default="file,sftp,hub,s3")
     options = parser.parse_args()
     repeats, tenth = (1, 10) if options.quick else (options.repeats, 1)
     print(describe_machine())
@@ -78,7 +69,7 @@ def main() -> int:
         os.environ |= variables(stack.enter_context(moto_beside()))
         server = stack.enter_context(running_sshd(_made(folder / "sshd")))
         os.environ["HOME"] = str(server.home)
-        hub = stack.enter_context(hub_server(_made(folder / "hub")))
+        hub = stack.enter_context(hub_server())
         warm = make_tree(folder / "warm", 10, 10_000, "json")
         trees = {
             f"{1000 // tenth:,} of 10 kB": make_tree(folder / "small", 1000 // tenth, 10_000, "json"),
@@ -99,20 +90,20 @@ def turn(store: Store, tree: Path, work: Path, *, ours_first: bool = False) -> d
     """Seconds of each direction, plain and ours. ours_first: whoever is finds more memory free, so both are in turn."""
     times: dict[str, float] = {}
     place, plain = f"{_made(work)}/ours", f"{work}/plain"
-    url = RemoteUrl.parse(store.url(place))
+    url = store.url(place)
     steps = {
         "plain push": lambda: store.put(tree, plain),
-        "push": lambda: push(tree, url, open_remote(url), unwatched),
+        "push": lambda: push(tree, open_remote(url, quiet=True)),
         "plain pull": lambda: store.get(plain, work / "got plain"),
-        "pull": lambda: pull(url, open_remote(url), work / "got", unwatched),
+        "pull": lambda: pull(open_remote(url, quiet=True), work / "got"),
     }
     order = ("push", "plain push", "pull", "plain pull") if ours_first else tuple(steps)
     for what in order:
-        sync_disk(work)
+        os.sync()
         start = time.perf_counter()
         steps[what]()
         times[what] = time.perf_counter() - start
-        sync_disk(work)
+        os.sync()
         times[f"{what} on disk"] = time.perf_counter() - start
     shutil.rmtree(work)
     return times
@@ -159,25 +150,20 @@ def stores(server: Sshd, hub: Hub) -> list[Store]:
     def s3_get(place: str, target: Path) -> None:
         S3FileSystem(skip_instance_cache=True).get(f"{BUCKET}{place}", str(target), recursive=True)
 
-    def sftp(name: str, **options: Any) -> Store:
-        def put(tree: Path, place: str) -> None:
-            with connected(server, **options) as client:
-                client.mkdir(place)
-                for path in tree.iterdir():
-                    client.put(str(path), f"{place}/{path.name}")
+    def sftp_put(tree: Path, place: str) -> None:
+        with connected(server) as client:
+            client.mkdir(place)
+            for path in tree.iterdir():
+                client.put(str(path), f"{place}/{path.name}")
 
-        def get(place: str, target: Path) -> None:
-            target.mkdir()
-            with connected(server, **options) as client:
-                for file in client.listdir(place):
-                    client.get(f"{place}/{file}", str(target / file))
+    def sftp_get(place: str, target: Path) -> None:
+        target.mkdir()
+        with connected(server) as client:
+            for file in client.listdir(place):
+                client.get(f"{place}/{file}", str(target / file))
 
-        return Store(name, lambda place: server.url(Path(place)), put, get)
-
-    hub.add_token(TOKEN, "user")
     os.environ["HF_TOKEN"] = TOKEN
-    constants.ENDPOINT, constants.HF_HUB_DISABLE_XET = hub.url, True
-    constants.HUGGINGFACE_CO_URL_TEMPLATE = f"{hub.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    talk_to(hub.url)
     disable_progress_bars()
     api = huggingface_hub.HfApi(endpoint=hub.url, token=TOKEN)
 
@@ -190,8 +176,7 @@ def stores(server: Sshd, hub: Hub) -> list[Store]:
 
     return [
         Store("file", lambda place: f"file://{place}", shutil.copytree, shutil.copytree),
-        sftp("sftp"),
-        sftp("sftp-gcm", transport_factory=quick_transport),
+        Store("sftp", lambda place: server.url(Path(place)), sftp_put, sftp_get),
         Store("hub", lambda place: f"hf://{_repo(place)}", hub_put, hub_get),
         Store("s3", lambda place: f"s3://{BUCKET}{place}", s3_put, s3_get),
     ]
@@ -202,11 +187,11 @@ def _repo(place: str) -> str:
 
 
 @contextlib.contextmanager
-def connected(server: Sshd, **options: Any) -> Iterator[paramiko.SFTPClient]:
+def connected(server: Sshd) -> Iterator[paramiko.SFTPClient]:
     client = paramiko.SSHClient()
     client.load_system_host_keys()
     key = str(server.home.parent / "user_key")
-    client.connect("127.0.0.1", server.port, server.user, key_filename=key, **options)
+    client.connect("127.0.0.1", server.port, server.user, key_filename=key)
     with client, client.open_sftp() as sftp:
         yield sftp
 
@@ -219,10 +204,6 @@ def make_tree(folder: Path, files: int, size: int, suffix: str) -> Path:
     for number in range(files):
         (folder / f"{number}.{suffix}").write_bytes(os.urandom(size))
     return folder
-
-
-def unwatched(total: int, what: str) -> contextlib.AbstractContextManager[Callable[[int], None]]:
-    return contextlib.nullcontext(lambda _: None)
 
 
 def _made(folder: Path) -> Path:

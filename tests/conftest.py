@@ -37,6 +37,7 @@ IMPORTED_ONCE = [
     "manip_il.evaluation.eval_report",
     "manip_il.learn.policy",
     "manip_il.learn.train",
+    "manip_il.store.transfer",
     "lerobot.policies.act.modeling_act",
     "pyarrow.parquet",
 ]
@@ -50,19 +51,16 @@ LONG = (
     "learn/test_fit_policy.py",
     "store/test_kills.py",
     "lerobot_commands/test_policies.py",
-    "store/test_round_trip.py",
-    "store/test_hub_programs.py",
+    "store/test_push_pull.py",
     "doctor/test_doctor_lerobot.py",
     "cli/test_commands.py",
     "faults/test_kills.py",
     "lerobot_commands/test_datasets.py",
     "collect/test_workers.py",
-    "store/test_faults.py",
     "lerobot_commands/test_pictures.py",
     "learn/test_plugin.py",
     "evaluation/test_runner.py",
     "learn/test_train.py",
-    "store/test_large_files.py",
 )
 
 

@@ -222,14 +222,9 @@ def _clean(text: str, words: list[str]) -> str:
 
     Without control characters, too.
     """
-    from manip_il.store.errors import mask, redact
+    from manip_il.store.errors import redact
 
-    if any(":" in word or "@" in word for word in words):
-        from manip_il.store.remote import secrets_in
-
-        for secret in (one for word in words for one in secrets_in(word)):
-            text = mask(text, secret)
-    return printable(redact(text))
+    return printable(redact(text, words))
 
 
 def _help() -> str:

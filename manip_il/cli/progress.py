@@ -37,6 +37,11 @@ def set_quiet(quiet: bool) -> None:
     _quiet = quiet
 
 
+def is_quiet() -> bool:
+    """Return whether progress is switched off."""
+    return _quiet
+
+
 def say(line: str) -> None:
     """Print a line of normal output, on standard output."""
     print(printable(line), flush=True)

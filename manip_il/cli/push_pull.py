@@ -2,127 +2,64 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, replace
+import sys
+from dataclasses import MISSING, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from manip_il.cli.inputs import require_folder
-from manip_il.cli.interrupt import Interrupted
 from manip_il.cli.outputs import require_ours, require_short_path
-from manip_il.cli.progress import bytes_text, progress, say, warn
+from manip_il.cli.progress import bytes_text, is_quiet, say
 from manip_il.errors import FolderExistsError, UsageError
 from manip_il.option import option
 
-if TYPE_CHECKING:
-    from manip_il.store.push import Plan
-    from manip_il.store.remote import Remote, RemoteUrl
-
-DISPLAY_EVERY = 0.1  # between two updates of the display [s]
-
-
-@contextmanager
-def show_bytes(total: int, what: str) -> Generator[Callable[[int], None]]:
-    """Show the progress of a transfer of `total` bytes; the callback adds bytes, from any thread."""
-    if not total:
-        yield lambda count: None
-        return
-    lock, displayed = threading.Lock(), time.monotonic()
-    done = waiting = 0
-
-    def advance(count: int) -> None:
-        nonlocal done, waiting, displayed
-        with lock:
-            done, waiting = done + count, waiting + count
-            now = time.monotonic()
-            if now - displayed >= DISPLAY_EVERY or done >= total:
-                bar.advance(waiting)
-                waiting, displayed = 0, now
-
-    with progress(total, what, of_bytes=True) as bar:
-        yield advance
-
-
-@contextmanager
-def resumable() -> Generator[None]:
-    """Have Ctrl-C answer that the same command resumes the transfer."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise Interrupted("what has been transferred so far", "the same command") from None
+REMOTES = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
 
 
 @dataclass
 class PushOptions:
-    """Push a dataset, or a policy with its run, to the Hugging Face Hub, an S3 store, another machine or a folder.
+    """Push a dataset, or a policy with its run, to the Hugging Face Hub, an object store, another machine or a folder.
 
     A dataset is checked first, as by manip-il doctor, and refused if it has errors. Only changes are uploaded. Readers
-    see the old version until the new one is complete and verified. Interrupted transfers resume: run the same command
-    again. Of two concurrent pushes one succeeds, and the other says so.
+    see the old version until the new one is complete. After an interruption run the same command again: what has
+    arrived is not sent twice.
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
     source: Path = option(MISSING, "folder of a dataset, a run or a policy", positional=True)
-    remote: str = option(
-        MISSING,
-        "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER",
-        positional=True,
-    )
+    remote: str = option(MISSING, REMOTES, positional=True)
     dry_run: bool = option(False, "only list what would be uploaded and removed")
     journals: bool = option(False, "include the journals, from which the dataset can be rebuilt")
     private: bool = option(False, "make a new repository on the Hub private")
 
     def check(self) -> None:
-        """Refuse an invalid address, and a missing folder."""
-        from manip_il.store.remote import RemoteUrl
-
-        RemoteUrl.parse(self.remote)
+        """Refuse a missing folder."""
         require_folder(self.source, "the folder of a dataset, a run or a policy")
 
     def run(self) -> None:
         """Examine, list, upload, switch over; print what was done."""
-        from manip_il.store.push import push
-        from manip_il.store.remote import RemoteUrl
+        from manip_il.store.transfer import open_remote, push
 
-        url = RemoteUrl.parse(self.remote)
-        remote = open_remote(url, private=self.private)
-        try:
-            with resumable():
-                plan, published = push(
-                    self.source, url, remote, show_bytes, journals=self.journals, dry_run=self.dry_run
-                )
-        finally:
-            warn(*remote.warnings)
-        if published is None:
-            _say_plan(plan, url)
-            return
-        if published.uploaded or published.removed:
-            counts = f"{published.uploaded} files, {bytes_text(published.size)}, uploaded"
-            say(f"{url}: {counts}; {published.removed} removed; {published.kept} unchanged")
-        else:
-            say(f"{url}: {published.kept} files, all there already")
-        say(f"next: manip-il pull {url} FOLDER")
-
-
-def _say_plan(plan: Plan, url: object) -> None:
-    for path in plan.upload:
-        say(f"upload   {path} ({bytes_text(plan.manifest.by_path[path].size)})")
-    for path in plan.remove:
-        say(f"remove   {path}")
-    kept = len(plan.manifest.files) - len(plan.upload)
-    upload = f"{len(plan.upload)} files, {bytes_text(plan.size)}, to upload"
-    say(f"{url}: {upload}; {len(plan.remove)} to remove; {kept} unchanged; nothing was done")
+        remote = open_remote(self.remote, private=self.private, quiet=is_quiet() or not sys.stderr.isatty())
+        plan = push(self.source, remote, journals=self.journals, dry_run=self.dry_run)
+        sizes = {path: plan.manifest.files[path].size for path in plan.upload}
+        for path, size in sizes.items() if self.dry_run else ():
+            say(f"upload   {path} ({bytes_text(size)})")
+        for path in plan.remove if self.dry_run else ():
+            say(f"remove   {path}")
+        counts = f"{len(sizes)} files, {bytes_text(sum(sizes.values()))}, {'to upload' * self.dry_run or 'uploaded'}"
+        rest = f"{len(plan.remove)} {'to remove' * self.dry_run or 'removed'}; {len(plan.local) - len(sizes)} unchanged"
+        say(f"{remote.name}: {counts}; {rest}{'; nothing was done' * self.dry_run}")
+        if not self.dry_run:
+            say(f"next: manip-il pull {remote.name} FOLDER")
 
 
 @dataclass
 class PullOptions:
-    """Pull a dataset or a policy from the Hugging Face Hub, an S3 store, another machine or a folder.
+    """Pull a dataset or a policy from the Hugging Face Hub, an object store, another machine or a folder.
 
-    Every file is verified by its hash before the folder appears. Interrupted transfers resume: run the same command
-    again. Paths that leave the folder, links, pickles and code are refused; nothing that is pulled is executed.
+    Every file is verified by its hash, and every file of a dataset opened once, before the folder appears. Paths that
+    leave the folder, links, pickles and code are refused; nothing that is pulled is executed.
     """
 
     example: ClassVar[str] = "manip-il pull hf://datasets/me/demos datasets/demos"
@@ -133,64 +70,25 @@ class PullOptions:
     overwrite: bool = option(False, "replace an existing dataset or run")
 
     def check(self) -> None:
-        """Refuse an invalid address, and a folder that may not be replaced."""
-        self._url()
+        """Refuse a folder that may not be replaced."""
         require_short_path(self.target)
         if self.overwrite and self.target.is_dir() and any(self.target.iterdir()):
             require_ours(self.target)
 
     def run(self) -> None:
         """Fetch, verify, rename; print what was pulled."""
-        from manip_il.store.pull import pull
+        from manip_il.store.transfer import open_remote, pull
 
-        url = self._url()
-        remote = open_remote(url)
+        remote = open_remote(self.remote, revision=self.revision, quiet=is_quiet() or not sys.stderr.isatty())
         try:
-            with resumable():
-                pulled = pull(url, remote, self.target, show_bytes, overwrite=self.overwrite, dry_run=self.dry_run)
+            manifest = pull(remote, self.target, overwrite=self.overwrite, dry_run=self.dry_run)
         except FolderExistsError:
             remedy = "replace them with --overwrite=true, or name a new folder"
             raise UsageError(f"{self.target} or its journals exist already; {remedy}") from None
-        finally:
-            warn(*remote.warnings)
-        manifest = pulled.manifest
-        if self.dry_run:
-            for entry in manifest.files:
-                say(f"pull     {entry.path} ({bytes_text(entry.size)})")
-        size = f"a {manifest.kind} of {len(manifest.files)} files, {bytes_text(manifest.size)}"
-        kept = f", of which {bytes_text(pulled.kept)} had been transferred before" if pulled.kept else ""
-        say(f"{url}: {size}; nothing was done" if self.dry_run else f"{self.target}: {size}, all verified{kept}")
+        for path, file in manifest.files.items() if self.dry_run else ():
+            say(f"pull     {path} ({bytes_text(file.size)})")
+        size = bytes_text(sum(file.size for file in manifest.files.values()))
+        what = f"a {manifest.kind} of {len(manifest.files)} files, {size}"
+        say(f"{remote.name}: {what}; nothing was done" if self.dry_run else f"{self.target}: {what}, all verified")
         if not self.dry_run and manifest.kind == "dataset":
             say(f"next: manip-il doctor {self.target}")
-
-    def _url(self) -> RemoteUrl:
-        from manip_il.store.remote import RemoteUrl
-
-        url = RemoteUrl.parse(self.remote)
-        if self.revision is None:
-            return url
-        if url.scheme != "hf":
-            raise UsageError(f"--revision={self.revision} is only for the Hub; {url} holds one version")
-        if url.revision not in (None, self.revision):
-            raise UsageError(f"{url} and --revision={self.revision} differ; give one of them")
-        return RemoteUrl.parse(f"{replace(url, revision=None)}@{self.revision}")
-
-
-def open_remote(url: RemoteUrl, *, private: bool = False) -> Remote:
-    """Return the remote of a URL, without connecting yet; the library of its scheme is imported here.
-
-    private: of a repository that a push creates on the Hub.
-    """
-    if url.scheme == "hf":
-        from manip_il.store.hub import HubRemote
-
-        return HubRemote(url, private)
-    if url.scheme == "s3":
-        from manip_il.store.s3_store import S3Blobs as Blobs
-    elif url.scheme == "sftp":
-        from manip_il.store.sftp_store import SftpBlobs as Blobs
-    else:
-        from manip_il.store.file_store import FileBlobs as Blobs
-    from manip_il.store.object_store import ObjectRemote
-
-    return ObjectRemote(Blobs(url))

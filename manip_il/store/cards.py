@@ -1,276 +1,154 @@
-"""Cards for the Hub: `README.md` of a dataset or policy, and a dataset's picture, made from its folder.
+"""Cards for the Hub: `README.md` of a dataset or policy, filled from its files into `card.md.jinja`, and a picture.
 
-The texts are the templates `card_dataset.md.jinja`, filled from the module of that name, and `card_policy.md.jinja`.
-No card holds an absolute path, a token or a date: the same folder gives the same bytes.
+No card holds an absolute path, a token or a date: the same folder gives the same bytes. The card of what another
+program made claims neither our licence nor our making.
 """
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
+import jinja2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from manip_il import checks
-from manip_il.checks import parse_yaml
+from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
-from manip_il.data.lerobot_layout import INFO
-from manip_il.data.schema import ENVIRONMENT_STATE
+from manip_il.data.lerobot_layout import EPISODE_INDEX, INFO
 from manip_il.errors import ManipError
-from manip_il.store.card_dataset import dataset_fields, draw_picture
 from manip_il.store.errors import redact
 from manip_il.store.manifest import CARD, CONFIG, Kind, journals_of, policy_folder
 
 PICTURE = "assets/episodes.png"
-_MADE_BY = "| made by | manip_il"  # a row of every card of ours
-_REPOSITORY = "USER/NAME"  # in the commands of a card that is not for a Hub
-_COMMANDS = {
-    **{"RecordOptions": "record", "TrainOptions": "train", "DaggerOptions": "dagger"},
-    **{"GailOptions": "gail", "AirlOptions": "airl", "PpoOptions": "ppo"},
-}
-_HEADER = re.compile(r"# manip-il \S+: resolved options \((\w+)\)")
-_NOT_SHOWN = (  # options that are places, or concern one machine
-    *("root", "output_dir", "repo_id", "config_path", "resume", "overwrite", "engine", "device", "workers", "threads"),
-    *("num_workers", "memory", "image_cache_gb", "log_freq", "save_freq", "tensorboard"),
+_FRAMES, _EPISODES = 6, 50  # of each camera, whose paths are drawn
+_WIDTH = 8.0  # of the picture [inches]
+_OURS = (b"<!-- written by manip-il push -->", b"| made by | manip_il")  # a card with either is made again
+_NOT_SHOWN = re.compile(  # lines of options that are places, concern one machine, or may be secrets
+    r"/|^ *(root|output_dir|repo_id|config_path|resume|overwrite|engine|device|workers|threads|num_workers|memory|"
+    r"image_cache_gb|log_freq|save_freq|tensorboard):|(?i:token|secret|passw|credential|api_?key)"
 )
-_SECRET = re.compile(r"token|secret|password|passwd|credential|api_?key", re.IGNORECASE)
-_LARGEST_CONFIG = 100_000  # [bytes]
-
-_PLACES = tuple(
-    f"{folder}{CONFIG}" for folder in ("", "pretrained_model/", "*/pretrained_model/", "*/*/pretrained_model/")
-)
-_LEVELS = re.compile(r"pretrained_model|policy|best|last|checkpoints|\d+")  # folders of one run, above its weights
-_PLUGIN = "manip_il.lerobot_plugin"  # our robots and policies in LeRobot's own commands
-_DATASET = "dataset"  # folder of a DAgger run: what its policy was fitted to
-_REPO_ID = re.compile(r"[\w.-]+/[\w.-]+")
-_FIT = {"steps": "{} steps", "batch_size": "batches of {}", "lr": "learning rate {}", "seed": "seed {}"}
 
 
-def card_for(root: Path, kind: Kind, url: str) -> dict[str, bytes]:
-    """Return path in the repository -> content. url: of the repository, for the commands that the card shows.
+def write_cards(root: Path, kind: Kind, place: str, folder: Path) -> dict[str, Path]:
+    """Write a card and a picture into `folder`; return them by their paths in the repository `place`, USER/NAME.
 
     A `README.md` of another origin is kept: then the result holds none. Raises `ManipError` for a folder that cannot be
     read.
     """
-    card = root / CARD
-    is_kept = card.is_file() and _MADE_BY not in card.read_text(encoding="utf-8", errors="replace")
-    found = re.fullmatch(r"hf://(?:datasets/|models/)?([^@]+)(?:@.*)?", url)
-    place = found[1] if found else _REPOSITORY
-    if kind == "policy":
-        return {} if is_kept else {CARD: _policy_card(root, place)}
-    picture = draw_picture(root)
-    files = {PICTURE: picture} if picture else {}
-    if not is_kept:
-        data, fields = dataset_fields(root, place)
-        above = root.absolute().parent / "config.yaml"
-        fields["command"] = command(journals_of(root) / "config.yaml") or command(above)
-        fields["picture"] = PICTURE if picture else None
-        files[CARD] = _render(DatasetCard, "card_dataset", data, fields)
-    return files
+    made, dataset = dict[str, bytes](), Dataset.open(root) if kind == "dataset" else None
+    if dataset and (picture := draw_picture(dataset)):
+        made[PICTURE] = picture
+    if not (root / CARD).is_file() or any(mark in (root / CARD).read_bytes() for mark in _OURS):
+        environment = jinja2.Environment(finalize=lambda value: redact(value) if isinstance(value, str) else value)
+        environment.filters["cell"] = lambda value: " ".join(str(value).split()).replace("|", "\\|")
+        template = environment.from_string(Path(__file__).with_name("card.md.jinja").read_text(encoding="utf-8"))
+        facts = {"place": place, "version": version("manip_il"), "picture": PICTURE if made else None}
+        try:
+            facts |= dataset_facts(dataset) if dataset else policy_facts(root)
+            made[CARD] = f"{template.render(facts)}\n".encode()
+        except (AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
+            text = f"{type(error).__name__}: {checks.one_line(error)}"
+            raise ManipError(f"{root}: a JSON file in it holds unexpected values ({text}); restore the file") from error
+    paths = {name: folder / Path(name).name for name in made}
+    for name, data in made.items():
+        paths[name].write_bytes(data)
+    return paths
 
 
-def _policy_card(root: Path, place: str) -> bytes:
-    try:
-        return _render(ModelCard, "card_policy", *policy_fields(root, place))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ManipError(
-            f"{root}: its card cannot be written, as a JSON file beside the policy holds unexpected values "
-            f"({type(error).__name__}: {checks.shorten(str(error))}); restore the file"
-        ) from error
+def dataset_facts(dataset: Dataset) -> dict[str, Any]:
+    """Return what the template says of a dataset."""
+    seeds = np.unique(dataset.columns([s.SEED])[s.SEED]).tolist() if s.SEED in dataset.features else []
+    made_by = options(journals_of(dataset.root)) or options(dataset.root.absolute().parent)
+    return {"dataset": dataset, "is_ours": dataset.own is not None, "seeds": seeds, "options": made_by}
 
 
-def _render(card: type[DatasetCard | ModelCard], template: str, data: Any, fields: dict[str, Any]) -> bytes:
-    """Fill a template. Every value of a table becomes one cell, without a secret."""
-    values = {**fields, "version": version("manip_il")}
-    for name in ("rows", "fingerprint"):
-        values[name] = [(_cell(label), _cell(value)) for label, value in fields[name]]
-    path = Path(__file__).with_name(f"{template}.md.jinja")
-    made = card.from_template(data, template_path=str(path), **values)
-    return f"{made}\n".encode()
-
-
-def _cell(value: object) -> str:
-    return redact(" ".join(str(value).split())).replace("|", "\\|")
-
-
-def command(config: Path) -> str | None:
-    """Return the `manip-il` command of a `config.yaml` of ours; None without one.
-
-    Leaves out folders, options of one machine, and anything that could be a secret.
-    """
-    if not config.is_file() or config.stat().st_size > _LARGEST_CONFIG:
-        return None
-    text = config.read_text(encoding="utf-8", errors="replace")
-    header = _HEADER.match(text)
-    word = _COMMANDS.get(header[1]) if header else None
-    if word is None:
-        return None
-    try:
-        tree = parse_yaml(text)
-    except ValueError:
-        return None
-    words = [f"--{name}={value}" for name, value in _leaves(tree) if _is_shown(name, value)]
-    return redact(f"manip-il {word} \\\n  " + " \\\n  ".join(words))
-
-
-def _leaves(tree: object, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(tree, dict):
-        named = cast("Mapping[str, object]", tree)
-        return [
-            leaf for key, value in named.items() for leaf in _leaves(value, f"{prefix}.{key}" if prefix else str(key))
-        ]
-    if isinstance(tree, list):
-        items = cast("Sequence[object]", tree)
-        return [(prefix, ",".join(map(str, items)))] if items else []
-    if isinstance(tree, bool):
-        return [(prefix, str(tree).lower())]
-    return [] if tree is None else [(prefix, str(tree))]
-
-
-def _is_shown(name: str, value: str) -> bool:
-    is_plain = re.fullmatch(r"[\w.,:+@=-]+", value)  # no path, nothing that a shell would read
-    return bool(is_plain) and name.split(".")[-1] not in _NOT_SHOWN and not _SECRET.search(name)
-
-
-class Policy:
-    """JSON files of a policy's folder, each `{}` if it is missing, and the names in them, empty if none has one.
-
-    type: LeRobot's name of its kind. dataset: LeRobot's `repo_id` of what it was trained on. was_chosen_by: whether the
-    evaluation is one that the policy was chosen by.
-    """
-
-    def __init__(self, root: Path):
-        """Read the policy in a folder, or in the run that the folder is. Raises `ManipError` if there is none."""
-        inside = policy_folder(path.relative_to(root).as_posix() for place in _PLACES for path in root.glob(place))
-        if inside is None:
-            text = f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder"
-            raise ManipError(text)
-        folder = root / inside
-        self.evaluation, self.was_chosen_by = _evaluation(root, folder)
-        files = ("config", "manip_il", "train_config")
-        self.config, self.meta, self.training = (_read(folder / f"{name}.json") for name in files)
-        self.type = str(self.config.get("type", "policy"))
-        self.robot, self.task = (str(self.meta.get(key) or self.evaluation.get(key) or "") for key in ("robot", "task"))
-        self.dataset = str((self.training.get("dataset") or {}).get("repo_id") or "")
-
-
-def policy_fields(root: Path, place: str) -> tuple[ModelCardData, dict[str, Any]]:
-    """Return metadata and fields of the card. place: USER/NAME of the repository.
-
-    Raises `ManipError` for a folder without a policy, and Python's own errors for JSON files with unexpected values.
-    """
-    policy = Policy(root)
-    title = f"{policy.type} for {policy.robot} {policy.task}" if policy.robot else policy.type
-    # Options name the robot and the task only if the policy's own folder does not.
-    missing = [
-        (key, name) for key, name in (("robot", policy.robot), ("task", policy.task)) if not policy.meta.get(key)
-    ]
-    options = "".join(f" --{key}.type={name}" for key, name in missing if name)
-    return _metadata(policy, title), {
-        "title": title,
-        "is_ours": bool(policy.meta),
-        "place": place,
-        "folder": place.rpartition("/")[2] if place != _REPOSITORY else "policy",
-        "command": command(root / "config.yaml"),
-        "rows": list(_rows(root, policy)),
-        "options": f"{options} --eval.n_episodes=200",
-        "environment": _environment(policy),
-        "fingerprint": (policy.meta.get("fingerprint") or {}).items(),
+def policy_facts(root: Path) -> dict[str, Any]:
+    """Return what the template says of a policy, or of the run that it is in. Raises `ManipError` if there is none."""
+    inside = policy_folder(path.relative_to(root).as_posix() for path in root.rglob(CONFIG))
+    if inside is None:
+        raise ManipError(f"no policy in {root}; push a run that has saved a checkpoint, or a pretrained_model folder")
+    config, ours, training = (_read(root / inside / f"{name}.json") for name in ("config", "manip_il", "train_config"))
+    evaluation, was_chosen_by = _evaluation(root)
+    fitted_to = Dataset.open(root / "dataset").summary if (root / "dataset" / INFO).is_file() else None
+    return {
+        **{"config": config, "ours": ours, "is_ours": bool(ours), "training": training, "fitted_to": fitted_to},
+        **{"evaluation": evaluation, "was_chosen_by": was_chosen_by, "options": options(root)},
     }
 
 
-def _metadata(policy: Policy, title: str) -> ModelCardData:
-    tags = dict.fromkeys(["robotics", "lerobot", "manip_il", policy.type, policy.robot, policy.task])
-    results = None
-    if "success_rate" in policy.evaluation:
-        rate, name = float(policy.evaluation["success_rate"]), f"{policy.robot} {policy.task}".strip() or "unknown"
-        results = [EvalResult("robotics", "manip_il", name, "success_rate", rate, metric_name="success rate")]
-    is_on_hub = _REPO_ID.fullmatch(policy.dataset) and not policy.dataset.startswith("local/")
-    return ModelCardData(
-        license="apache-2.0",
-        library_name="lerobot",
-        pipeline_tag="robotics",
-        tags=[tag for tag in tags if tag],
-        model_name=title.replace(" ", "_"),
-        datasets=policy.dataset if is_on_hub else None,
-        eval_results=results,
+def options(folder: Path) -> str:
+    """Return our `config.yaml` in a folder, without places, options of one machine and secrets; "" without one."""
+    path = folder / "config.yaml"
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    shown = [line for line in text.splitlines() if not _NOT_SHOWN.search(line)]
+    return "\n".join(shown) if text.startswith("# manip-il") else ""
+
+
+def _evaluation(root: Path) -> tuple[Mapping[str, Any], bool]:
+    """Return a run's `eval.json` with the most episodes, else the best one of a round, which chose the policy."""
+    found = [(path.parent.name.startswith("round_"), _read(path)) for path in root.rglob("eval.json")]
+    known = [(was, one) for was, one in found if {"success_rate", "n_episodes"} <= one.keys()]
+    was_chosen_by, best = max(
+        known, key=lambda pair: (not pair[0], pair[1]["n_episodes"], pair[1]["success_rate"]), default=(False, {})
     )
-
-
-def _rows(root: Path, policy: Policy) -> Iterator[tuple[str, object]]:
-    meta = policy.meta
-    yield "policy", f"`{policy.type}`"
-    if policy.robot:
-        yield "robot, task", f"`{policy.robot}`, `{policy.task}`"
-    yield "sees", ", ".join(f"`{key}`" for key in policy.config.get("input_features") or {}) or "nothing"
-    if meta.get("cameras"):
-        height, width = meta.get("image_size", (0, 0))
-        yield "cameras", f"{', '.join(meta['cameras'])}, {width} x {height} pixels"
-    if meta.get("action_meaning"):
-        yield "action", f"{meta['action_meaning']}, {meta.get('fps', '?')} a second"
-    if policy.dataset:
-        yield "learnt from", f"`{policy.dataset}`"
-    elif (root / _DATASET / INFO).is_file():
-        data = Dataset.open(root / _DATASET).summary
-        yield "learnt from", f"{data.episodes:,} episodes, {data.frames:,} frames"
-    options = {**(meta.get("options") or {}), **policy.training}
-    fit = [text.format(options[key]) for key, text in _FIT.items() if options.get(key) is not None]
-    if fit:
-        yield "fit", ", ".join(fit)
-    yield "success", _success(policy)
-
-
-def _success(policy: Policy) -> str:
-    found = policy.evaluation
-    if "success_rate" not in found:
-        return "not measured; see below"
-    low, high = found.get("interval") or (float("nan"), float("nan"))
-    confidence = float(found.get("confidence", 0.95))
-    count = f"{found['n_episodes']:,} episodes"
-    text = f"**{found['success_rate']:.1%}** [{low:.1%}, {high:.1%}] ({confidence:.0%} interval, {count})"
-    return f"{text}, on the seeds that it was chosen on" if policy.was_chosen_by else f"{text}, on unseen seeds"
-
-
-def _environment(policy: Policy) -> str:
-    """Return the options by which LeRobot's evaluator finds our robots; a placeholder for a policy of another robot."""
-    if not (policy.meta and policy.robot and policy.task):
-        return "--env.type=..."
-    task = "".join(word.capitalize() for word in f"{policy.robot}_{policy.task}".split("_"))
-    words = [f"--env.discover_packages_path={_PLUGIN}", "--env.type=manip_il", f"--env.task={task}-v0"]
-    if policy.meta.get("cameras"):
-        height, width = policy.meta.get("image_size", (128, 128))
-        has_state = ENVIRONMENT_STATE in (policy.config.get("input_features") or {})
-        words += [
-            f"--env.observation={'both' if has_state else 'images'}",
-            f"--env.cameras={','.join(policy.meta['cameras'])}",
-        ]
-        words += [f"--env.observation_height={height}", f"--env.observation_width={width}"]
-    return " \\\n  ".join([*words, "--eval.n_episodes=50"])
-
-
-def _evaluation(root: Path, folder: Path) -> tuple[Mapping[str, Any], bool]:
-    """Return the nearest `eval.json` beside the weights, up to the folder of their run; else one of its rounds."""
-    folder = folder.resolve()
-    for place in (folder, *folder.parents):
-        if found := _evaluations((place / "eval.json", *sorted(place.glob("eval*/eval.json")))):
-            return max(found, key=lambda one: one["n_episodes"]), place.name.startswith("round_")
-        if not _LEVELS.fullmatch(place.name):
-            break
-    rounds = _evaluations(sorted(root.glob("round_*/eval.json")))
-    return (max(rounds, key=lambda one: one["success_rate"]), True) if rounds else ({}, False)
-
-
-def _evaluations(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    needed = ("success_rate", "n_episodes")
-    return [one for one in map(_read, paths) if all(isinstance(one.get(key), int | float) for key in needed)]
+    return best, was_chosen_by
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file; an empty one if the file is missing or damaged."""
-    try:
-        return checks.read_json(path, "a JSON file beside a policy")
-    except ManipError:
-        return {}
+    return checks.read_json(path, "a JSON file beside a policy") if path.is_file() else {}
+
+
+def draw_picture(dataset: Dataset) -> bytes | None:
+    """Return a PNG: frames of the first episode, or without cameras the paths of the object; None without either."""
+    feature = dataset.features.get(s.ENVIRONMENT_STATE)
+    names = list(feature.labels) if feature else []
+    if dataset.cameras:
+        figure = _draw_frames(dataset)
+    elif {f"{thing}.{axis}" for thing in ("object", "goal") for axis in "xyz"} <= set(names):
+        figure = _draw_paths(dataset, names)
+    else:
+        return None
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=100, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _draw_frames(dataset: Dataset) -> Figure:
+    """Draw one row for each camera: evenly spaced frames of the first episode."""
+    rows = dataset.rows_of(0)
+    picked = rows[np.unique(np.linspace(0, len(rows) - 1, _FRAMES).round().astype(int))]
+    strips: list[NDArray[Any]] = [np.concatenate(list(dataset.frames(key, picked)), axis=1) for key in dataset.cameras]
+    heights = [_WIDTH * strip.shape[0] / strip.shape[1] for strip in strips]
+    figure = Figure((_WIDTH, sum(heights)), layout="constrained")
+    axes = figure.subplots(len(strips), squeeze=False, height_ratios=heights)[:, 0]
+    for axis, strip in zip(axes, strips, strict=True):
+        axis.imshow(strip)
+        axis.axis("off")
+    return figure
+
+
+def _draw_paths(dataset: Dataset, names: list[str]) -> Figure:
+    """Draw the object's paths in the first episodes, from above and from the side, and the goals [m]."""
+    table = dataset.columns([s.ENVIRONMENT_STATE, EPISODE_INDEX])
+    index, values = table[EPISODE_INDEX].reshape(-1), table[s.ENVIRONMENT_STATE]
+    episodes = [values[index == episode] for episode in np.unique(index)[:_EPISODES]]
+    firsts = np.array([rows[0] for rows in episodes])
+    figure = Figure((_WIDTH, _WIDTH / 2), layout="constrained")
+    axes = figure.subplots(1, 2)
+    for axis, (across, up), side in zip(axes, ("xy", "xz"), ("above", "the side"), strict=True):
+        x, y, goal_x, goal_y = (names.index(f"{thing}.{one}") for thing in ("object", "goal") for one in (across, up))
+        for rows in episodes:
+            axis.plot(rows[:, x], rows[:, y], color="#8aa4c8", linewidth=1)
+        axis.plot(firsts[:, x], firsts[:, y], "s", color="#c0392b", markersize=4, label="object at the start")
+        axis.plot(firsts[:, goal_x], firsts[:, goal_y], "o", color="#2e8b57", fillstyle="none", label="goal")
+        axis.set(title=f"from {side}, {len(episodes)} episodes", xlabel=f"{across} [m]", ylabel=f"{up} [m]")
+        axis.set_aspect("equal", adjustable="datalim")
+    axes[0].legend()
+    return figure

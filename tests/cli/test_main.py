@@ -122,26 +122,6 @@ def test_a_stream_that_the_shell_closed_is_no_error(closed, tmp_path):
     assert (done.returncode, (tmp_path / "made").read_text()) == (0, "done")
 
 
-BUSY = """
-import os, signal, sys, threading, time
-from manip_il.cli import main as program
-from manip_il.store.object_store import in_threads
-
-def work(words):
-    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
-    in_threads(2, lambda key: time.sleep(100), range(4))
-
-signal.signal(signal.SIGINT, signal.default_int_handler)
-program._dispatch = work
-program.script()
-"""
-
-
-def test_ctrl_c_does_not_wait_for_what_threads_send():
-    done = subprocess.run([sys.executable, "-c", BUSY], capture_output=True, text=True, check=False, timeout=120)
-    assert (done.returncode, done.stderr) == (130, "manip-il: interrupted\n")
-
-
 @pytest.mark.parametrize("command", ["record", "eval"])
 def test_help_says_every_kind_of_robot_and_the_stock_tasks(command, capsys):
     assert main([command, "--help"]) == 0

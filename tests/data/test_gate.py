@@ -19,6 +19,7 @@ from manip_il.data.gate import check_arrived
 from manip_il.data.lerobot_library import read_metadata
 from manip_il.errors import ManipError
 from manip_il.mdp import Episode
+from manip_il.store.transfer import open_remote, pull, push
 
 from ..damage import DATA, EPISODES
 from ..pictures import encoded, store_pictures, write
@@ -70,6 +71,16 @@ def test_a_cell_without_its_picture_is_followed_by_no_reader(root: Path, cell: A
     with pytest.raises(ManipError, match=refused):
         check_arrived(root)
     assert not opened
+
+
+def test_such_a_dataset_is_not_pulled(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    remote = open_remote(f"file://{tmp_path}/store", quiet=True)
+    set_first(root, {"bytes": None, "path": "http://127.0.0.1:1/a.png"})
+    monkeypatch.setattr("manip_il.store.transfer.examine_folder", lambda root: [])  # another program pushed it
+    push(root, remote)
+    with pytest.raises(ManipError, match=rf"{DATA}: column '{KEY}' has no PNG or JPEG in row 0"):
+        pull(remote, tmp_path / "here")
+    assert not (tmp_path / "here").exists()
 
 
 DECODED: dict[str, Any] = {

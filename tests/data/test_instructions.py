@@ -20,7 +20,7 @@ from manip_il.doctor.examine import examine_folder, has_errors
 from manip_il.errors import ManipError
 from manip_il.mcap.export import export_dataset
 from manip_il.mdp import Episode
-from manip_il.store.card_dataset import dataset_fields
+from manip_il.store.cards import write_cards
 
 from ..mcap.use import decoded
 
@@ -79,7 +79,8 @@ def test_the_doctor_finds_nothing_amiss_and_mcap_and_the_card_have_every_text(tm
     assert not has_errors(examine_folder(root))
     for path, text in zip(export_dataset(Dataset.open(root), tmp_path), TEXTS, strict=True):
         assert {message.message for topic, _, message in decoded(path.read_bytes()) if topic == "/task"} == {text}
-    assert dict(dataset_fields(root, "someone/data")[1]["rows"])["texts"] == f"2, such as: {RED}"
+    card = write_cards(root, "dataset", "someone/data", tmp_path)["README.md"].read_text()
+    assert f"| texts | 2, such as: {RED} |" in card
 
 
 def test_a_number_without_a_text_is_an_error(root):

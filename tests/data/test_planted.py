@@ -12,8 +12,6 @@ from manip_il.cli.outputs import append_jsonl
 from manip_il.data.atomic import exclusive
 from manip_il.errors import ManipError
 from manip_il.learn.metrics import json_lines
-from manip_il.store.disk import Download
-from manip_il.store.manifest import FileEntry
 
 HELD = b"of the user\n"
 
@@ -30,16 +28,10 @@ def write_metrics(folder: Path) -> None:
         write({"step": 1})
 
 
-def download(folder: Path) -> None:
-    entry = FileEntry("a", 3, "0" * 64)
-    Download(entry, folder / "part", lambda count: None).attempt(lambda sink, offset: sink.write(b"abc"))
-
-
 WRITERS: dict[str, Callable[[Path], None]] = {
     ".run.lock": lock,
     "records.jsonl": lambda folder: append_jsonl(folder / "records.jsonl", {"a": 1}),
     "planted": write_metrics,
-    "part": download,
 }
 
 

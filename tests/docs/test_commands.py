@@ -9,15 +9,13 @@ from pathlib import Path
 
 import boto3
 import pytest
-from huggingface_hub import constants
 
 from manip_il.cli import trials
 from manip_il.cli.main import load
 from manip_il.cli.parsing import parse
 from manip_il.tasks.table import TASKS
 
-from ..store.hub_server import Hub, clean_environment, hub_server
-from ..store.hub_use import TOKEN
+from ..store.hub_server import TOKEN, Hub, clean_environment, hub_server, talk_to
 from ..store.s3 import KEY, SECRET, running_moto, variables
 from ..warm import Warm
 from .pages import LANGUAGES, PAGES, ROOT, Line, blocks, command_of, help_lines, page_lines
@@ -35,9 +33,8 @@ def stock(tmp_path_factory: pytest.TempPathFactory) -> Stock:
 
 
 @pytest.fixture(scope="session")
-def running_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
-    with hub_server(tmp_path_factory.mktemp("hub")) as hub:
-        hub.add_token(TOKEN, "user")
+def running_hub() -> Iterator[Hub]:
+    with hub_server() as hub:
         yield hub
 
 
@@ -96,9 +93,7 @@ def workplace(
         monkeypatch.setenv(name, value)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(trials, "FILM_EVERY", 20)  # a frame a second: drawing all takes most of the quickstart's time
-    monkeypatch.setattr(constants, "ENDPOINT", running_hub.url)
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "no_token"))
+    talk_to(running_hub.url, monkeypatch.setattr)
     return Workplace(tmp_path, stock, lerobot)
 
 

@@ -1,19 +1,22 @@
-"""Stores on this machine: moto, sshd, folders."""
+"""An empty place on every kind of remote, a Hub, and runs to push."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from ..synthetic import make_episode, offline, spec
-from .hub_server import Hub
-from .hub_use import a_hub, make_policy
-from .s3 import Proxy, client_of, running_moto, running_proxy, variables
+from ..synthetic import make_episode, spec
+from .hub_server import TOKEN, Hub, hub_server, talk_to
+from .s3 import client_of, running_moto, variables
 from .sshd import Sshd, running_sshd
 
-__all__ = ["make_episode", "offline", "spec"]
+__all__ = ["make_episode", "spec"]  # fixtures
+SAMPLE = Path(__file__).parents[2] / "datasets" / "sample"
+DATASET, POLICY = "hf://datasets/user/demos", "hf://user/policy"
 
 
 @pytest.fixture(scope="session")
@@ -29,8 +32,16 @@ def sshd(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
 
 
 @pytest.fixture
+def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    """A Hub that this process talks to."""
+    with hub_server() as server:
+        talk_to(server.url, monkeypatch.setattr)
+        monkeypatch.setenv("HF_TOKEN", TOKEN)
+        yield server
+
+
+@pytest.fixture
 def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
-    """Name of an empty bucket; the environment says how to reach it."""
     for name, value in variables(moto).items():
         monkeypatch.setenv(name, value)
     name = f"b{abs(hash(request.node.nodeid)):x}"
@@ -38,39 +49,35 @@ def bucket(moto: str, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRe
     return name
 
 
-@pytest.fixture
-def proxy(bucket: str, moto: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Proxy]:
-    """Between us and the bucket."""
-    with running_proxy(moto) as running:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", running.url)
-        yield running
-
-
-def url_on(kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A URL where nothing is yet, on a kind of store."""
-    if kind == "s3":
-        return f"s3://{request.getfixturevalue('bucket')}/some/demos"
-    if kind == "file":
-        return f"file://{tmp_path}/store/demos"
-    server: Sshd = request.getfixturevalue("sshd")
-    monkeypatch.setenv("HOME", str(server.home))
-    return server.url(tmp_path / "store" / "demos")
-
-
-@pytest.fixture(params=["file", "s3", pytest.param("sftp", marks=pytest.mark.slow)])
+@pytest.fixture(params=["file", "s3", "sftp", "hub"])
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A URL where nothing is yet, on each kind of store."""
-    return url_on(request.param, request, tmp_path, monkeypatch)
+    """A URL where nothing is yet, on each kind of remote."""
+    if request.param == "sftp":
+        server: Sshd = request.getfixturevalue("sshd")
+        monkeypatch.setenv("HOME", str(server.home))
+        return server.url(tmp_path / "store" / "demos")
+    if request.param == "hub":
+        request.getfixturevalue("hub")
+        return POLICY
+    return f"file://{tmp_path}/store" if request.param == "file" else f"s3://{request.getfixturevalue('bucket')}/a/b"
 
 
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[Hub]:
-    """A Hub that this process talks to."""
-    with a_hub(tmp_path / "hub") as server:
-        yield server
+def make_run(folder: Path, seed: int = 1, size: int = 20_000) -> Path:
+    """A run as `train` leaves it, with random weights; equal files and an empty one."""
+    rng, model = np.random.default_rng(seed), folder / "checkpoints" / "000004" / "pretrained_model"
+    model.mkdir(parents=True)
+    (folder / "checkpoints" / "last").symlink_to("000004")
+    (folder / "README.md").write_text("# By hand\n")
+    for name, data in {"same.json": b"{}", "copy.json": b"{}", "empty.txt": b"", "new.txt": rng.bytes(99)}.items():
+        (folder / name).write_bytes(data)
+    (model / "config.json").write_text(f'{{"type": "act", "seed": {seed}}}')
+    (model / "model.safetensors").write_bytes(rng.bytes(size))
+    return folder
 
 
-@pytest.fixture(scope="session")
-def tiny_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small ACT, as LeRobot writes it."""
-    return make_policy(tmp_path_factory.mktemp("policies") / "act")
+def content(folder: Path) -> dict[str, object]:
+    """Everything below: bytes of files, targets of links."""
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_symlink() or path.is_file()]
+    return {
+        str(path.relative_to(folder)): os.readlink(path) if path.is_symlink() else path.read_bytes() for path in paths
+    }

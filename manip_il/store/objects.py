@@ -1,0 +1,168 @@
+"""Every remote but the Hub, through fsspec: objects named by the sha256 of their bytes, and one manifest.
+
+    PLACE/manip_il_manifest.json       replaced last, in one step: readers see the old version or the new one
+         /objects/3f/3f9a...           each file's bytes, never changed
+
+Objects of the version before stay until the next push, so that whoever is reading it can finish; what no version names
+is removed by the push after.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import secrets
+from functools import cached_property
+from pathlib import Path
+from typing import Any, override
+from urllib.parse import unquote
+
+import fsspec
+import paramiko
+from fsspec.callbacks import TqdmCallback
+from fsspec.implementations.sftp import SFTPFileSystem
+
+from manip_il.errors import UnknownName, UsageError
+from manip_il.store.errors import RemoteError, explained
+from manip_il.store.manifest import MANIFEST_FILE, Kind, Manifest, Plan
+
+TIMEOUT = 30.0  # of connecting to an ssh server, and of any one answer [s]
+_KNOWN = ("hf", "s3", "sftp", "file", "gs", "az")  # the last two with gcsfs and adlfs
+_ASYNC = {"skip_instance_cache": True, "use_listings_cache": False}  # of object stores: what others push is seen
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "file": {"auto_mkdir": True},
+    "s3": {"max_concurrency": 4, "config_kwargs": {"read_timeout": 120}, **_ASYNC},
+    "sftp": {},
+}
+_SFTP = re.compile(r"sftp://([^@:/]+(:[^@:/]*@|@))?(\[[0-9a-f:.]+\]|[^@:/\[\]]+)(:\d{1,4}|:[1-5]\d{4})?/[^@]+")
+_AT_ONCE = 4  # files; s3fs holds as many parts of each in memory [50 MB]
+
+
+class Sftp(SFTPFileSystem):
+    """Files of a host whose key is in ~/.ssh/known_hosts, with the user's ~/.ssh/config; fsspec's takes any key."""
+
+    cachable = False
+    put: Any = fsspec.AbstractFileSystem.put  # fsspec's takes one file alone
+
+    def _connect(self) -> None:
+        logging.getLogger("paramiko").setLevel(logging.CRITICAL)  # its errors are raised, too
+        config, login = Path.home() / ".ssh" / "config", self.ssh_kwargs
+        known = dict(paramiko.SSHConfig.from_path(str(config)).lookup(self.host)) if config.is_file() else {}
+        self.client = paramiko.SSHClient()
+        self.client.load_system_host_keys()
+        self.client.set_missing_host_key_policy(paramiko.RejectPolicy())
+        self.client.connect(
+            str(known.get("hostname", self.host.strip("[]"))),
+            login.get("port") or int(known.get("port", 22)),
+            login.get("username") or known.get("user"),
+            unquote(login.get("password") or "") or None,
+            key_filename=known.get("identityfile"),
+            timeout=TIMEOUT,
+            banner_timeout=TIMEOUT,
+            auth_timeout=TIMEOUT,
+        )
+        self.ftp = self.client.open_sftp()
+        self.ftp.get_channel().settimeout(TIMEOUT)  # pyright: ignore[reportOptionalMemberAccess]
+
+    @override
+    def put_file(self, lpath: Any, rpath: Any, callback: Any = None, mode: str = "", **kwargs: Any) -> None:
+        """Upload a file, and make its folder."""
+        self.makedirs(self._parent(rpath), exist_ok=True)
+        self.ftp.put(str(lpath), str(rpath))
+
+
+class Objects:
+    """A folder of any file system that fsspec knows. quiet: show no progress."""
+
+    kind: Kind | None = None  # no address says it
+
+    def __init__(self, scheme: str, url: str, *, quiet: bool = False):
+        """Take an address. Raises `UsageError` for a scheme without a package, and for what cannot be read."""
+        self._scheme, self._quiet = scheme, quiet
+        self.name = re.sub(r"(?<=://)([^/@:]*):.*@", r"\1@", url)
+        try:
+            self._class: Any = Sftp if scheme == "sftp" else fsspec.get_filesystem_class(scheme)
+        except ImportError as error:
+            raise UsageError(f"{scheme}:// needs another package: {error}") from None
+        except ValueError:
+            raise UnknownName("scheme", f"{scheme}://", [f"{known}://" for known in _KNOWN]) from None
+        if scheme == "sftp" and not _SFTP.fullmatch(url):
+            text = "expected sftp://[USER@]HOST[:PORT]/FOLDER; in a password write / as %2F, @ as %40, : as %3A"
+            raise UsageError(f"the sftp:// address cannot be read; {text}")
+        self._login, place = self._class._get_kwargs_from_urls(url), self._class._strip_protocol(url)
+        self._root = place.removeprefix("/~/").rstrip("/")  # relative to the user's home
+        self._manifest = f"{self._root}/{MANIFEST_FILE}"
+
+    @cached_property
+    def _fs(self) -> Any:
+        return self._class(**self._login, **_OPTIONS.get(self._scheme, _ASYNC))
+
+    def read(self) -> Manifest | None:
+        """Return the version that readers see now; None if there is none."""
+        with explained(f"read {self.name}"):
+            found = self._read()
+            return Manifest.from_json(*found) if found else None
+
+    def write(self, plan: Plan) -> None:
+        """Upload the objects that are not there, then replace the manifest; remove what no reader can need."""
+        with explained(f"push to {self.name}"):
+            found = self._fs.find(f"{self._root}/objects", detail=True)
+            there = {name.rpartition("/")[2]: info["size"] for name, info in found.items()}
+            files, before = plan.manifest.files, plan.before.files if plan.before else {}
+            missing = {one.sha256: path for path, one in files.items() if there.get(one.sha256) != one.size}
+            sources = [str(plan.local[path]) for path in missing.values()]
+            self._fs.put(sources, [self._object(key) for key in missing], **self._how("push"))
+            for path in missing.values():
+                if plan.local[path].stat().st_size != files[path].size:
+                    raise RemoteError(f"{plan.local[path]} was written to while it was pushed; push again after that")
+            if files != before:
+                self._switch(plan.manifest.to_json(), plan.before)
+                named = {one.sha256 for one in (*files.values(), *before.values())}
+                if unused := there.keys() - named:
+                    self._fs.rm([self._object(key) for key in unused])
+
+    def fetch(self, manifest: Manifest, paths: list[str], folder: Path) -> None:
+        """Write objects to where their files belong in a folder; their hashes are not looked at."""
+        with explained(f"pull from {self.name}"):
+            sources = [self._object(manifest.files[path].sha256) for path in paths]
+            self._fs.get(sources, [str(folder / path) for path in paths], **self._how("pull"))
+
+    def _how(self, what: str) -> dict[str, Any]:
+        """Return options of a transfer: a bar on a terminal, and how many files travel at once."""
+        bar = TqdmCallback({"desc": what, "unit": " files", "disable": True if self._quiet else None})
+        return {"callback": bar, **({"batch_size": _AT_ONCE} if self._fs.async_impl else {})}
+
+    def _read(self) -> tuple[bytes, str] | None:
+        """Return the manifest's text and what names this version of it: the store's ETag, or else its hash."""
+        try:
+            info = self._fs.info(self._manifest)
+            data = self._fs.cat_file(self._manifest)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        return data, info.get("ETag") or hashlib.sha256(data).hexdigest()
+
+    def _switch(self, data: bytes, before: Manifest | None) -> None:
+        """Replace the manifest if it is still `before`: S3 sees to that itself; elsewhere it is read just before."""
+        version, found = before.version if before else None, self._read()
+        try:
+            if (found[1] if found else None) != version:
+                raise FileExistsError
+            if self._scheme in ("file", "sftp"):  # others replace a file in one step
+                partial = f"{self._root}/.{MANIFEST_FILE}.{secrets.token_hex(8)}.partial"
+                self._fs.pipe_file(partial, data)
+                self._fs.mv(partial, self._manifest)
+            else:
+                condition = {"IfMatch": version} if version else {"IfNoneMatch": "*"}
+                self._fs.pipe_file(self._manifest, data, **(condition if self._scheme == "s3" else {}))
+        except OSError as error:
+            found = self._read()
+            if found and found[0] == data:
+                return  # it had worked, and only the answer was lost
+            if (found[1] if found else None) != version:
+                text = "was changed by another push in the meantime; nothing of this push is visible there; push again"
+                raise RemoteError(f"{self.name} {text}") from error
+            raise
+
+    def _object(self, key: str) -> str:
+        return f"{self._root}/objects/{key[:2]}/{key}"

@@ -1,0 +1,160 @@
+"""Push: a folder to a remote, examined, uploaded, and only then visible. Pull: back, verified, in one rename."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+from manip_il import checks
+from manip_il.data import atomic
+from manip_il.data.gate import check_arrived
+from manip_il.data.lerobot_layout import INFO
+from manip_il.doctor.examine import examine_folder
+from manip_il.doctor.finding import NotWhole, Severity
+from manip_il.errors import FolderExistsError, UsageError
+from manip_il.store.errors import RemoteError
+from manip_il.store.hub import Hub
+from manip_il.store.manifest import (
+    CHECKPOINTS,
+    JOURNALS,
+    LAST,
+    File,
+    Kind,
+    Manifest,
+    Plan,
+    datasets_in,
+    journals_of,
+    list_files,
+    newest,
+)
+from manip_il.store.objects import Objects
+
+FORMS = "hf://datasets/USER/NAME, hf://USER/NAME, s3://BUCKET/FOLDER, sftp://HOST/FOLDER, file://FOLDER"
+TRIES = 2  # to fetch a file with the right hash
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.*[^/].*)")
+_OF_A_RUN = ("config.yaml", "config.json", "eval.json", "checkpoints", "best")
+
+
+def open_remote(url: str, *, revision: str | None = None, private: bool = False, quiet: bool = False) -> Hub | Objects:
+    """Return the remote of a URL, without connecting yet. Raises `UsageError` for what is no such URL.
+
+    revision: a Hub's branch, tag or commit. private: of a repository that a push creates on a Hub.
+    """
+    found = _ADDRESS.fullmatch(url)
+    if not found:
+        raise UsageError(f"the remote is not a URL; expected {FORMS}")
+    if found[1] == "hf":
+        return Hub(found[2], revision, private=private, quiet=quiet)
+    if revision is not None:
+        raise UsageError(f"--revision={revision} is only for the Hub; other remotes hold one version")
+    return Objects(found[1], url, quiet=quiet)
+
+
+def push(source: Path, remote: Hub | Objects, *, journals: bool = False, dry_run: bool = False) -> Plan:
+    """Push a folder, or with `dry_run` nothing; return what is different there.
+
+    journals: include them. Raises `NotWhole` for a dataset in which the doctor finds errors, in a run too, `UsageError`
+    for a dataset in place of a policy or the other way round, and `RemoteError`.
+    """
+    kind = kind_of(source)
+    if remote.kind not in (None, kind):
+        right = "hf://datasets/USER/NAME" if kind == "dataset" else "hf://USER/NAME"
+        raise UsageError(f"{source} is a {kind}, {remote.name} is for a {remote.kind}; push it to {right}")
+    for dataset in datasets_in(source):
+        _refuse_damaged(dataset)
+    with tempfile.TemporaryDirectory(prefix="manip_il_card_") as folder:
+        local = list_files(source.absolute(), kind, journals=journals)
+        if isinstance(remote, Hub):  # elsewhere a pull gives the folder back as it was
+            local |= remote.additions(source, local, Path(folder))
+        plan = _compare(local, kind, remote)
+        if not dry_run:
+            remote.write(plan)
+    return plan
+
+
+def kind_of(root: Path) -> Kind:
+    """Return what a folder holds. Raises `UsageError` if it is neither a dataset nor a run."""
+    if (root / INFO).is_file():
+        return "dataset"
+    if any((root / name).exists() for name in _OF_A_RUN):
+        return "policy"
+    text = f"{root} is neither a LeRobot dataset ({INFO}) nor a run or policy ({', '.join(_OF_A_RUN)})"
+    raise UsageError(f"{text}; name the folder that holds one")
+
+
+def _refuse_damaged(dataset: Path) -> None:
+    first = next((finding for finding in examine_folder(dataset) if finding.severity is Severity.ERROR), None)
+    if first is not None:
+        text = f"{dataset} is damaged and was not pushed: {' '.join(str(first).split())}"
+        raise NotWhole(f"{text}; see all with manip-il doctor {dataset}, and repair it with --repair=true")
+
+
+def _compare(local: Mapping[str, Path], kind: Kind, remote: Hub | Objects) -> Plan:
+    """Return the plan of a push. Raises `UsageError` if something of another kind is there."""
+    before = remote.read()
+    if before and before.kind != kind:
+        raise UsageError(f"{remote.name} holds a {before.kind}, not a {kind}; choose another name")
+    with ThreadPoolExecutor() as pool:
+        manifest = Manifest(kind, dict(zip(local, pool.map(File.of, local.values()), strict=True)))
+    old = before.files if before else {}
+
+    def is_there(path: str) -> bool:
+        there = old.get(path)
+        return there is not None and (there == manifest.files[path] if there.sha256 else there.fits(local[path]))
+
+    upload = tuple(path for path in sorted(local) if not is_there(path))
+    return Plan(manifest, before, local, upload, tuple(sorted(old.keys() - local.keys())))
+
+
+def pull(remote: Hub | Objects, target: Path, *, overwrite: bool = False, dry_run: bool = False) -> Manifest:
+    """Fetch what readers of the remote see now into `target`, whole, or leave it as it is; return its manifest.
+
+    overwrite: replace what is there, in one step. Raises `FolderExistsError` if something is there and may not be
+    replaced, `ManipError` for a dataset that `check_arrived` refuses, and `RemoteError`.
+    """
+    manifest = remote.read()
+    if manifest is None or not manifest.files:
+        text = "check the address (of a dataset on the Hub: hf://datasets/USER/NAME), log in if it is private, or push"
+        raise RemoteError(f"{remote.name} holds nothing that can be pulled; {text} there first")
+    files = {path: file for path, file in manifest.files.items() if path not in manifest.copies}
+    if dry_run:
+        return replace(manifest, files=files)
+    beside, skip = journals_of(target), len(f"{JOURNALS}/")
+    journals = [path for path in files if manifest.kind == "dataset" and path.startswith(f"{JOURNALS}/")]
+    if beside.exists() and not overwrite and not all(files[path].fits(beside / path[skip:]) for path in journals):
+        raise FolderExistsError(beside)  # else what a killed pull has left
+    with atomic.new_folder(target, replace=overwrite) as partial:
+        _fetch(partial, remote, manifest, files)
+        for checkpoints in [path for path in partial.rglob(CHECKPOINTS) if path.is_dir()]:
+            if name := newest(checkpoints):
+                (checkpoints / LAST).symlink_to(name)
+        if journals:
+            with atomic.new_folder(beside, replace=True) as folder:
+                for path in list((partial / JOURNALS).iterdir()):
+                    path.rename(folder / path.name)
+            (partial / JOURNALS).rmdir()
+    return replace(manifest, files=files)
+
+
+def _fetch(folder: Path, remote: Hub | Objects, manifest: Manifest, files: Mapping[str, File]) -> None:
+    """Fill a folder with all files of a version, each verified and, of datasets, opened in a child process."""
+    wrong = list(files)
+    for _ in range(TRIES):
+        for path in wrong:
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).unlink(missing_ok=True)
+        remote.fetch(manifest, wrong, folder)
+        with ThreadPoolExecutor() as pool:
+            fits = pool.map(lambda path: files[path].fits(folder / path), wrong)
+            wrong = [path for path, is_right in zip(wrong, fits, strict=True) if not is_right]
+        if not wrong:
+            break
+    else:
+        text = f"{checks.shorten(wrong[0])} twice did not have the hash that it should have"
+        raise RemoteError(f"{remote.name}: {text}; nothing was kept; push to an empty folder, and pull from there")
+    for dataset in datasets_in(folder):
+        check_arrived(dataset)

@@ -1,0 +1,120 @@
+"""What comes from outside: verified, kept inside the folder, never run; and mistakes, in one line without secrets."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manip_il.cli.main import main
+from manip_il.errors import ManipError
+from manip_il.store.manifest import Manifest
+from manip_il.store.transfer import open_remote, pull, push
+
+from .conftest import DATASET, POLICY, SAMPLE, content, make_run
+from .hub_server import TOKEN, Hub
+from .sshd import Sshd
+
+DATA = b"payload"
+SHA = hashlib.sha256(DATA).hexdigest()
+
+
+def manifest_of(path: Any, size: Any = 7, sha256: Any = SHA, **more: Any) -> bytes:
+    files = [{"path": "config.json", "size": len(DATA), "sha256": SHA}, {"path": path, "size": size, "sha256": sha256}]
+    return json.dumps({"version": 1, "kind": "policy", "files": files, **more}).encode()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(manifest_of(path) for path in ("../x", "/tmp/x", "a/../../x", "a//x", "./x", "", "..\\x", "a\0b", None, 3)),
+        *(manifest_of(path) for path in (".git/hooks/x", "a/.bashrc", "x.pkl", "x.PT", "a/run.py", "a/x.so", "con\n")),
+        *(manifest_of("x", size) for size in (-1, 1.5, None, True, "7", 2**80)),
+        *(manifest_of("x", sha256=sha) for sha in ("", SHA[:-1], f"../{SHA}", None, SHA.upper())),
+        *(manifest_of("x", **more) for more in ({"version": 2}, {"kind": "code"}, {"files": {"a": 1}})),
+        *(b"", b"{", b"[]", b"[" * 100_000, b"\x80\x04K\x01.", b'{"version": NaN}'),
+    ],
+)
+def test_a_hostile_manifest_is_refused_and_nothing_is_written(text: bytes, tmp_path: Path):
+    (tmp_path / "store/objects" / SHA[:2]).mkdir(parents=True)
+    (tmp_path / "store/objects" / SHA[:2] / SHA).write_bytes(DATA)
+    (tmp_path / "store/manip_il_manifest.json").write_bytes(text)
+    before = content(tmp_path)
+    with pytest.raises(ManipError):
+        pull(open_remote(f"file://{tmp_path}/store", quiet=True), tmp_path / "inner" / "target")
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("change", [lambda data: data[:-1], lambda data: data + b"x", lambda data: b"x" + data[1:]])
+def test_bytes_that_differ_are_refused(change: Callable[[bytes], bytes], place: str, tmp_path: Path, monkeypatch):
+    push(make_run(tmp_path / "run"), open_remote(place, quiet=True))
+    remote = open_remote(place, quiet=True)
+    fetch = remote.fetch
+
+    def lie(manifest: Manifest, paths: list[str], folder: Path) -> None:
+        fetch(manifest, paths, folder)
+        (folder / "new.txt").write_bytes(change((folder / "new.txt").read_bytes()))
+
+    monkeypatch.setattr(remote, "fetch", lie)
+    with pytest.raises(ManipError, match=r"'new\.txt' twice did not have the hash"):
+        pull(remote, tmp_path / "got")
+    assert not list(tmp_path.glob("*got*"))
+    times = iter([lie, fetch])
+    monkeypatch.setattr(remote, "fetch", lambda *words: next(times)(*words))
+    pull(remote, tmp_path / "got")
+    assert content(tmp_path / "got") == content(tmp_path / "run")
+
+
+def test_a_hub_that_names_a_path_or_a_commit_outside_the_folder(hub: Hub, tmp_path: Path):
+    push(SAMPLE, open_remote(DATASET, quiet=True))
+    sha = hub.repos["datasets/user/demos"].heads["main"].encode()
+    for old, new in ((b"meta/info.json", b"../info.json"), (sha, b"../../../../outside"), (b'"size"', b'"sise"')):
+        hub.change = lambda line, body, old=old, new=new: body.replace(old, new) if "/api/" in line else body
+        with pytest.raises(ManipError):
+            pull(open_remote(DATASET, quiet=True), tmp_path / "inner" / "target")
+        assert not content(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("url", "code", "says"),
+    [
+        ("datasets/demos", 2, "the remote is not a URL; expected hf://"),
+        ("s4://bucket/x", 2, "unknown scheme 's4://' (did you mean 's3://'?)"),
+        ("gs://bucket/x", 2, "gs:// needs another package: Please install gcsfs"),
+        ("hf://demos", 2, "expected hf://datasets/USER/NAME"),
+        ("sftp://me:hunter2@host", 2, "expected sftp://[USER@]HOST[:PORT]/FOLDER"),
+        ("sftp://me:hun/hunter2@host/x", 2, "in a password write / as %2F"),
+        ("file:///no/such/store", 1, "holds nothing that can be pulled; check the address"),
+        ("s3://no-bucket/x", 1, "holds nothing that can be pulled"),
+        ("sftp://me:hunter2@127.0.0.1:1/x", 1, "cannot read sftp://me@127.0.0.1:1/x: [Errno None] Unable to connect"),
+        ("sftp://OTHER/x", 1, "not found in known_hosts; run `ssh HOST` once"),
+        ("sftp://CHANGED/x", 1, "Host key for server '127.0.0.1' does not match"),
+        (DATASET, 1, "holds nothing that can be pulled; check the address (of a dataset on the Hub: hf://datasets/"),
+    ],
+)
+def test_a_mistake_is_one_line(url, code, says, hub, bucket, sshd: Sshd, tmp_path, monkeypatch, capsys):
+    known = (sshd.home / ".ssh" / "known_hosts").read_text()
+    (tmp_path / ".ssh").mkdir()
+    (tmp_path / ".ssh" / "known_hosts").write_text(known[:-8] + "AAAAAAA\n")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    url = url.replace("OTHER", f"localhost:{sshd.port}").replace("CHANGED", f"127.0.0.1:{sshd.port}")
+    assert main(["pull", url, str(tmp_path / "got")]) == code
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert "hunter2" not in said
+
+
+def test_no_token_is_said(hub: Hub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
+    push(make_run(tmp_path / "run"), open_remote(POLICY, private=True, quiet=True))
+    for token, says in (("hf_HunterTwoHunterTwo", "hf auth login"), ("", "holds nothing that can be pulled")):
+        monkeypatch.setenv("HF_TOKEN", token)
+        assert main(["pull", POLICY, str(tmp_path / "got"), "--debug"]) == 1
+        said = capsys.readouterr().err
+        assert says in said
+        assert token not in said or not token
+        assert TOKEN not in said

@@ -1,0 +1,161 @@
+"""What is pulled is what was pushed; what has not changed does not travel; readers see one version or the other."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from manip_il.data.build import build
+from manip_il.data.journal import Journal
+from manip_il.data.schema import RobotTaskSpec
+from manip_il.doctor.finding import NotWhole
+from manip_il.errors import FolderExistsError
+from manip_il.mdp import Episode
+from manip_il.store.errors import RemoteError
+from manip_il.store.objects import Objects
+from manip_il.store.transfer import open_remote, pull, push
+
+from .conftest import DATASET, POLICY, SAMPLE, content, make_run
+from .hub_server import Hub
+
+open_quietly = partial(open_remote, quiet=True)
+
+
+def test_a_run_comes_back_as_it_was_and_only_changes_travel(place: str, tmp_path: Path):
+    run = make_run(tmp_path / "run")
+    (run / ".hidden").write_text("left here")
+    plan = push(run, open_quietly(place))
+    (run / ".hidden").unlink()
+    assert {*content(run)} - {"checkpoints/last"} <= {*plan.upload}
+    pull(open_quietly(place), tmp_path / "got")
+    assert content(tmp_path / "got") == content(run)
+    (run / "same.json").write_text("[1]")
+    (run / "more.json").write_text("[12]")
+    (run / "empty.txt").unlink()
+    plan = push(run, open_quietly(place))
+    assert (plan.upload, plan.remove) == (("more.json", "same.json"), ("empty.txt",))
+    plan = push(run, open_quietly(place), dry_run=True)
+    assert (plan.upload, plan.remove) == ((), ())
+    with pytest.raises(FolderExistsError):
+        pull(open_quietly(place), tmp_path / "got")
+    pull(open_quietly(place), tmp_path / "got", overwrite=True)
+    assert content(tmp_path / "got") == content(run)
+    assert not list(tmp_path.glob(".got*"))
+
+
+def test_a_reader_of_the_version_before_finishes_while_a_new_one_is_pushed(place: str, tmp_path: Path):
+    push(make_run(tmp_path / "a", 1), open_quietly(place))
+    reader = open_quietly(place)
+    old = reader.read()
+    push(make_run(tmp_path / "b", 2), open_quietly(place))
+    reader.read = lambda: old
+    pull(reader, tmp_path / "got")
+    assert content(tmp_path / "got") == content(tmp_path / "a")
+
+
+def test_of_two_pushes_one_wins_and_the_other_is_told(place: str, tmp_path: Path):
+    runs = [make_run(tmp_path / name, seed) for seed, name in enumerate("abc")]
+    push(runs[0], open_quietly(place))
+    late = open_quietly(place)
+    before = late.read()
+    push(runs[1], open_quietly(place))
+    late.read = lambda: before
+    with pytest.raises(RemoteError, match="push again"):
+        push(runs[2], late)
+    pull(open_quietly(place), tmp_path / "got")
+    assert content(tmp_path / "got") == content(runs[1])
+
+
+def test_s3_itself_refuses_a_manifest_that_replaces_another_than_was_read(bucket: str, tmp_path: Path, monkeypatch):
+    remote = Objects("s3", f"s3://{bucket}/a", quiet=True)
+    push(make_run(tmp_path / "run"), remote)
+    found = remote.read()
+    answers = iter([(b"", '"an older tag"'), remote._read()])
+    monkeypatch.setattr(remote, "_read", lambda: next(answers))
+    with pytest.raises(RemoteError, match="changed by another push"):
+        remote._switch(b"{}", replace(found, version='"an older tag"'))
+    monkeypatch.undo()
+
+
+def test_journals_go_along_when_asked_and_lie_beside_again(
+    tmp_path: Path, spec: RobotTaskSpec, make_episode: Callable[..., Episode]
+):
+    for seed in (1, 2):
+        Journal(tmp_path / "d.journals", spec, {}).write(make_episode(seed))
+    build(tmp_path / "d.journals", tmp_path / "d")
+    url = f"file://{tmp_path}/store"
+    for asked in (False, True):
+        push(tmp_path / "d", open_quietly(url), journals=asked)
+        pull(open_quietly(url), tmp_path / "got", overwrite=True)
+        assert content(tmp_path / "got") == content(tmp_path / "d")
+        assert (tmp_path / "got.journals").exists() == asked
+    assert content(tmp_path / "got.journals") == content(tmp_path / "d.journals")
+    shutil.rmtree(tmp_path / "got")  # as a kill between the two renames leaves it
+    pull(open_quietly(url), tmp_path / "got")
+
+
+def test_a_store_of_the_version_before_is_read_and_cleared(tmp_path: Path):
+    run, store = make_run(tmp_path / "run"), tmp_path / "store"
+    push(run, open_quietly(f"file://{store}"))
+    manifest = store / "manip_il_manifest.json"
+    unused = store / "objects" / "00" / ("00" * 32)
+    unused.parent.mkdir(exist_ok=True)
+    unused.write_bytes(b"of a push before")
+    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "replaced": [unused.name]}))
+    pull(open_quietly(f"file://{store}"), tmp_path / "got")
+    (run / "new.txt").write_text("other")
+    push(run, open_quietly(f"file://{store}"))
+    assert not unused.exists()
+
+
+def test_a_dataset_is_examined_before_its_push(tmp_path: Path):
+    broken = shutil.copytree(SAMPLE, tmp_path / "run" / "dataset")
+    (broken / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1")
+    (tmp_path / "run" / "config.yaml").write_text("")
+    for folder in (broken, broken.parent):
+        with pytest.raises(NotWhole, match=r"is damaged and was not pushed.*--repair=true"):
+            push(folder, open_quietly(f"file://{tmp_path}/store"))
+    assert not (tmp_path / "store").exists()
+
+
+def test_links_are_not_followed(tmp_path: Path):
+    run = make_run(tmp_path / "run")
+    (run / "secret.txt").symlink_to("/etc/passwd")
+    with pytest.raises(RemoteError, match=r"secret\.txt is a link"):
+        push(run, open_quietly(f"file://{tmp_path}/store"))
+
+
+def test_a_hub_shows_lerobot_a_dataset_by_its_tag_and_a_runs_policy_at_the_root(hub: Hub, tmp_path: Path):
+    push(SAMPLE, open_quietly(DATASET))
+    repo = hub.repos["datasets/user/demos"]
+    push(SAMPLE, open_quietly(f"{DATASET}@trial"))
+    assert repo.tags == {"v3.0": repo.heads["main"]}
+    broken = shutil.copytree(SAMPLE, tmp_path / "demos")
+    (broken / "notes.txt").write_text("more")
+    push(broken, open_quietly(DATASET))
+    assert repo.tags == {"v3.0": repo.heads["main"]}
+    pull(open_quietly(DATASET, revision="trial"), tmp_path / "trial")
+    assert not (tmp_path / "trial" / "notes.txt").exists()
+    run = make_run(tmp_path / "run")
+    push(run, open_quietly(POLICY, private=True))
+    repo = hub.repos["models/user/policy"]
+    assert repo.private
+    assert repo.files["config.json"] == repo.files["checkpoints/000004/pretrained_model/config.json"]
+
+
+def test_what_another_program_pushed_can_be_pulled_and_replaced(hub: Hub, tmp_path: Path):
+    push(SAMPLE, open_quietly(DATASET))
+    repo = hub.repos["datasets/user/demos"]
+    edited = repo.files["meta/info.json"].replace(b'"fps": 20', b'"fps": 21')  # of the same size
+    repo.commit("main", {**repo.commits[repo.heads["main"]], "meta/info.json": (edited, False)})
+    manifest = pull(open_quietly(DATASET), tmp_path / "edited", dry_run=True)
+    assert manifest.files["meta/info.json"].git_sha1
+    assert "meta/info.json" in push(SAMPLE, open_quietly(DATASET)).upload
+    pull(open_quietly(DATASET), tmp_path / "got")
+    assert {**content(tmp_path / "got"), **content(SAMPLE)} == content(tmp_path / "got")
