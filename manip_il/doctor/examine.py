@@ -1,73 +1,144 @@
-"""Examine a dataset by every check."""
+"""Examine a dataset by every check, and repair what its journals or its own data allow."""
 
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
 
 from manip_il import checks
+from manip_il.data.atomic import exclusive
+from manip_il.data.build import build
 from manip_il.data.dataset import Dataset
 from manip_il.data.gate import check_arrived
-from manip_il.data.lerobot_layout import INFO, STATS
-from manip_il.doctor import files, motion, pictures
-from manip_il.doctor.finding import ERROR, Finding, Severity, repair_it, restore
+from manip_il.data.info import NUMBERS
+from manip_il.data.lerobot_layout import DATA_FILES, EPISODE_INDEX, INFO, STATS, write_json
+from manip_il.data.statistics import column_statistics
+from manip_il.doctor import files, learning
+from manip_il.doctor.finding import Finding, Severity, by_journals, by_repair, journals_of
 from manip_il.errors import ManipError
 
 Check = Callable[[Dataset], Iterator[Finding]]
-CHECKS: tuple[Check, ...] = (*files.CHECKS, *pictures.CHECKS, *motion.CHECKS)
+CHECKS: tuple[Check, ...] = (*files.CHECKS, *learning.CHECKS)
 _FILE = re.compile(r"(?:meta|data|videos)/[\w.\-/]*\w")
 _ADVICE = re.compile(r"\W*(?:run|see)? ?`manip-il .*")  # of readers, to examine the dataset
+_PICTURES = 100  # of a camera, of which its statistics are
 
 
-def examine(root: Path, more: Sequence[Check] = ()) -> Iterator[Finding]:
-    """Yield every finding, each once; none for a dataset that is whole. Raises nothing, whatever the folder holds.
+def examine_folder(root: Path, more: Sequence[Check] = ()) -> list[Finding]:
+    """Return every finding about a folder, none for a dataset that is whole. Raises nothing, whatever it holds.
 
     Every file is opened in a child process first; if that needs too much memory or time, or the folder is no dataset,
     this is the only finding. more: checks beside those of this room.
     """
-    said: set[str] = set()
     try:
         check_arrived(root, strict=False)
         dataset = Dataset.open(root)
     except ManipError as problem:
-        yield _explain(root, problem)
-        return
+        return [_explain(root, problem)]
+    found = dict[Finding, None]()  # several checks may need the same file
     for check in (*CHECKS, *more):
         try:
             for finding in check(dataset):
-                if str(finding) not in said:
-                    yield finding
-                said.add(str(finding))
-        except Exception as problem:  # one check that fails must not hide the others
-            if str(finding := _explain(root, problem)) not in said:
-                yield finding
-            said.add(str(finding))
-
-
-def examine_folder(root: Path) -> list[Finding]:
-    """Return all findings about a folder."""
-    return list(examine(root))
+                found[finding] = None
+        except Exception as problem:  # what one check cannot read or finish must not hide the others
+            found[_explain(root, problem)] = None
+    return list(found)
 
 
 def has_errors(findings: Sequence[Finding]) -> bool:
     """Return whether one of the findings is an error."""
-    return any(finding.severity is ERROR for finding in findings)
-
-
-def verdict(root: Path, findings: Sequence[Finding]) -> str:
-    """Return one line: how many episodes and frames are whole, or how many errors and warnings there are."""
-    severities = [finding.severity for finding in findings]
-    counts = [f"{severities.count(kind)} {kind.value}(s)" for kind in Severity if kind in severities]
-    if not has_errors(findings):
-        info = Dataset.open(root).info
-        counts.insert(0, f"{info.episodes:,} episodes, {info.frames:,} frames: whole")
-    return f"{root}: {', '.join(counts)}"
+    return any(finding.severity is Severity.ERROR for finding in findings)
 
 
 def _explain(root: Path, problem: Exception) -> Finding:
-    """Return what cannot be read, or a check that could not be finished, as a finding."""
-    text = checks.one_line(problem) if isinstance(problem, ManipError) else f"check failed: {problem!r}"
+    text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
     text = _ADVICE.sub("", text).replace(f"{root}/", "").removeprefix(f"{root}: ")
+    text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
     place = found[0] if (found := _FILE.search(text)) else str(root)
-    return Finding(ERROR, place, text, (repair_it if place in (INFO, STATS) else restore)(root))
+    return Finding(place, text, (by_repair if place in (INFO, STATS) else by_journals)(root))
+
+
+def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
+    """Repair what can be repaired; yield one line for each thing that was done, or was not and why.
+
+    Nothing is deleted: what is replaced or moved is kept in `ROOT.before-repair`. Raises `ManipError` for what is
+    reached through links, and while another process is at work on it. Examine it anew afterwards.
+    """
+    kept = root.with_name(f"{root.name}.before-repair")
+    if kept.exists():
+        raise ManipError(f"{kept} is there already, from an earlier repair; move it elsewhere first")
+    if linked := [path for path in root.rglob("*") if not path.resolve().is_relative_to(root.resolve())]:
+        raise ManipError(f"{linked[0]} is a link to elsewhere, where nothing is changed; repair a copy of the dataset")
+    with exclusive(root):
+        if has_errors(findings) and journals_of(root).is_dir():
+            yield _rebuild(root, kept)
+        for path in files.leftovers(root):
+            kept.mkdir(exist_ok=True)
+            shutil.move(path, kept)
+            yield f"moved away: {path.name}"
+        try:
+            yield from _recount(root, kept)
+            if any(finding.place.startswith(STATS) for finding in findings):
+                yield _write(root / STATS, kept, _statistics(Dataset.open(root)))
+        except (ManipError, OSError, ValueError) as problem:
+            yield f"not repaired further: {checks.one_line(problem)}"
+        if kept.exists():
+            yield f"what was replaced or moved is kept in {kept}"
+
+
+def _rebuild(root: Path, kept: Path) -> str:
+    """Build the dataset from its journals, unless they hold less than it does."""
+    journals, fresh = journals_of(root), root.with_name(f"{root.name}.rebuilt")
+    try:
+        held = len(np.unique(Dataset.open(root).columns([EPISODE_INDEX])[EPISODE_INDEX]))
+    except ManipError:
+        held = 0  # nothing of it can be read
+    try:
+        result = build(journals, fresh, replace=True)
+    except ManipError as problem:
+        return f"not rebuilt: {problem}"
+    if result.info.episodes < held:
+        shutil.rmtree(fresh)
+        return f"not rebuilt: {journals.name} makes {result.info.episodes} episodes, and {held} are still readable"
+    root.rename(kept)
+    fresh.rename(root)
+    return "; left out: ".join([f"rebuilt from {journals.name}: {result.info.episodes} episodes", *result.damaged])
+
+
+def _recount(root: Path, kept: Path) -> Iterator[str]:
+    """Write counts of episodes, rows and tasks that are there, if info.json has others."""
+    dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
+    rows = sum(pq.read_metadata(path).num_rows for path in root.glob(DATA_FILES))
+    counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
+    if not about.items() >= counts.items():
+        yield _write(root / INFO, kept, {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}})
+
+
+def _statistics(dataset: Dataset) -> dict[str, Any]:
+    """Compute the statistics of every column of finite numbers, and from some pictures those of every camera."""
+    stats: dict[str, Any] = {}
+    for key, feature in dataset.features.items():
+        if feature.is_rgb:
+            rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
+            values, shape = dataset.frames(key, rows).reshape(-1, 3) / 255, (3, 1, 1)
+        elif feature.dtype in NUMBERS and np.isfinite(values := dataset.columns([key])[key]).all():
+            values, shape = values.reshape(-1, *feature.shape[-1:]), (-1,)
+        else:
+            continue
+        table = {**column_statistics({key: values})[key], "count": np.array([len(dataset)])}
+        stats[key] = {name: one.reshape(shape if one.size > 1 else -1).tolist() for name, one in table.items()}
+    return stats
+
+
+def _write(path: Path, kept: Path, content: dict[str, Any]) -> str:
+    if path.exists():
+        kept.mkdir(exist_ok=True)
+        shutil.copy2(path, kept)
+    write_json(path, content)
+    return f"computed from the data: meta/{path.name}"

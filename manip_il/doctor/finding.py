@@ -17,17 +17,14 @@ class Severity(Enum):
     WARNING = "warning"
 
 
-ERROR, WARNING = Severity.ERROR, Severity.WARNING
-
-
 @dataclass(frozen=True)
 class Finding:
     """One line of a report. place: a file in the dataset or beside it, or a column. remedy: what to do."""
 
-    severity: Severity
     place: str
     text: str
     remedy: str
+    severity: Severity = Severity.ERROR
 
     def __str__(self) -> str:
         line = f"{self.severity.value:7}  {self.place}: {self.text}; {self.remedy}"
@@ -39,25 +36,30 @@ class NotWhole(ManipError):
     """The examined dataset has errors; the message is the verdict."""
 
 
+def warning(place: str, text: str, remedy: str) -> Finding:
+    """Return a warning."""
+    return Finding(place, text, remedy, Severity.WARNING)
+
+
 def journals_of(root: Path) -> Path:
     """Return the folder of a dataset's journals, beside it; it may be missing."""
     return root.absolute().with_name(f"{root.absolute().name}.journals")
 
 
-def repair_it(root: Path) -> str:
+def by_repair(root: Path) -> str:
     """Return the remedy of what a dataset's own data correct."""
     return f"repair it: manip-il data repair {root}"
 
 
-def restore(root: Path) -> str:
-    """Return the remedy of what only journals give back, or the place that the dataset came from."""
-    return repair_it(root) if journals_of(root).is_dir() else "no journals are beside it: pull or record it again"
+def by_journals(root: Path) -> str:
+    """Return the remedy of what journals alone give back."""
+    return by_repair(root) if journals_of(root).is_dir() else "without journals beside it: pull or record it again"
 
 
-def delete(root: Path, episodes: Iterable[int]) -> str:
+def by_deletion(root: Path, episodes: Iterable[int]) -> str:
     """Return the remedy of what is wrong with some episodes for good."""
-    tool = f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root}"
     numbers = f'--operation.episode_indices="[{", ".join(map(str, episodes))}]"'
+    tool = f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root}"
     return f"record these again, or delete them: {tool} --operation.type=delete_episodes {numbers}"
 
 

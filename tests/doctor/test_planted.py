@@ -18,7 +18,6 @@ from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.doctor import examine
 from manip_il.doctor.examine import examine_folder
-from manip_il.doctor.pictures import picture_statistics
 
 from ..damage import DATA, EPISODES, cut, edit_json, edit_table
 from ..pictures import encoded
