@@ -59,9 +59,9 @@ def resumable() -> Generator[None]:
 class PushOptions:
     """Push a dataset, or a policy with its run, to the Hugging Face Hub, an S3 store, another machine or a folder.
 
-    A dataset is checked first, as by manip-il doctor, and refused if it has errors. Only changes are uploaded. Readers
-    see the old version until the new one is complete and verified. Interrupted transfers resume: run the same command
-    again. Of two concurrent pushes one succeeds, and the other says so.
+    A dataset is checked first, as by manip-il data check, and refused if it has errors. Only changes are uploaded.
+    Readers see the old version until the new one is complete and verified. Interrupted transfers resume: run the same
+    command again. Of two concurrent pushes one succeeds, and the other says so.
     """
 
     example: ClassVar[str] = "manip-il push datasets/demos hf://datasets/me/demos"
@@ -161,7 +161,7 @@ class PullOptions:
         kept = f", of which {bytes_text(pulled.kept)} had been transferred before" if pulled.kept else ""
         say(f"{url}: {size}; nothing was done" if self.dry_run else f"{self.target}: {size}, all verified{kept}")
         if not self.dry_run and manifest.kind == "dataset":
-            say(f"next: manip-il doctor {self.target}")
+            say(f"next: manip-il data check {self.target}")
 
     def _url(self) -> RemoteUrl:
         from manip_il.store.remote import RemoteUrl

@@ -60,7 +60,7 @@ def _explain(root: Path, problem: Exception) -> Finding:
     text = checks.one_line(problem) if isinstance(problem, ManipError) else f"a check failed: {problem!r}"
     text = _ADVICE.sub("", text).replace(f"{root}/", "").removeprefix(f"{root}: ")
     text = text.replace("Parquet magic bytes not found in footer", "it has no footer, as if its recorder had died")
-    place = found[0] if (found := _FILE.search(text)) else str(root)
+    place = found[-1] if (found := _FILE.findall(text)) else str(root)  # the last is a file in a folder
     return Finding(place, text, (by_repair if place in (INFO, STATS) else by_journals)(root))
 
 

@@ -70,14 +70,13 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
 def check_rows(dataset: Dataset) -> Iterator[Finding]:
     """Check that episodes count from 0 and follow each other, that the rows are theirs, at the rate's times."""
     table, tasks = dataset.episodes, dataset.tasks
-    ends, texts = np.cumsum(table.length), [text for texts in table.tasks for text in texts]
+    ends = np.cumsum(table.length)
     frame = np.concatenate([np.arange(length) for length in table.length])
     columns = {key: dataset.columns([key])[key].reshape(-1) for key in INDEX_FEATURES}
     for place, found, wanted in (
         ("meta/episodes: episode_index", table.index, np.arange(len(table))),
         ("meta/episodes: dataset_from_index", table.start, ends - table.length),
         ("meta/episodes: dataset_to_index", table.stop, ends),
-        ("meta/episodes: known tasks", np.isin(texts, [*tasks.values()]), np.ones(len(texts))),
         ("meta/tasks.parquet: task_index", np.sort([*tasks]), np.arange(len(tasks))),
         ("data: task_index", columns[layout.TASK_INDEX], columns[layout.TASK_INDEX].clip(0, len(tasks) - 1)),
         ("data: index", columns[layout.INDEX], np.arange(len(frame))),
@@ -87,6 +86,9 @@ def check_rows(dataset: Dataset) -> Iterator[Finding]:
     ):
         if text := _differ(found, wanted, _LATE + 1e-6 * np.abs(wanted)):
             yield Finding(place, text, by_journals(dataset.root))
+    if unknown := {text for texts in table.tasks for text in texts} - {*tasks.values()}:
+        text = f"names the task {list_first(map(repr, unknown))}, which {layout.TASKS} does not hold"
+        yield Finding("meta/episodes: tasks", text, by_journals(dataset.root))
 
 
 def _differ(found: NDArray[Any], wanted: NDArray[Any], tolerance: Any = 0) -> str:
@@ -113,11 +115,10 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
                 episodes = sorted({*np.searchsorted(ends, bad, side="right").tolist()})
                 remedy = by_journals(root) if journals_of(root).is_dir() else by_deletion(root, episodes)
                 yield Finding(f"data: {key}", f"no number in row {bad[0]:,} ({len(bad):,} such rows)", remedy)
-            elif stored is not None and not text:
+            elif stored is not None and not text and key not in INDEX_FEATURES:  # as LeRobot's tools leave those
                 text = _compare(stored[key], values, feature)
         if text:
-            say = warning if key in INDEX_FEATURES else Finding  # LeRobot's tools leave those as they were
-            yield say(f"{layout.STATS}: {key}", text, by_repair(root))
+            yield Finding(f"{layout.STATS}: {key}", text, by_repair(root))
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:

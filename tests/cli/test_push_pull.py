@@ -110,7 +110,7 @@ def test_a_hub_from_the_command_line(tmp_path, capsys):
         target = tmp_path / "got"
         assert said("pull", DATASET, target, "--revision=trial") == [
             f"{target}: a dataset of 8 files, 590 kB, all verified",
-            f"next: manip-il doctor {target}",
+            f"next: manip-il data check {target}",
         ]
         assert main(["pull", DATASET, str(tmp_path / "more"), "--revision=v9"]) == 1
         error = capsys.readouterr().err

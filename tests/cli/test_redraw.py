@@ -1,4 +1,4 @@
-"""`manip-il redraw`: a dataset to train from, the same after a kill, on two workers, and read by LeRobot."""
+"""`manip-il data redraw`: a dataset to train from, the same after a kill, on two workers, and read by LeRobot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def demos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def redrawn(demos, tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("redrawn") / "new"
-    assert main(["redraw", str(demos), str(root), *SMALL]) == 0
+    assert main(["data", "redraw", str(demos), str(root), *SMALL]) == 0
     return root
 
 
@@ -50,7 +50,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
         assert places.reshape(60, -1, 3)[:, :2, 2].any()
     assert Dataset.open(redrawn).columns(["label_valid"])["label_valid"].all()
     assert not redrawn.with_name("new.journals").exists()
-    assert main(["doctor", str(redrawn)]) == 0
+    assert main(["data", "check", str(redrawn)]) == 0
     dataset: Any = LeRobotDataset("local/new", root=redrawn)
     assert dataset[7]["observation.images.side"].shape == (3, 32, 32)
     inputs = dataset_to_policy_features(dataset.meta.features)
@@ -61,7 +61,7 @@ def test_it_is_a_plain_dataset_of_single_frames(redrawn, demos, capsys):
 @pytest.mark.slow
 def test_two_workers_and_a_resumed_redraw_write_the_same_bytes(redrawn, demos, tmp_path, monkeypatch):
     two = tmp_path / "new"
-    assert main(["redraw", str(demos), str(two), *SMALL[:3], "--workers=2", "--quiet"]) == 0
+    assert main(["data", "redraw", str(demos), str(two), *SMALL[:3], "--workers=2", "--quiet"]) == 0
     assert digests(two) == digests(redrawn)
     shutil.rmtree(two)
     killed: list[int] = []
@@ -74,11 +74,11 @@ def test_two_workers_and_a_resumed_redraw_write_the_same_bytes(redrawn, demos, t
 
     with monkeypatch.context() as patch:
         patch.setattr("manip_il.data.journal.write_file", kill)
-        assert main(["redraw", str(demos), str(two), *SMALL]) != 0
+        assert main(["data", "redraw", str(demos), str(two), *SMALL]) != 0
     kept = tmp_path / "new.journals"
     assert not two.exists()
     assert len(list(kept.glob("*.mcap"))) == 2
-    assert main(["redraw", str(demos), str(two), *SMALL, "--resume=true"]) == 0
+    assert main(["data", "redraw", str(demos), str(two), *SMALL, "--resume=true"]) == 0
     assert digests(two) == digests(redrawn)
 
 
@@ -87,7 +87,7 @@ def test_two_workers_and_a_resumed_redraw_write_the_same_bytes(redrawn, demos, t
 def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
     target = tmp_path / "branches"
     words = ["--frames=6", "--branch_steps=4", *SMALL[1:]]
-    assert main(["redraw", str(demos), str(target), *words]) == 0
+    assert main(["data", "redraw", str(demos), str(target), *words]) == 0
     assert (Dataset.open(target).summary.episodes, Dataset.open(target).summary.frames) == (6, 24)
     table = Dataset.open(target).columns(["action", "executed_action"])
     np.testing.assert_array_equal(table["action"], table["executed_action"])
@@ -103,7 +103,7 @@ def test_branches_are_episodes_for_policies_that_plan(demos, tmp_path):
 )
 def test_wrong_words_are_one_line_and_nothing_is_written(demos, words, message, tmp_path, capsys):
     before = files(tmp_path)
-    assert main(["redraw", str(demos), str(tmp_path / "new"), *words]) in (1, 2)
+    assert main(["data", "redraw", str(demos), str(tmp_path / "new"), *words]) in (1, 2)
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
@@ -118,7 +118,7 @@ def test_a_dataset_of_another_scene_is_refused(lacks, demos, tmp_path, capsys):
     about = json.loads(ours.read_text())
     about["spec"]["sim_state_size" if lacks == "sim_state" else "task"] = 7 if lacks == "sim_state" else "sculpt"
     ours.write_text(json.dumps(about))
-    assert main(["redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
+    assert main(["data", "redraw", str(other), str(tmp_path / "new"), *SMALL]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 

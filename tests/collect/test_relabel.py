@@ -133,7 +133,7 @@ def test_videos_are_copied_and_lerobot_reads_all(tmp_path):
     assert content(tmp_path / "again") == content(whole)
     dataset: Any = LeRobotDataset("local/new", root=tmp_path / "again")
     np.testing.assert_array_equal(dataset[5][schema.ACTION], episodes[0].columns[schema.ACTION][5])
-    assert main(["doctor", str(tmp_path / "again")]) == 0
+    assert main(["data", "check", str(tmp_path / "again")]) == 0
 
 
 def test_columns_of_another_length_are_refused_and_nothing_is_left(tmp_path):
@@ -148,14 +148,14 @@ def test_columns_of_another_length_are_refused_and_nothing_is_left(tmp_path):
 def test_the_command_says_what_changed_and_what_comes_next(tmp_path, capsys):
     env = EnvConfig("fetch", "reach")
     root = write([without_labels(one) for one in recorded(env, 1)], tmp_path / "demos", env)
-    assert main(["relabel", str(root), "--workers=1", "--quiet"]) == 0
+    assert main(["data", "relabel", str(root), "--workers=1", "--quiet"]) == 0
     out = capsys.readouterr().out
     assert "states have a sound label now" in out
     assert f"dataset: {tmp_path / 'demos_relabelled'}" in out
-    assert main(["relabel", str(root), "--workers=1", "--quiet"]) == 2  # it is there already
-    assert main(["relabel", str(root), str(root), "--quiet"]) == 2
+    assert main(["data", "relabel", str(root), "--workers=1", "--quiet"]) == 2  # it is there already
+    assert main(["data", "relabel", str(root), str(root), "--quiet"]) == 2
     assert "overlaps" in capsys.readouterr().err
-    assert main(["relabel", str(tmp_path), "--quiet"]) == 2
-    again = ["relabel", str(tmp_path / "demos_relabelled"), str(tmp_path / "twice"), "--workers=1", "--quiet"]
+    assert main(["data", "relabel", str(tmp_path), "--quiet"]) == 2
+    again = ["data", "relabel", str(tmp_path / "demos_relabelled"), str(tmp_path / "twice"), "--workers=1", "--quiet"]
     assert main(again) == 0
     assert "all labels are as they were" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, without false alarms."""
+"""Fifteen kinds of defects, planted into twenty datasets of this program and of LeRobot: found, and nothing else."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def rows(root: Path, rng: np.random.Generator) -> tuple[str, str]:
 
 def names(root: Path, rng: np.random.Generator) -> tuple[str, str]:
     key = next(iter(Dataset.open(root).cameras), s.ACTION)
-    wrong = [None, ["width", "height", "channels"], ["channels", "height", "width"]] if key != s.ACTION else [["a", "b"]]
+    wrong = (
+        [None, ["width", "height", "channels"], ["channels", "height", "width"]] if key != s.ACTION else [["a", "b"]]
+    )
     edit_json(root / layout.INFO, lambda info: info["features"][key].update(names=wrong[rng.integers(len(wrong))]))
     return layout.INFO, "names"
 
@@ -116,7 +118,7 @@ def died(root: Path, rng: np.random.Generator) -> tuple[str, str]:
     if rng.random() < 0.5:
         name = str(rng.choice([DATA, EPISODES]))
         cut(root / name, float(rng.uniform(0.3, 0.95)))
-        return name, "died"
+        return name, "recorder had died" if name == DATA else "no footer"
     left = str(rng.choice(["images/front/episode-000003/frame-000000.png", "tmpab12cd_9/x.mp4", "meta/.x.partial"]))
     (root / left).parent.mkdir(parents=True, exist_ok=True)
     (root / left).write_bytes(b"x")
@@ -128,7 +130,7 @@ def tasks(root: Path, rng: np.random.Generator) -> tuple[str, str]:
         store(root, {layout.TASK_INDEX: np.full(len(Dataset.open(root)), 3)})
         return "task_index", "3"
     edit_table(root / EPISODES, lambda table: table["tasks"].__setitem__(0, ["Drop it"]))
-    return "tasks", "row 0"
+    return "tasks", "Drop it"
 
 
 def own(root: Path, rng: np.random.Generator) -> tuple[str, str] | None:
@@ -201,7 +203,12 @@ def joint(root: Path, rng: np.random.Generator) -> tuple[str, str]:
 def commands(root: Path, rng: np.random.Generator) -> tuple[str, str]:
     """A gripper that does not follow, actions cut off, or one text for two motions."""
     what = str(rng.choice(["never reached", "cut off", "another way"]))
-    half, stuck, place, limit = set(some(rng, 3)), rng.random() < 0.5, int(rng.integers(4)), float(rng.uniform(0.6, 0.8))
+    half, stuck, place, limit = (
+        set(some(rng, 3)),
+        rng.random() < 0.5,
+        int(rng.integers(4)),
+        float(rng.uniform(0.6, 0.8)),
+    )
 
     def change(state: np.ndarray, action: np.ndarray, episode: int) -> None:
         if what == "never reached":

@@ -30,7 +30,7 @@ def journals(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_no_cut_loses_another_episode_or_stops_the_doctor(journals, tmp_path):
+def test_no_cut_loses_another_episode(journals, tmp_path):
     build(journals, tmp_path / "whole")
     rng = np.random.default_rng(0)
     for number in range(CUTS):
@@ -43,9 +43,6 @@ def test_no_cut_loses_another_episode_or_stops_the_doctor(journals, tmp_path):
         assert np.unique(Dataset.open(root).columns(["seed"])["seed"]).tolist() == others
         assert len(result.damaged) == 1
         assert cut.name in result.damaged[0]
-        assert any(cut.name in finding.place + finding.text for finding in examine_folder(root))
-        shutil.rmtree(root)
-        shutil.copytree(tmp_path / "whole", root)  # the dataset from before the damage holds what the journal lost
-        assert any(cut.name in finding.place + finding.text for finding in examine_folder(root))
+        assert examine_folder(root) == []
         shutil.rmtree(root)
         shutil.rmtree(folder)
