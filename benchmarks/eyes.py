@@ -1,6 +1,6 @@
 """What a `cnn` sees in scenes that it has not learnt from: errors of what it reads off, and its heat maps as a picture.
 
-Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset that `manip-il data redraw` made with
+Usage: python benchmarks/eyes.py PRETRAINED_MODEL DATASET [PICTURE.png], of a dataset of `manip-il data redraw` with
 a seed of its own. The picture needs a policy that has learnt heat maps (`--policy.heatmap_weight`).
 """
 

@@ -84,7 +84,7 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
             yield f"moved away: {path.name}"
         try:
             yield from _recount(root, kept)
-            if any(finding.place.startswith(STATS) for finding in findings):
+            if any(finding.place.startswith(STATS) for finding in examine_folder(root)):
                 yield _write(root / STATS, kept, _statistics(Dataset.open(root)))
         except (ManipError, OSError, ValueError) as problem:
             yield f"not repaired further: {checks.one_line(problem)}"

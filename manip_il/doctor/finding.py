@@ -59,8 +59,8 @@ def by_journals(root: Path) -> str:
 def by_deletion(root: Path, episodes: Iterable[int]) -> str:
     """Return the remedy of what is wrong with some episodes for good."""
     numbers = f'--operation.episode_indices="[{", ".join(map(str, episodes))}]"'
-    tool = f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root}"
-    return f"record these again, or delete them: {tool} --operation.type=delete_episodes {numbers}"
+    tool = f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root} --new_root={root}_kept"
+    return f"record these again, or leave them out: {tool} --operation.type=delete_episodes {numbers}"
 
 
 def list_first(values: Iterable[object]) -> str:

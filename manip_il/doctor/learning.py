@@ -21,31 +21,31 @@ from manip_il.doctor.finding import Finding, by_deletion, by_journals, list_firs
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor
 
-F64 = NDArray[np.float64]
+F64, Mask = NDArray[np.float64], NDArray[np.bool_]
 _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
 _STILL, _IDLE = 0.01, 0.1  # of every joint's range, within a second; of all frames
 _LEAD = 0.4  # by which actions may be ahead of the joints that follow them [s]
 _CLIPPED = 0.05  # of all frames
 _LEAST = 5  # episodes that are compared with each other
-_AGAIN = "correct what recorded it, and record again"
 _EPISODES, _PICTURES, _SIDE = 100, 6, 16  # that are decoded, of each; height and width of a thumbnail
 _SAME, _DARK = 1.5, 10.0  # levels, of 255: change of the most changed part of a thumbnail; mean of a picture
-Rows = dict[int, slice]  # of episodes, by their numbers
+_AGAIN = "correct what recorded it, and record again"
 
 
 @dataclass(frozen=True)
-class Joint:
-    """One that both action and state have: what it is told, and where it is, (T,)."""
+class Motion:
+    """What the joints that action and state share are told, and where they are, (T, n). rows: of every episode."""
 
-    name: str
+    dataset: Dataset
+    rows: dict[int, slice]
+    names: list[str]
     told: F64
     found: F64
-    is_gripper: bool
+    gripper: Mask  # (n,)
 
-    def correlate(self, rows: slice = slice(None)) -> float:
-        """Return the correlation of both in these rows; 0 if one does not move."""
-        told, found = self.told[rows] - self.told[rows].mean(), self.found[rows] - self.found[rows].mean()
-        return float(told @ found / max(np.linalg.norm(told) * np.linalg.norm(found), 1e-9))
+    def episodes(self, which: Mask) -> list[int]:
+        """Return numbers of episodes, of a mask (E,)."""
+        return [episode for episode, chosen in zip(self.rows, which, strict=True) if chosen]
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
@@ -58,58 +58,51 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
     learner, table = columns.get(s.ACTOR, np.zeros(len(state))).reshape(-1) == Actor.LEARNER, dataset.episodes
     spans = zip(table.index.tolist(), map(slice, table.start, table.stop), strict=True)
     rows = {episode: one for episode, one in spans if len(state[one]) > 1 and not learner[one].any()}
+    if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():  # named by another check
+        return
     left, right = dataset.features[s.ACTION].labels, dataset.features[s.STATE].labels
-    pairs = [(left.index(name), right.index(name)) for name in left if name in right]
-    if not pairs and len(left) == len(right):
-        pairs = [(place, place) for place in range(len(left))]
-    grippers = [place for place, _ in pairs if _GRIPPER.search(left[place])] or [place for place, _ in pairs[-1:]]
-    joints = [Joint(left[i], action[:, i], state[:, j], i in grippers) for i, j in pairs]
-    if rows and np.isfinite(state).all() and np.isfinite(action).all():  # else named by another check
-        yield from _check_idle(dataset, np.hstack([state, action]), rows)
-        yield from _check_lag(dataset, joints, rows)
-        yield from _check_joints(dataset, joints, rows)
-        yield from _check_commands(joints, rows)
-        yield from _check_texts(dataset, state, rows)
+    if len(left) == len(right) and not {*left} & {*right}:
+        right = left
+    names = [name for name in left if name in right]
+    gripper = np.array([bool(_GRIPPER.search(name)) for name in names], bool)
+    gripper = gripper if gripper.any() else np.arange(len(names)) == len(names) - 1
+    told, found = action[:, [left.index(name) for name in names]], state[:, [right.index(name) for name in names]]
+    motion = Motion(dataset, rows, names, told, found, gripper)
+    yield from _check_idle(motion, np.hstack([state, action]))
+    yield from _check_lag(motion)
+    yield from _check_joints(motion)
+    yield from _check_commands(motion)
+    yield from _check_texts(motion, state)
 
 
-def _check_idle(dataset: Dataset, both: F64, rows: Rows) -> Iterator[Finding]:
+def _check_idle(motion: Motion, both: F64) -> Iterator[Finding]:
     """Seconds in which neither actions nor joints move; to rest at the end is no fault."""
     both = both / np.where(np.ptp(both, axis=0) > 1e-9, np.ptp(both, axis=0), np.inf)
-    second, idle = max(2, round(dataset.fps)), dict[int, int]()
-    for episode, span in rows.items():
-        starts = range(span.start, span.stop - second + 1, second)
+    second, idle = max(2, round(motion.dataset.fps)), list[int]()
+    for rows in motion.rows.values():
+        starts = range(rows.start, rows.stop - second + 1, second)
         moving = [np.ptp(both[start : start + second], axis=0).max() > _STILL for start in starts]
-        idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
-    if (share := sum(idle.values()) * second / len(both)) > _IDLE:
-        worst = sorted((episode for episode in idle if idle[episode]), key=lambda episode: -idle[episode])
-        text = f"nothing moves for seconds, in {share:.0%} of the frames, most in episodes {list_first(worst)}"
-        remedy = by_deletion(dataset.root, sorted(worst))
+        idle.append(max(np.flatnonzero(moving), default=-1) + 1 - sum(moving))
+    if (share := sum(idle) * second / len(both)) > _IDLE:
+        odd = motion.episodes(np.array(idle) > 0)
+        text = f"nothing moves for seconds, in {share:.0%} of the frames (episodes {list_first(odd)})"
+        remedy = by_deletion(motion.dataset.root, odd)
         yield warning(s.ACTION, f"{text}: a policy learns to stand still there", remedy)
 
 
-def _check_lag(dataset: Dataset, joints: list[Joint], rows: Rows) -> Iterator[Finding]:
+def _check_lag(motion: Motion) -> Iterator[Finding]:
     """Actions that come after the motion that they should cause, or long before it, by cross-correlation."""
-    lengths = [span.stop - span.start for span in rows.values()]
-    reach = min(round(dataset.fps / 2) + 1, int(np.median(lengths)) // 4)
-    long = [span for span, length in zip(rows.values(), lengths, strict=True) if length >= 4 * reach]
-
-    def inner(values: F64, lead: int) -> F64:
-        """Return numbers `lead` frames earlier, without the ends of episodes, of mean 0 and norm 1."""
-        pieces = [values[span.start + reach - lead : span.stop - reach - lead] for span in long]
-        joined = np.concatenate([piece - piece.mean() for piece in pieces])
-        return joined / max(np.linalg.norm(joined), 1e-9)
-
-    leads, curves = list(range(-reach, reach + 1)), list[F64]()
-    for joint in joints:
-        moved = inner(joint.found, 0)
-        curve = np.array([inner(joint.told, lead) @ moved for lead in leads])
-        if not joint.is_gripper and curve.max() > 0.9:  # other actions are no targets
-            curves.append(curve)
-    if reach < 2 or len(curves) < max(2, len(joints) / 2):
+    fps, spans = motion.dataset.fps, motion.rows.values()
+    reach = min(round(fps / 2) + 1, int(np.median([rows.stop - rows.start for rows in spans])) // 4)
+    inner = np.concatenate([np.arange(rows.start + reach, rows.stop - reach) for rows in spans])
+    leads = range(-reach, reach + 1)
+    curves = np.array([_correlate(motion.told[inner - lead], motion.found[inner]) for lead in leads])
+    curves = curves[:, (curves.max(axis=0) > 0.9) & ~motion.gripper]  # the others' actions are no targets
+    if reach < 2 or curves.shape[1] < max(2, len(motion.names) / 2):
         return
-    curve = np.mean(curves, axis=0)
+    curve = curves.mean(axis=1)
     best = leads[int(curve.argmax())]
-    fine = min(max(best, 1), max(2, round(_LEAD * dataset.fps)))
+    fine = min(max(best, 1), max(2, round(_LEAD * fps)))
     if fine != best and 1 - curve[fine + reach] > 1.3 * (1 - curve.max()) + 1e-6:
         how = f"lead the joints by {best}" if best > 0 else f"lag the joints by {-best}"
         figures = f"correlation {curve.max():.4f}; {curve[fine + reach]:.4f} at a lead of {fine}"
@@ -117,24 +110,30 @@ def _check_lag(dataset: Dataset, joints: list[Joint], rows: Rows) -> Iterator[Fi
         yield warning(s.ACTION, f"actions {how} frames ({figures})", remedy)
 
 
-def _check_joints(dataset: Dataset, joints: list[Joint], rows: Rows) -> Iterator[Finding]:
+def _correlate(left: F64, right: F64) -> F64:
+    """Return the correlations (n,) of columns (T, n); 0 if one does not move."""
+    left, right = left - left.mean(axis=0), right - right.mean(axis=0)
+    return (left * right).sum(axis=0) / np.maximum(np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0), 1e-9)
+
+
+def _check_joints(motion: Motion) -> Iterator[Finding]:
     """A joint whose zero or sign differs between episodes: by where it starts, and by how it follows its action."""
-    for joint in joints if len(rows) >= _LEAST else ():
-        spread = np.ptp(joint.found)
-        starts = np.array([joint.found[span.start] for span in rows.values()])
-        agree = np.array([joint.correlate(span) for span in rows.values()])
-        for what, values, odd in (
-            ("starts at", starts, _find_apart(starts, 5, 0.1 * spread)),
-            ("correlates with its action by", agree, (agree < -0.8) & bool(np.median(agree) > 0.8)),
-        ):
-            if odd.any() and not joint.is_gripper:
-                episodes = np.array(list(rows))[odd]
-                figures = f"{values[odd].mean():.3g} in episodes {list_first(episodes)}, else {values[~odd].mean():.3g}"
-                text = f"{joint.name} {what} {figures}: its zero or sign differs"
-                yield warning(s.STATE, text, by_deletion(dataset.root, episodes))
+    if len(motion.rows) < _LEAST:
+        return
+    starts = np.array([motion.found[rows.start] for rows in motion.rows.values()])
+    agree = np.array([_correlate(motion.told[rows], motion.found[rows]) for rows in motion.rows.values()])
+    for place in np.flatnonzero(~motion.gripper):
+        apart = _find_apart(starts[:, place], 5, 0.1 * np.ptp(motion.found[:, place]))
+        against = (agree[:, place] < -0.8) & bool(np.median(agree[:, place]) > 0.8)
+        for what, values, odd in (("starts at", starts, apart), ("correlates with its action by", agree, against)):
+            if odd.any():
+                here, there = values[odd, place].mean(), values[~odd, place].mean()
+                text = f"{what} {here:.3g} in episodes {list_first(motion.episodes(odd))}, else {there:.3g}"
+                remedy = by_deletion(motion.dataset.root, motion.episodes(odd))
+                yield warning(s.STATE, f"{motion.names[place]} {text}: its zero or sign differs", remedy)
 
 
-def _find_apart(values: F64, times: float, least: float = 1e-9) -> NDArray[np.bool_]:
+def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
     """Return which of the numbers (E,) stand apart from most, by a gap of `least` and `times` what those differ by."""
     ranked = np.sort(values)
     cut = int(np.argmax(np.diff(ranked)))
@@ -143,46 +142,49 @@ def _find_apart(values: F64, times: float, least: float = 1e-9) -> NDArray[np.bo
     return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(times * extent, least))
 
 
-def _check_commands(joints: list[Joint], rows: Rows) -> Iterator[Finding]:
+def _check_commands(motion: Motion) -> Iterator[Finding]:
     """Commands, of the gripper as a rule, that are never reached; others that are cut off at a limit.
 
     Units of both are the same, or a joint follows by a small share. At rest at an episode's end nothing is cut off.
     """
-    for joint in joints:
-        (low, high), (below, above) = (np.quantile(one, [0.01, 0.99]) for one in (joint.told, joint.found))
+    for name, told, found, gripper in zip(motion.names, motion.told.T, motion.found.T, motion.gripper, strict=True):
+        (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
         share = (above - below) / max(high - low, 1e-9)
-        stuck = share < 0.05 and abs(joint.correlate()) < 0.5
+        stuck = share < 0.05 and abs(_correlate(told, found)) < 0.5
         inside = 0.05 <= share < 0.5 and min(below - low, high - above) > 0.1 * (high - low)
         if high - low > 1e-6 and (stuck or inside):
-            text = f"{joint.name} is told {low:.3g} to {high:.3g}, and is {below:.3g} to {above:.3g}"
-            yield warning(s.ACTION, f"{text}: commands never reached", f"calibrate or free that joint: {_AGAIN}")
-        for limit in {joint.told.min(), joint.told.max()} if len(np.unique(joint.told)) > 50 else ():
-            at = [joint.told[span] == limit for span in rows.values()]
-            share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(joint.told)
-            if share > _CLIPPED and not joint.is_gripper:
-                text = f"{joint.name} is cut off at {limit:.6g} in {share:.0%} of the frames"
+            text = f"{name} is told {low:.3g} to {high:.3g}, and is {below:.3g} to {above:.3g}: commands never reached"
+            yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
+        for limit in {told.min(), told.max()} if len(np.unique(told)) > 50 and not gripper else ():
+            at = [told[rows] == limit for rows in motion.rows.values()]
+            share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(told)
+            if share > _CLIPPED:
+                text = f"{name} is cut off at {limit:.6g} in {share:.0%} of the frames"
                 yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
 
 
-def _check_texts(dataset: Dataset, state: F64, rows: Rows) -> Iterator[Finding]:
+def _check_texts(motion: Motion, state: F64) -> Iterator[Finding]:
     """Two different motions, with nothing between, that neither text nor first observation tells apart."""
-    points = np.array([np.linspace(span.start, span.stop - 1, 12).astype(int) for span in rows.values()])
+    dataset, spans = motion.dataset, motion.rows.values()
+    points = np.array([np.linspace(rows.start, rows.stop - 1, 12).astype(int) for rows in spans])
     paths = (state / np.maximum(state.std(axis=0), 1e-9))[points].reshape(len(points), -1)
     seen = [one.key for one in dataset.info.of_dtype(*NUMBERS) if one.key.startswith("observation.")]
     firsts = np.hstack([dataset.columns([key])[key][points[:, 0]].reshape(len(points), -1) for key in seen])
-    texts = dict(zip(dataset.episodes.index.tolist(), map(tuple, dataset.episodes.tasks), strict=True))
-    for text in set(texts.values()):
-        same = np.array([place for place, episode in enumerate(rows) if texts[episode] == text])
+    known = dict(zip(dataset.episodes.index.tolist(), map(tuple, dataset.episodes.tasks), strict=True))
+    texts = [" ".join(known[episode]) for episode in motion.rows]
+    for text in {*texts}:
+        same = np.flatnonzero([one == text for one in texts])
+        centred = paths[same] - paths[same].mean(axis=0)
         if len(same) < 2 * _LEAST:
             continue
-        centred = paths[same] - paths[same].mean(axis=0)
-        odd = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
-        here, there = firsts[same[odd]], firsts[same[~odd]]
-        if 5 * odd.sum() >= len(odd) and not ((here.max(0) < there.min(0)) | (there.max(0) < here.min(0))).any():
-            what = f"{odd.sum()} of {len(odd)} episodes ({list_first(np.array(list(rows))[same[odd]])})"
-            said = f"{what} move in another way than the rest, for one text {' '.join(text)[:60]!r}"
-            remedy = "give them a text of their own: lerobot-edit-dataset --operation.type=modify_tasks --help"
-            yield warning("task", said, remedy)
+        odd = np.zeros(len(paths), bool)
+        odd[same] = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
+        here, there = firsts[odd], firsts[np.setdiff1d(same, np.flatnonzero(odd))]
+        if 5 * odd.sum() < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
+            continue  # few, or the first observation tells which
+        what = f"{odd.sum()} of {len(same)} episodes ({list_first(motion.episodes(odd))})"
+        remedy = "give them a text of their own: lerobot-edit-dataset --operation.type=modify_tasks --help"
+        yield warning("task", f"{what} move in another way than the rest, for one text {text[:60]!r}", remedy)
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
@@ -220,7 +222,7 @@ def _thumbnails(pictures: NDArray[np.uint8]) -> F64:
     return np.stack([np.asarray(one, dtype=np.float64) for one in small])
 
 
-def _find_swapped(left: F64, right: F64) -> NDArray[np.bool_]:
+def _find_swapped(left: F64, right: F64) -> Mask:
     """Return the episodes, (E,), in which two cameras look like each other in the other episodes."""
     pictures = np.stack([left.mean(axis=1), right.mean(axis=1)])
     typical = np.median(pictures, axis=1, keepdims=True)
