@@ -124,9 +124,9 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:
     """Return how statistics differ from a column's, (N, n); a matrix has them over its last axis."""
     flat = values if stored["mean"].size == values.shape[1] else values.reshape(-1, feature.shape[-1])
-    scale = np.abs(flat).max(axis=0)
     for name, share in _TOLERANCES.items():
-        if text := _differ(stored[name].reshape(-1), getattr(np, name)(flat, axis=0), share * scale + 1e-9):
+        tolerance = share * np.abs(flat).max(axis=0) + 1e-9
+        if text := _differ(stored[name].reshape(-1), getattr(np, name)(flat, axis=0), tolerance):
             return f"{name} is {text}"
     return "" if stored["count"][0] == len(values) else f"count is {stored['count'][0]}; expected {len(values)}"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 
 from manip_il.errors import ManipError
@@ -32,13 +33,11 @@ class Finding:
         return "".join(character if character.isprintable() else " " for character in line)
 
 
+warning = partial(Finding, severity=Severity.WARNING)
+
+
 class NotWhole(ManipError):
     """The examined dataset has errors; the message is the verdict."""
-
-
-def warning(place: str, text: str, remedy: str) -> Finding:
-    """Return a warning."""
-    return Finding(place, text, remedy, Severity.WARNING)
 
 
 def journals_of(root: Path) -> Path:
