@@ -83,9 +83,13 @@ def repair(root: Path, findings: Sequence[Finding]) -> Iterator[str]:
             shutil.move(path, kept)
             yield f"moved away: {path.name}"
         try:
-            yield from _recount(root, kept)
-            if any(finding.place.startswith(STATS) for finding in examine_folder(root)):
-                yield _write(root / STATS, kept, _statistics(Dataset.open(root)))
+            for name, compute in ((INFO, _recount), (STATS, _recompute)):
+                if content := compute(root):
+                    kept.mkdir(exist_ok=True)
+                    for path in root.glob(name):
+                        shutil.copy2(path, kept)
+                    write_json(root / name, content)
+                    yield f"computed from the data: {name}"
         except (ManipError, OSError, ValueError) as problem:
             yield f"not repaired further: {checks.one_line(problem)}"
         if kept.exists():
@@ -111,18 +115,20 @@ def _rebuild(root: Path, kept: Path) -> str:
     return "; left out: ".join([f"rebuilt from {journals.name}: {result.info.episodes} episodes", *result.damaged])
 
 
-def _recount(root: Path, kept: Path) -> Iterator[str]:
-    """Write counts of episodes, rows and tasks that are there, if info.json has others."""
+def _recount(root: Path) -> dict[str, Any]:
+    """Return info.json with the counts of episodes, rows and tasks that are there; empty if it has them."""
     dataset, about = Dataset.open(root), checks.read_json(root / INFO, "a dataset's description")
     rows = sum(pq.read_metadata(path).num_rows for path in root.glob(DATA_FILES))
     counts = {"total_episodes": len(dataset.episodes), "total_frames": rows, "total_tasks": len(dataset.tasks)}
-    if not about.items() >= counts.items():
-        yield _write(root / INFO, kept, {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}})
+    right = {**about, **counts, "splits": {"train": f"0:{len(dataset.episodes)}"}}
+    return {} if about.items() >= counts.items() else right
 
 
-def _statistics(dataset: Dataset) -> dict[str, Any]:
-    """Compute the statistics of every column of finite numbers, and from some pictures those of every camera."""
-    stats: dict[str, Any] = {}
+def _recompute(root: Path) -> dict[str, Any]:
+    """Return statistics of finite columns and, from some pictures, of cameras; empty if the stored ones are right."""
+    if not any(finding.place.startswith(STATS) for finding in examine_folder(root)):
+        return {}
+    dataset, stats = Dataset.open(root), dict[str, Any]()
     for key, feature in dataset.features.items():
         if feature.is_rgb:
             rows = np.unique(np.linspace(0, len(dataset) - 1, _PICTURES).astype(np.int64))
@@ -134,11 +140,3 @@ def _statistics(dataset: Dataset) -> dict[str, Any]:
         table = {**column_statistics({key: values})[key], "count": np.array([len(dataset)])}
         stats[key] = {name: one.reshape(shape if one.size > 1 else -1).tolist() for name, one in table.items()}
     return stats
-
-
-def _write(path: Path, kept: Path, content: dict[str, Any]) -> str:
-    if path.exists():
-        kept.mkdir(exist_ok=True)
-        shutil.copy2(path, kept)
-    write_json(path, content)
-    return f"computed from the data: meta/{path.name}"

@@ -57,9 +57,13 @@ def by_journals(root: Path) -> str:
 
 def by_deletion(root: Path, episodes: Iterable[int]) -> str:
     """Return the remedy of what is wrong with some episodes for good."""
-    numbers = f'--operation.episode_indices="[{", ".join(map(str, episodes))}]"'
-    tool = f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root} --new_root={root}_kept"
-    return f"record these again, or leave them out: {tool} --operation.type=delete_episodes {numbers}"
+    numbers = f'--new_root={root}_kept --operation.episode_indices="[{", ".join(map(str, episodes))}]"'
+    return f"record these again, or leave them out: {edit(root, 'delete_episodes')} {numbers}"
+
+
+def edit(root: Path, operation: str) -> str:
+    """Return the command of LeRobot's tool for an operation."""
+    return f"lerobot-edit-dataset --repo_id=local/{root.absolute().name} --root={root} --operation.type={operation}"
 
 
 def list_first(values: Iterable[object]) -> str:

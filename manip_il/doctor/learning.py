@@ -5,9 +5,9 @@ Motions are looked at in episodes that a teacher drove: where a learner drives, 
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,12 @@ from manip_il import checks
 from manip_il.data import schema as s
 from manip_il.data.dataset import Dataset
 from manip_il.data.info import NUMBERS
-from manip_il.doctor.finding import Finding, by_deletion, by_journals, list_first, warning
+from manip_il.doctor.finding import Finding, by_deletion, by_journals, edit, list_first, warning
 from manip_il.errors import ManipError
 from manip_il.mdp import Actor
 
 F64, Mask = NDArray[np.float64], NDArray[np.bool_]
+Rows = dict[int, slice]  # of episodes, by their numbers
 _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
 _STILL, _IDLE = 0.01, 0.1  # of every joint's range, within a second; of all frames
 _LEAD = 0.4  # by which actions may be ahead of the joints that follow them [s]
@@ -30,22 +31,6 @@ _LEAST = 5  # episodes that are compared with each other
 _EPISODES, _PICTURES, _SIDE = 100, 6, 16  # that are decoded, of each; height and width of a thumbnail
 _SAME, _DARK = 1.5, 10.0  # levels, of 255: change of the most changed part of a thumbnail; mean of a picture
 _AGAIN = "correct what recorded it, and record again"
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What the joints that action and state share are told, and where they are, (T, n). rows: of every episode."""
-
-    dataset: Dataset
-    rows: dict[int, slice]
-    names: list[str]
-    told: F64
-    found: F64
-    gripper: Mask  # (n,)
-
-    def episodes(self, which: Mask) -> list[int]:
-        """Return numbers of episodes, of a mask (E,)."""
-        return [episode for episode, chosen in zip(self.rows, which, strict=True) if chosen]
 
 
 def check_motions(dataset: Dataset) -> Iterator[Finding]:
@@ -58,51 +43,45 @@ def check_motions(dataset: Dataset) -> Iterator[Finding]:
     learner, table = columns.get(s.ACTOR, np.zeros(len(state))).reshape(-1) == Actor.LEARNER, dataset.episodes
     spans = zip(table.index.tolist(), map(slice, table.start, table.stop), strict=True)
     rows = {episode: one for episode, one in spans if len(state[one]) > 1 and not learner[one].any()}
-    if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():  # named by another check
-        return
-    left, right = dataset.features[s.ACTION].labels, dataset.features[s.STATE].labels
-    if len(left) == len(right) and not {*left} & {*right}:
-        right = left
-    names = [name for name in left if name in right]
-    gripper = np.array([bool(_GRIPPER.search(name)) for name in names], bool)
-    gripper = gripper if gripper.any() else np.arange(len(names)) == len(names) - 1
-    told, found = action[:, [left.index(name) for name in names]], state[:, [right.index(name) for name in names]]
-    motion = Motion(dataset, rows, names, told, found, gripper)
-    yield from _check_idle(motion, np.hstack([state, action]))
-    yield from _check_lag(motion)
-    yield from _check_joints(motion)
-    yield from _check_commands(motion)
-    yield from _check_texts(motion, state)
+    if not rows or not np.isfinite(state).all() or not np.isfinite(action).all():
+        return  # named by another check
+    yield from _check_idle(dataset, rows, np.hstack([state, action]))
+    yield from _check_texts(dataset, rows, state)
+    if action.shape == state.shape:  # of the same joints, as LeRobot's robots have them
+        names = np.array(dataset.features[s.ACTION].labels)
+        gripper = np.array([bool(_GRIPPER.search(name)) for name in names])
+        arm = ~gripper if gripper.any() else np.arange(len(names)) < len(names) - 1
+        yield from _check_lag(dataset, rows, action[:, arm], state[:, arm])
+        yield from _check_joints(dataset, rows, action[:, arm], state[:, arm], names[arm])
+        yield from _check_commands(rows, action, state, names, arm)
 
 
-def _check_idle(motion: Motion, both: F64) -> Iterator[Finding]:
+def _check_idle(dataset: Dataset, rows: Rows, both: F64) -> Iterator[Finding]:
     """Seconds in which neither actions nor joints move; to rest at the end is no fault."""
     both = both / np.where(np.ptp(both, axis=0) > 1e-9, np.ptp(both, axis=0), np.inf)
-    second, idle = max(2, round(motion.dataset.fps)), list[int]()
-    for rows in motion.rows.values():
-        starts = range(rows.start, rows.stop - second + 1, second)
+    second, idle = max(2, round(dataset.fps)), dict[int, int]()
+    for episode, span in rows.items():
+        starts = range(span.start, span.stop - second + 1, second)
         moving = [np.ptp(both[start : start + second], axis=0).max() > _STILL for start in starts]
-        idle.append(max(np.flatnonzero(moving), default=-1) + 1 - sum(moving))
-    if (share := sum(idle) * second / len(both)) > _IDLE:
-        odd = motion.episodes(np.array(idle) > 0)
+        idle[episode] = max(np.flatnonzero(moving), default=-1) + 1 - sum(moving)
+    if (share := sum(idle.values()) * second / len(both)) > _IDLE:
+        odd = [episode for episode, seconds in idle.items() if seconds]
         text = f"nothing moves for seconds, in {share:.0%} of the frames (episodes {list_first(odd)})"
-        remedy = by_deletion(motion.dataset.root, odd)
-        yield warning(s.ACTION, f"{text}: a policy learns to stand still there", remedy)
+        yield warning(s.ACTION, f"{text}: a policy learns to stand still there", by_deletion(dataset.root, odd))
 
 
-def _check_lag(motion: Motion) -> Iterator[Finding]:
+def _check_lag(dataset: Dataset, rows: Rows, told: F64, found: F64) -> Iterator[Finding]:
     """Actions that come after the motion that they should cause, or long before it, by cross-correlation."""
-    fps, spans = motion.dataset.fps, motion.rows.values()
-    reach = min(round(fps / 2) + 1, int(np.median([rows.stop - rows.start for rows in spans])) // 4)
-    inner = np.concatenate([np.arange(rows.start + reach, rows.stop - reach) for rows in spans])
+    reach = min(round(dataset.fps / 2) + 1, int(np.median([span.stop - span.start for span in rows.values()])) // 4)
+    inner = np.concatenate([np.arange(span.start + reach, span.stop - reach) for span in rows.values()])
     leads = range(-reach, reach + 1)
-    curves = np.array([_correlate(motion.told[inner - lead], motion.found[inner]) for lead in leads])
-    curves = curves[:, (curves.max(axis=0) > 0.9) & ~motion.gripper]  # the others' actions are no targets
-    if reach < 2 or curves.shape[1] < max(2, len(motion.names) / 2):
+    curves = np.array([_correlate(told[inner - lead], found[inner]) for lead in leads])
+    followed = curves.max(axis=0) > 0.9  # the others' actions are no targets
+    if reach < 2 or followed.sum() < max(2, len(followed) / 2):
         return
-    curve = curves.mean(axis=1)
+    curve = curves[:, followed].mean(axis=1)
     best = leads[int(curve.argmax())]
-    fine = min(max(best, 1), max(2, round(_LEAD * fps)))
+    fine = min(max(best, 1), max(2, round(_LEAD * dataset.fps)))
     if fine != best and 1 - curve[fine + reach] > 1.3 * (1 - curve.max()) + 1e-6:
         how = f"lead the joints by {best}" if best > 0 else f"lag the joints by {-best}"
         figures = f"correlation {curve.max():.4f}; {curve[fine + reach]:.4f} at a lead of {fine}"
@@ -116,21 +95,20 @@ def _correlate(left: F64, right: F64) -> F64:
     return (left * right).sum(axis=0) / np.maximum(np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0), 1e-9)
 
 
-def _check_joints(motion: Motion) -> Iterator[Finding]:
+def _check_joints(dataset: Dataset, rows: Rows, told: F64, found: F64, names: NDArray[np.str_]) -> Iterator[Finding]:
     """A joint whose zero or sign differs between episodes: by where it starts, and by how it follows its action."""
-    if len(motion.rows) < _LEAST:
-        return
-    starts = np.array([motion.found[rows.start] for rows in motion.rows.values()])
-    agree = np.array([_correlate(motion.told[rows], motion.found[rows]) for rows in motion.rows.values()])
-    for place in np.flatnonzero(~motion.gripper):
-        apart = _find_apart(starts[:, place], 5, 0.1 * np.ptp(motion.found[:, place]))
-        against = (agree[:, place] < -0.8) & bool(np.median(agree[:, place]) > 0.8)
-        for what, values, odd in (("starts at", starts, apart), ("correlates with its action by", agree, against)):
+    starts = np.array([found[span.start] for span in rows.values()])
+    agree = np.array([_correlate(told[span], found[span]) for span in rows.values()])
+    against = (agree < -0.8) & (np.median(agree, axis=0) > 0.8)
+    for place, name in enumerate(names if len(rows) >= _LEAST else ()):
+        apart = _find_apart(starts[:, place], 5, 0.1 * np.ptp(found[:, place]))
+        measures = (("starts at", starts, apart), ("correlates with its action by", agree, against[:, place]))
+        for what, values, odd in measures:
             if odd.any():
-                here, there = values[odd, place].mean(), values[~odd, place].mean()
-                text = f"{what} {here:.3g} in episodes {list_first(motion.episodes(odd))}, else {there:.3g}"
-                remedy = by_deletion(motion.dataset.root, motion.episodes(odd))
-                yield warning(s.STATE, f"{motion.names[place]} {text}: its zero or sign differs", remedy)
+                episodes = np.array([*rows])[odd]
+                text = f"{name} {what} {values[odd, place].mean():.3g} in episodes {list_first(episodes)}"
+                text += f", else {values[~odd, place].mean():.3g}: its zero or sign differs"
+                yield warning(s.STATE, text, by_deletion(dataset.root, episodes))
 
 
 def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
@@ -142,12 +120,12 @@ def _find_apart(values: F64, times: float, least: float = 1e-9) -> Mask:
     return (above if 2 * above.sum() <= len(values) else ~above) & (gap > max(times * extent, least))
 
 
-def _check_commands(motion: Motion) -> Iterator[Finding]:
-    """Commands, of the gripper as a rule, that are never reached; others that are cut off at a limit.
+def _check_commands(rows: Rows, action: F64, state: F64, names: NDArray[np.str_], arm: Mask) -> Iterator[Finding]:
+    """Commands, of the gripper as a rule, that are never reached; those of the arm that are cut off at a limit.
 
     Units of both are the same, or a joint follows by a small share. At rest at an episode's end nothing is cut off.
     """
-    for name, told, found, gripper in zip(motion.names, motion.told.T, motion.found.T, motion.gripper, strict=True):
+    for name, told, found, is_arm in zip(names, action.T, state.T, arm, strict=True):
         (low, high), (below, above) = np.quantile(told, [0.01, 0.99]), np.quantile(found, [0.01, 0.99])
         share = (above - below) / max(high - low, 1e-9)
         stuck = share < 0.05 and abs(_correlate(told, found)) < 0.5
@@ -155,36 +133,37 @@ def _check_commands(motion: Motion) -> Iterator[Finding]:
         if high - low > 1e-6 and (stuck or inside):
             text = f"{name} is told {low:.3g} to {high:.3g}, and is {below:.3g} to {above:.3g}: commands never reached"
             yield warning(s.ACTION, text, f"calibrate or free that joint: {_AGAIN}")
-        for limit in {told.min(), told.max()} if len(np.unique(told)) > 50 and not gripper else ():
-            at = [told[rows] == limit for rows in motion.rows.values()]
+        for limit in {told.min(), told.max()} if is_arm and len(np.unique(told)) > 50 else ():
+            at = [told[span] == limit for span in rows.values()]
             share = sum(int(one.sum()) for one in at if not one[0] and not one[-1]) / len(told)
             if share > _CLIPPED:
                 text = f"{name} is cut off at {limit:.6g} in {share:.0%} of the frames"
                 yield warning(s.ACTION, text, f"widen that limit: {_AGAIN}")
 
 
-def _check_texts(motion: Motion, state: F64) -> Iterator[Finding]:
+def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
     """Two different motions, with nothing between, that neither text nor first observation tells apart."""
-    dataset, spans = motion.dataset, motion.rows.values()
-    points = np.array([np.linspace(rows.start, rows.stop - 1, 12).astype(int) for rows in spans])
+    points = np.array([np.linspace(span.start, span.stop - 1, 12).astype(int) for span in rows.values()])
     paths = (state / np.maximum(state.std(axis=0), 1e-9))[points].reshape(len(points), -1)
     seen = [one.key for one in dataset.info.of_dtype(*NUMBERS) if one.key.startswith("observation.")]
     firsts = np.hstack([dataset.columns([key])[key][points[:, 0]].reshape(len(points), -1) for key in seen])
-    known = dict(zip(dataset.episodes.index.tolist(), map(tuple, dataset.episodes.tasks), strict=True))
-    texts = [" ".join(known[episode]) for episode in motion.rows]
+    known = dict(zip(dataset.episodes.index.tolist(), dataset.episodes.tasks, strict=True))
+    texts = np.array([" ".join(known[episode]) for episode in rows])
     for text in {*texts}:
-        same = np.flatnonzero([one == text for one in texts])
+        same = np.flatnonzero(texts == text)
         centred = paths[same] - paths[same].mean(axis=0)
         if len(same) < 2 * _LEAST:
             continue
-        odd = np.zeros(len(paths), bool)
-        odd[same] = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
-        here, there = firsts[odd], firsts[np.setdiff1d(same, np.flatnonzero(odd))]
-        if 5 * odd.sum() < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
+        apart = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
+        here, there, episodes = firsts[same[apart]], firsts[same[~apart]], np.array([*rows])[same[apart]]
+        if 5 * len(here) < len(same) or (here.max(0) < there.min(0)).any() or (there.max(0) < here.min(0)).any():
             continue  # few, or the first observation tells which
-        what = f"{odd.sum()} of {len(same)} episodes ({list_first(motion.episodes(odd))})"
-        remedy = "give them a text of their own: lerobot-edit-dataset --operation.type=modify_tasks --help"
-        yield warning("task", f"{what} move in another way than the rest, for one text {text[:60]!r}", remedy)
+        what = f"{len(here)} of {len(same)} episodes ({list_first(episodes)}) move in another way than the rest"
+        own = json.dumps(dict.fromkeys(map(str, episodes), "NEW TEXT"))
+        remedy = (
+            f"give them a text of their own: {edit(dataset.root, 'modify_tasks')} --operation.episode_tasks='{own}'"
+        )
+        yield warning("task", f"{what}, for one text {text[:60]!r}", remedy)
 
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:

@@ -214,8 +214,10 @@ def commands(root: Path, rng: Rng) -> str:
     return f"(action|task): .*{what}"
 
 
-PLANTS: tuple[Plant, ...] = (counts, rows, names, frames, finite, times, statistics, died, tasks, own)
-PLANTS += (idle, lag, cameras, joint, commands)
+PLANTS: tuple[Plant, ...] = (
+    *(counts, rows, names, frames, finite, times, statistics, died, tasks, own),
+    *(idle, lag, cameras, joint, commands),
+)
 
 
 @pytest.fixture(scope="module")
