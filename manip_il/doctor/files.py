@@ -40,7 +40,7 @@ def leftovers(root: Path) -> list[Path]:
     root = root.absolute()
     inside = [path for path in [*root.iterdir(), *root.glob("meta/*")] if _TEMPORARY.fullmatch(path.name)]
     beside = root.parent.glob(f".{root.name}.*.partial")
-    return sorted(path for path in [*inside, *beside] if path.is_file() or any(path.rglob("*.*")))
+    return sorted(path for path in [*inside, *beside] if any(one.is_file() for one in [path, *path.rglob("*")]))
 
 
 def check_info(dataset: Dataset) -> Iterator[Finding]:
@@ -51,7 +51,8 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
         if feature.dtype in PICTURES:
             if names not in _AXES or len(shape) != 3 or shape[0 if names[0] == "channels" else 2] not in (1, 3):
                 text = f"a camera of shape {shape} with names {names}, on which LeRobot does not train"
-                yield Finding(place, text, 'set [height, width, 3] and ["height", "width", "channels"] there')
+                say = warning if isinstance(names, list) and names[:2] == ["height", "width"] else Finding  # some train
+                yield say(place, text, 'set [height, width, 3] and ["height", "width", "channels"] there')
         elif isinstance(names, list) and len(names) not in (feature.size, len(shape)):
             yield Finding(
                 place, f"{len(names)} names for shape {shape}", "name each number there, or set names to null"
@@ -108,17 +109,17 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
     if stored is None:
         yield warning(layout.STATS, "is missing: LeRobot normalises nothing without it", by_repair(root))
     for feature in dataset.info.of_dtype(*NUMBERS, *PICTURES):
-        key, text = feature.key, "is missing" if stored is not None and feature.key not in stored else ""
+        key, text, table = feature.key, "", (stored or {}).get(feature.key)
         if feature.dtype in NUMBERS:
             values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64)
             if len(bad := np.flatnonzero(~np.isfinite(values).all(axis=1))):
                 episodes = sorted({*np.searchsorted(ends, bad, side="right").tolist()})
                 remedy = by_journals(root) if journals_of(root).is_dir() else by_deletion(root, episodes)
                 yield Finding(f"data: {key}", f"no number in row {bad[0]:,} ({len(bad):,} such rows)", remedy)
-            elif stored is not None and not text and key not in INDEX_FEATURES:  # as LeRobot's tools leave those
-                text = _compare(stored[key], values, feature)
-        if text:
-            yield Finding(f"{layout.STATS}: {key}", text, by_repair(root))
+            elif table is not None:
+                text = _compare(table, values, feature)
+        if stored is not None and key not in INDEX_FEATURES and (text or table is None):  # of those nobody needs any
+            yield Finding(f"{layout.STATS}: {key}", text or "is missing", by_repair(root))
 
 
 def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Feature) -> str:

@@ -27,7 +27,7 @@ _GRIPPER = re.compile(r"grip|finger|jaw|hand|claw", re.IGNORECASE)
 _STILL, _IDLE = 0.01, 0.1  # of every joint's range, within a second; of all frames
 _LEAD = 0.4  # by which actions may be ahead of the joints that follow them [s]
 _CLIPPED = 0.05  # of all frames
-_LEAST = 5  # episodes that are compared with each other
+_LEAST = 10  # episodes that are compared with each other
 _EPISODES, _PICTURES, _SIDE = 100, 6, 16  # that are decoded, of each; height and width of a thumbnail
 _SAME, _DARK = 1.5, 10.0  # levels, of 255: change of the most changed part of a thumbnail; mean of a picture
 _AGAIN = "correct what recorded it, and record again"
@@ -152,7 +152,7 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
     for text in {*texts}:
         same = np.flatnonzero(texts == text)
         centred = paths[same] - paths[same].mean(axis=0)
-        if len(same) < 2 * _LEAST:
+        if len(same) < _LEAST:
             continue
         apart = _find_apart(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], 2.5)
         here, there, episodes = firsts[same[apart]], firsts[same[~apart]], np.array([*rows])[same[apart]]
@@ -168,7 +168,7 @@ def _check_texts(dataset: Dataset, rows: Rows, state: F64) -> Iterator[Finding]:
 
 def check_cameras(dataset: Dataset) -> Iterator[Finding]:
     """Check some pictures of every episode: they are decoded and have their size, and show what they should."""
-    table, root = dataset.episodes, dataset.root
+    table, root, _ = dataset.episodes, dataset.root, dataset.data_files  # what raises here is said once
     chosen = np.flatnonzero(table.length > 1)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(_EPISODES, len(chosen))).astype(int)]
     rows = np.linspace(table.start[chosen], table.stop[chosen] - 1, _PICTURES, dtype=np.int64, axis=-1)
