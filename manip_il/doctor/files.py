@@ -47,16 +47,13 @@ def check_info(dataset: Dataset) -> Iterator[Finding]:
     """Check that `meta/info.json` has names and shapes with which LeRobot trains, every column, and right counts."""
     info, root = dataset.info, dataset.root
     for key, feature in info.features.items():
-        shape, names, place = list(feature.shape), feature.names, f"{layout.INFO}: {key}"
-        if feature.dtype in PICTURES:
-            if names not in _AXES or len(shape) != 3 or shape[0 if names[0] == "channels" else 2] not in (1, 3):
-                text = f"a camera of shape {shape} with names {names}, on which LeRobot does not train"
-                say = warning if isinstance(names, list) and names[:2] == ["height", "width"] else Finding  # some train
-                yield say(place, text, 'set [height, width, 3] and ["height", "width", "channels"] there')
-        elif isinstance(names, list) and len(names) not in (feature.size, len(shape)):
-            yield Finding(
-                place, f"{len(names)} names for shape {shape}", "name each number there, or set names to null"
-            )
+        shape, names = list(feature.shape), feature.names
+        right = names in _AXES and len(shape) == 3 and shape[0 if names[0] == "channels" else 2] in (1, 3)
+        if feature.dtype in PICTURES and not right:
+            text = f"a camera of shape {shape} with names {names}, on which LeRobot does not train"
+            say = warning if isinstance(names, list) and names[:2] == ["height", "width"] else Finding  # some train
+            remedy = 'set [height, width, 3] and ["height", "width", "channels"] there'
+            yield say(f"{layout.INFO}: {key}", text, remedy)
     counts = {"episodes": (info.episodes, len(dataset.episodes)), "tasks": (info.tasks, len(dataset.tasks))}
     for what, (said, found) in counts.items():
         if said not in (None, found):
@@ -132,9 +129,15 @@ def _compare(stored: dict[str, NDArray[Any]], values: NDArray[Any], feature: Fea
     return "" if stored["count"][0] == len(values) else f"count is {stored['count'][0]}; expected {len(values)}"
 
 
-def check_videos(dataset: Dataset) -> Iterator[Finding]:
-    """Check that every video file is there and has a frame at the time of each of its rows; none is decoded."""
+def check_frames(dataset: Dataset) -> Iterator[Finding]:
+    """Check that every row has a picture in its data file, or a frame in a video at its time; none is decoded."""
     table, root = dataset.episodes, dataset.root
+    for key in [feature.key for feature in dataset.info.of_dtype("image")]:
+        for path in dataset.data_files:
+            cells: Any = pq.read_table(path, columns=[key]).column(key).combine_chunks()
+            if lacking := cells.field("bytes").null_count:
+                place = f"{path.relative_to(root).as_posix()}: {key}"
+                yield Finding(place, f"{lacking:,} of {len(cells):,} rows have no picture", by_journals(root))
     for clips in table.clips.values():
         for name in dict.fromkeys(clips.files):
             try:
@@ -176,4 +179,4 @@ def check_own(dataset: Dataset) -> Iterator[Finding]:
             yield Finding(f"data: {key}", text, by_journals(root))
 
 
-CHECKS = (check_leftovers, check_info, check_rows, check_numbers, check_videos, check_own)
+CHECKS = (check_leftovers, check_info, check_rows, check_numbers, check_frames, check_own)
