@@ -108,7 +108,7 @@ def check_numbers(dataset: Dataset) -> Iterator[Finding]:
     for feature in dataset.info.of_dtype(*NUMBERS, *PICTURES):
         key, text, table = feature.key, "", (stored or {}).get(feature.key)
         if feature.dtype in NUMBERS:
-            values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64)
+            values = dataset.columns([key])[key].reshape(len(dataset), -1).astype(np.float64, copy=False)
             if len(bad := np.flatnonzero(~np.isfinite(values).all(axis=1))):
                 episodes = sorted({*np.searchsorted(ends, bad, side="right").tolist()})
                 remedy = by_journals(root) if journals_of(root).is_dir() else by_deletion(root, episodes)
